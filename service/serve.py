@@ -51,9 +51,9 @@ from abbe.service.scheduler.job import Checks
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.engine import parse_url
 from abbe.service.storage.private import database_seen_by_others
+from abbe.service.storage.store import Store
 from abbe.service.tables.push_outcome import open_push
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
@@ -78,19 +78,21 @@ EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - compared with, not
 class Service:
     """All parts of the running service, wired. The store is open and the port is taken, or this object does not exist."""
 
-    def __init__(self, setup: ServiceSetup, store: ServiceStore, listening: socket.socket, clock: Clock) -> None:
+    def __init__(self, setup: ServiceSetup, store: Store, listening: socket.socket, clock: Clock) -> None:
         self._setup = setup
         self._store = store
         self._clock = clock
         self._listening = listening
         self.board = Board(setup.devices, clock)
         self._publisher = self._make_publisher()
-        self._presence = Heartbeat(setup.machine, version("abbe"), store, lambda: self._scheduler.next_due(), clock, self.board.attention)
+        self._presence = Heartbeat(
+            setup.machine, version("abbe"), store.heartbeats, lambda: self._scheduler.next_due(), clock, self.board.attention
+        )
         watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._presence]
         if self._publisher is not None:
             watchers.append(StateTeller(self._publisher, clock))
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
-        self._shelf = StoreShelf(store, clock, (setup.machine, store.add_machine(setup.machine, setup.doc)), topics, self._posted)
+        self._shelf = StoreShelf(store, clock, (setup.machine, store.machines.add(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
         alarms = self._make_alarms(book)
         checks = Checks(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
@@ -143,7 +145,7 @@ class Service:
         setup, board = self._setup, self.board
         if setup.broker is None:
             return None
-        outbox = StoreOutbox(self._store, setup.topics, self._clock)
+        outbox = StoreOutbox(self._store.outbox, setup.topics, self._clock)
         return Publisher(setup.broker, setup.topics, outbox, self._clock, board.broker, board.messages_dropped)
 
     def _make_opcua(self) -> OpcUaServer | None:
@@ -237,7 +239,7 @@ class Service:
         with suppress(TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 # Messages that are not delivered now are delivered by the next start.
-                while self.board.mqtt_connected and await asyncio.to_thread(self._store.waiting_messages) > 0:
+                while self.board.mqtt_connected and await asyncio.to_thread(self._store.outbox.count) > 0:
                     await self._clock.sleep(0.1)
         return all(state == "done: pass" for state in states)
 
@@ -297,7 +299,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
     check_certificate(setup.web.certificate, setup.web.key)
     listening = bind(setup.web.host, setup.web.port)
     try:
-        store = await asyncio.to_thread(ServiceStore.open, setup.store_url)
+        store = await asyncio.to_thread(Store.open, setup.store_url)
         if words := database_seen_by_others(setup.store_url):
             log.warning("database", text=words)
         try:
@@ -320,5 +322,5 @@ def _admins(url: str) -> int:
     parsed = parse_url(url)
     if parsed.drivername == "sqlite" and not Path(parsed.database or "").is_file():
         return 0
-    with ServiceStore.open(url) as store:
-        return store.active_admins()
+    with Store.open(url) as store:
+        return store.people.active_admins()

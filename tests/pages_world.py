@@ -31,6 +31,7 @@ from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.utc import utc_text
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
@@ -39,9 +40,8 @@ from abbe.service.queries.status import StatusReader
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler import record
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.site import Site
-from abbe.service.storage.base import utc_text
+from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import table_image
 from abbe.service.users.passwords import Passwords
@@ -105,18 +105,18 @@ def fill(folder: Path, evil: str = "", checks: int = 24) -> Filled:
     schedules = [Schedule(f"weekly{evil}", "0 6 * * 1", "Europe/Berlin", f"quick-check{evil}"),
                  Schedule("night", "30 2 * * *", "Europe/Berlin", "verify")]  # fmt: skip
     devices = {"ballbar": f"serial:///dev/serial/by-id/usb-bar{evil}", "laser": "modbus://127.0.0.1:5021"}
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         _checks(store, machine, schedules[0], checks, evil)
         _slots(store, machine, schedules, evil)
         site, runs, solved, doc = solved_campaign(machine)
         campaign = f"june{evil}"
         _import(store, folder / "in", campaign, site, runs)
         _broken_run(store, campaign, evil)
-        stored = store.campaign(campaign)
-        ids = [r.id for r in store.runs(stored.id) if r.visible_status == "complete"]
+        stored = store.campaigns.find(campaign)
+        ids = [r.id for r in store.runs.all(stored.id) if r.visible_status == "complete"]
         doc |= {"campaign": campaign, "machine": site.doc, "flags": [f"run r1: look at it{evil}"]}
         doc["not_observable"] = [*doc["not_observable"], f"the colour of the machine{evil}"]
-        solution = store.add_solution(stored.id, "joint", ids, doc)
+        solution = store.solutions.add(stored.id, "joint", ids, doc)
         with ThreadPoolExecutor(1) as aside:  # a test with a browser has a loop in this thread
             # Before the proposals: what is written afterwards supersedes them.
             aside.submit(lambda: asyncio.run(_pushes(store, machine, evil))).result()
@@ -124,32 +124,32 @@ def fill(folder: Path, evil: str = "", checks: int = 24) -> Filled:
         return Filled(url, machine, schedules, devices, campaign, solution, proposals, _discovery(store, folder / "c1", evil))
 
 
-def _checks(store: ServiceStore, machine: str, schedule: Schedule, count: int, evil: str) -> None:
-    now, number = datetime.now(UTC), store.add_machine(machine, {"name": machine})
+def _checks(store: Store, machine: str, schedule: Schedule, count: int, evil: str) -> None:
+    now, number = datetime.now(UTC), store.machines.add(machine, {"name": machine})
     for week in range(count):
         at = now - timedelta(days=7 * (count - 1 - week), hours=3)
         occasion = record.Occasion(machine, schedule, at)
         if week == count - 3:
             trouble = LinkDown(f"modbus+tcp://127.0.0.1:5021{evil}", "connect", f"refused{evil}", f"is the laser on?{evil}")
-            store.keep_verification(number, record.failed(occasion, trouble, at, 5.0), [])
+            store.verifications.add_with_messages(number, record.failed(occasion, trouble, at, 5.0), [])
             continue
         drift = 11.0 + 0.02 * week**2
         verdict = "fail" if drift - 1.1 > 20 else "pass" if drift + 1.1 <= 20 else "cannot tell"
         values = {"diagonal_ppp_um": drift - 3, "body_diagonal_um": drift, "helix_rms_um": 1.2 + 0.1 * week}
         told = Result(verdict, values, text=f"{verdict}: worst body diagonal {drift:.1f} µm{evil}", started_utc=at, duration_s=312.0,
                       campaign=f"quick-check {week}{evil}")  # fmt: skip
-        store.keep_verification(number, record.found(occasion, told), [])
+        store.verifications.add_with_messages(number, record.found(occasion, told), [])
 
 
-def _slots(store: ServiceStore, machine: str, schedules: list[Schedule], evil: str) -> None:
+def _slots(store: Store, machine: str, schedules: list[Schedule], evil: str) -> None:
     for day, (state, reason) in enumerate([("done: pass", ""), ("skipped: busy", f"weekly was still running{evil}"), ("done: fail", "")]):
         at = datetime(2026, 11, 2 + 7 * day, 5, tzinfo=UTC)
         for schedule in schedules:
-            store.claim_slot(f"{machine}/{schedule.name}", at)
-            store.finish_slot(f"{machine}/{schedule.name}", at, state, reason)
+            store.slots.claim(f"{machine}/{schedule.name}", at)
+            store.slots.finish(f"{machine}/{schedule.name}", at, state, reason)
 
 
-def _import(store: ServiceStore, folder: Path, campaign: str, site: Site, runs: list[dict[str, Any]]) -> None:
+def _import(store: Store, folder: Path, campaign: str, site: Site, runs: list[dict[str, Any]]) -> None:
     folder.mkdir()
     entries = []
     for n, run in enumerate(runs):
@@ -161,14 +161,12 @@ def _import(store: ServiceStore, folder: Path, campaign: str, site: Site, runs: 
     import_folder(store, folder)
 
 
-def _broken_run(store: ServiceStore, campaign: str, evil: str) -> None:
-    number = store.start_run(store.campaign(campaign).id, f"late{evil}", "ballbar_circle", "identify", {"setup": {}})
-    store.finish_run(number, "stopped", f"SEQ-003: the auth was opened{evil}", None)
+def _broken_run(store: Store, campaign: str, evil: str) -> None:
+    number = store.runs.start(store.campaigns.find(campaign).id, f"late{evil}", "ballbar_circle", "identify", {"setup": {}})
+    store.runs.finish(number, "stopped", f"SEQ-003: the auth was opened{evil}", None)
 
 
-def _proposals(
-    store: ServiceStore, site: Site, runs: list[dict[str, Any]], solved: Solved, campaign: str, solution: int, evil: str
-) -> list[int]:
+def _proposals(store: Store, site: Site, runs: list[dict[str, Any]], solved: Solved, campaign: str, solution: int, evil: str) -> list[int]:
     change = nine_tables(solved.joint, GRID)
     predicted = predict_residual(solved.joint, change)
     tables = quantise(change, LSB_NM * 1e-6)
@@ -186,7 +184,7 @@ def _proposals(
     out = []
     for proposed in (replace(one, reasons=(f"STALE: measured 80 h ago{evil}",)), replace(one, by=f"{PROPOSER}{evil}"), one):
         doc = doc_of(proposed)
-        out.append(store.add_proposal(site.name, solution, doc, digest_of_doc(doc)))
+        out.append(store.proposals.add(site.name, solution, doc, digest_of_doc(doc)))
     return out
 
 
@@ -197,7 +195,7 @@ class _Earlier(SystemClock):
         return super().utc() - timedelta(weeks=30)
 
 
-async def _pushes(store: ServiceStore, machine: str, evil: str) -> None:
+async def _pushes(store: Store, machine: str, evil: str) -> None:
     """A rollback that did not hold, and a push that was kept: that one can be taken back."""
     clock = _Earlier()
     back = {"kind": "rollback", "reason": f"worse on the gauge block{evil}", "by": f"user:anna{evil}"}
@@ -205,7 +203,7 @@ async def _pushes(store: ServiceStore, machine: str, evil: str) -> None:
     await as_if_pushed(store, clock, machine, {"proposal": 99}, (b"the table of May", b"the table of June"), KEPT)
 
 
-def _discovery(store: ServiceStore, folder: Path, evil: str) -> int:
+def _discovery(store: Store, folder: Path, evil: str) -> int:
     write_case(folder, f"c1{evil}")
     job = prepare(from_folder(folder), catalogue(), None)
     journal = journal_of(store, job)
@@ -220,7 +218,7 @@ class Served:
 
     base: str
     filled: Filled
-    store: ServiceStore
+    store: Store
     people: People
     auth: Authenticator
     board: Board
@@ -231,10 +229,10 @@ class Served:
 def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
     """The page over a filled store, on a real socket, in a thread with its own event loop."""
     clock = SystemClock()
-    with ServiceStore.open(filled.url) as store:
+    with Store.open(filled.url) as store:
         people = People(store, clock, Passwords(memory_kib=64, passes=1))
         for name, role in USERS.items() if users else ():
-            if store.user(name) is None:
+            if store.people.find(name) is None:
                 people.add(name, role, PHRASE)
         auth = Authenticator(store, people, AuditBook(store, filled.url), rate_hz=1e6, burst=1e6)
         board = Board(filled.devices, clock)

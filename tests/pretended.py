@@ -16,11 +16,11 @@ NAME = f"{KIND} pretended"
 
 async def as_if_commissioned(controller: Controller, store: Store, site: Site) -> None:
     """Put a proof of this control into the store, as a commissioning would that had found nothing wrong."""
-    if any(c.name == NAME for c in store.campaigns()):
+    if any(c.name == NAME for c in store.campaigns.all()):
         return
-    machine = store.add_machine(site.name, site.doc)
-    campaign = store.add_campaign(machine, NAME, {})
-    store.add_solution(campaign, KIND, [], {"proved": True, "faults": [], "identity": identity(await controller.identify())})
+    machine = store.machines.add(site.name, site.doc)
+    campaign = store.campaigns.add(machine, NAME, {})
+    store.solutions.add(campaign, KIND, [], {"proved": True, "faults": [], "identity": identity(await controller.identify())})
 
 
 async def as_if_commissioned_at(url: str, store: Store, site: Site) -> None:
@@ -34,7 +34,7 @@ async def as_if_commissioned_at(url: str, store: Store, site: Site) -> None:
 
 async def as_if_proved_for_nobody_there(controller: Controller, store: Store, site: Site) -> None:
     """The same for what the control does for a push that nobody attends."""
-    machine = store.add_machine(site.name, site.doc)
-    campaign = store.add_campaign(machine, f"{LEVELS} pretended", {})
+    machine = store.machines.add(site.name, site.doc)
+    campaign = store.campaigns.add(machine, f"{LEVELS} pretended", {})
     flags = flags_of(Capabilities(*[True] * 6)) | {"can_disable": True}
-    store.add_solution(campaign, LEVELS, [], {"identity": identity(await controller.identify()), "flags": flags})
+    store.solutions.add(campaign, LEVELS, [], {"identity": identity(await controller.identify()), "flags": flags})

@@ -28,7 +28,7 @@ async def as_if_pushed(
     identity of the control, empty as older versions wrote.
     """
     base, image = images
-    table = store.add_table(store.add_machine(machine, {"name": machine}), None, image, crc32(image), doc)
+    table = store.tables.add(store.machines.add(machine, {"name": machine}), None, image, crc32(image), doc)
     known = {"table": table, "base_image": base.hex(), "base_crc": crc32(base), "base_bank": 0, "image": image.hex()}
     known |= {"crc": crc32(image), "target": 1, "base_meaning": "b", "meaning": "m", "owner": 0x00770000}
     known |= {"machine": machine} | ({"control": control} if control else {})

@@ -134,7 +134,7 @@ class AuditBook:
         """
         if not self._memory:
             files_ready(self.key_file, self.head_file)
-        self._store.can_write()
+        self._store.check_writable()
 
     def write(self, event: AuditEvent) -> AuditEvent:
         """Append a record; on return it is on disk and its head is kept outside.
@@ -152,14 +152,14 @@ class AuditBook:
             outcome=_clean(event.outcome)[:200],
             doc=_cleaned(event.doc),
         )
-        record = self._store.append_audit(lambda last, utc: follow(last, utc, cleaned, key))
+        record = self._store.audit.append(lambda last, utc: follow(last, utc, cleaned, key))
         self._keep(anchor_of(record, key))
         return record
 
     def verify(self) -> list[str]:
         """Everything that is wrong; an empty list: all is there and as written. An audit that was never begun has nothing wrong."""
         heads = self._heads if self._memory else heads_in(self.head_file)
-        records = self._store.audit()
+        records = self._store.audit.events()
         try:
             if not records and not heads and not self._has_key():
                 return []
@@ -230,7 +230,7 @@ def _sqlite_place(store: Store | None, database: Path) -> str:
     if store is None or not folder or files_of(base)[0].exists():
         return base
     before = str(Path(folder) / database.name)
-    last = store.audit(1)
+    last = store.audit.events(1)
     with suppress(OSError):
         if last and last[0].key == key_name(files_of(before)[0].read_bytes()):
             return before

@@ -66,10 +66,10 @@ def from_store(store: Store, name: str) -> Campaign:
     StoreError
         There is no such campaign.
     """
-    record = store.campaign(name)
-    runs = [load_run(store, r.id) for r in store.runs(record.id) if r.visible_status == "complete"]
+    record = store.campaigns.find(name)
+    runs = [load_run(store, r.id) for r in store.runs.all(record.id) if r.visible_status == "complete"]
     known = record.doc.get("imported") or record.doc
-    doc = known | {"campaign": record.name, "machine": store.machine(record.machine_id).doc}
+    doc = known | {"campaign": record.name, "machine": store.machines.get(record.machine_id).doc}
     return _campaign(record.name, doc, runs, None)
 
 
@@ -95,11 +95,11 @@ def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any
         Another campaign of this name is in the store.
     """
     ids = ensure_stored(store, campaign)
-    record = store.campaign(campaign.name)
+    record = store.campaigns.find(campaign.name)
     used = [ids[label] for label in doc["inputs"]["runs"]]
-    same = [s.id for s in store.solutions(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
+    same = [s.id for s in store.solutions.all(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
     told = {"run_ids": used, "same_as": same}
-    return told | {"solution_id": store.add_solution(record.id, "joint", used, doc | told)}
+    return told | {"solution_id": store.solutions.add(record.id, "joint", used, doc | told)}
 
 
 def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
@@ -112,12 +112,12 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
     CampaignRefused
         Another campaign of this name is in the store.
     """
-    if campaign.folder is not None and all(c.name != campaign.name for c in store.campaigns()):
+    if campaign.folder is not None and all(c.name != campaign.name for c in store.campaigns.all()):
         import_folder(store, campaign.folder)
-    record = store.campaign(campaign.name)
-    ids = {r.label: r.id for r in store.runs(record.id) if r.visible_status == "complete"}
+    record = store.campaigns.find(campaign.name)
+    ids = {r.label: r.id for r in store.runs.all(record.id) if r.visible_status == "complete"}
     if campaign.folder is not None:
-        _check_same(store, campaign, store.machine(record.machine_id).doc, ids)
+        _check_same(store, campaign, store.machines.get(record.machine_id).doc, ids)
     return ids
 
 

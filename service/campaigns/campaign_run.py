@@ -119,7 +119,7 @@ async def read_path(session: Session, store: Store, campaign: int, test: str, mo
     """How far the path of a test was read in a mounting, if the ball-bar's box has not been restarted since."""
 
     def look() -> SoFar | None:
-        lines = (one.doc for one in store.checkpoints(campaign) if one.kind == RUN)
+        lines = (one.doc for one in store.checkpoints.of_campaign(campaign) if one.kind == RUN)
         runs = [int(one["run"]) for one in lines if one["test"] == test and one["mounting"] == mounting]
         return path_so_far(store, max(runs)) if runs else None
 

@@ -38,7 +38,7 @@ async def listen(session: Session, store: Store, site: Site, plan: CampaignPlan,
     run_ids = []
     for test in plan.tests:
         doc = await start_document(session, site, under_way, test, clock)
-        run_id = await store.write(store.start_run, under_way.id, test.label, test.test, test.role, doc)
+        run_id = await store.write(store.runs.start, under_way.id, test.label, test.test, test.role, doc)
         status, reason, end = "aborted", "stopped", dict[str, Any]()
         about = {"label": test.label, "test": test.test, "machine": site.name}
         recorder: CaptureRecorder | None = None

@@ -66,7 +66,7 @@ class OpenCampaign:
 
 async def start_campaign(session: Session, store: Store, site: Site, name: str, more: dict[str, Any] | None = None) -> tuple[int, int]:
     """A new campaign in the store and its clock zero (controller time, us). ``more``: what else its document shall say."""
-    machine_id = await store.write(store.add_machine, site.name, site.doc)
+    machine_id = await store.write(store.machines.add, site.name, site.doc)
     status = await session.controller.status()
     comp = await session.controller.comp_status()
     doc = {
@@ -78,7 +78,7 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
         "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": 1e-7}},
         "temperature_sensors": False,
     } | (more or {})
-    return await store.write(store.add_campaign, machine_id, name, doc), status.ctrl_us
+    return await store.write(store.campaigns.add, machine_id, name, doc), status.ctrl_us
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ async def _campaign_run(
     if manner.resumed is not None:
         campaign_run.mountings = dict(manner.resumed.mountings)
         campaign_run.used = set(manner.resumed.used)
-        campaign_run.labels = {run.label for run in await asyncio.to_thread(store.runs, journal.campaign)}
+        campaign_run.labels = {run.label for run in await asyncio.to_thread(store.runs.all, journal.campaign)}
     return campaign_run
 
 
@@ -265,7 +265,7 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
     doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
     if attempt.remainder is not None:
         doc["path"] |= attempt.remainder.doc()
-    run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, doc)
+    run_id = await store.write(store.runs.start, campaign.id, test.label, test.test, test.role, doc)
     status, reason, end = "aborted", "stopped", dict[str, Any]()
     recorder: CaptureRecorder | None = None
     about = {"label": test.label, "test": test.test, "machine": site.name}

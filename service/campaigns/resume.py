@@ -60,7 +60,7 @@ def read_journal(store: Store, campaign: CampaignRecord) -> Lines:
     WorldChanged
         It has none.
     """
-    found: list[CheckpointRecord] = store.checkpoints(campaign.id)
+    found: list[CheckpointRecord] = store.checkpoints.of_campaign(campaign.id)
     begun = [one.doc for one in found if one.kind == BEGUN]
     if not begun:
         raise PreconditionsChanged(
@@ -81,7 +81,7 @@ def begun_source(store: Store, name: str) -> RecipeSource:
     WorldChanged
         Its journal does not say.
     """
-    source: Doc = read_journal(store, store.campaign(name)).begun.get("source") or {}
+    source: Doc = read_journal(store, store.campaigns.find(name)).begun.get("source") or {}
     if "recipe" not in source:
         raise PreconditionsChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
     return RecipeSource(**source)
@@ -104,7 +104,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     UnsafeToMove
         Another process is measuring it, or an interlock holds.
     """
-    campaign = store.campaign(name)
+    campaign = store.campaigns.find(name)
     lines = read_journal(store, campaign)
     _same_plan(store, campaign, lines, site, plan)
     comp = await session.controller.comp_status()
@@ -117,7 +117,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
         await session.controller.abort()
         said.append("the machine was still moving: it was stopped")
     check_interlocks(await session.controller.status())
-    found = _Finder(store, campaign.id, plan, lines, {run.id: run.visible_status for run in store.runs(campaign.id)})
+    found = _Finder(store, campaign.id, plan, lines, {run.id: run.visible_status for run in store.runs.all(campaign.id)})
     start = await found.starts(session, confirm, said)
     said.insert(1, f"{len(found.done)} of {len(plan.tests)} tests are complete")
     ctrl0_us = int(campaign.doc["ctrl0_us"])
@@ -130,7 +130,7 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site,
     owner = Owner(**lines.begun["owner"]) if "owner" in lines.begun else None
     if owner is not None and not lines.ended and not owner.is_gone():
         raise UnsafeToMove(f"campaign {campaign.name!r} is being measured (process {owner.pid} on {owner.host})", "wait until it has ended")
-    for run in store.runs(campaign.id):
+    for run in store.runs.all(campaign.id):
         if run.visible_status == RUNNING:
             raise UnsafeToMove(
                 f"run {run.label} of campaign {campaign.name} is being measured (process {run.owner.pid})", "wait until it has ended"
@@ -140,7 +140,7 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site,
             f"campaign {campaign.name!r} was begun with another recipe (or feed limit, or version of Abbe)",
             "go on with the recipe that it was begun with, or measure a new campaign",
         )
-    if store.machine(campaign.machine_id).doc != site.doc:
+    if store.machines.get(campaign.machine_id).doc != site.doc:
         raise PreconditionsChanged(
             f"campaign {campaign.name!r} is of another machine, or its description was changed", "measure a new campaign"
         )
@@ -218,7 +218,7 @@ class _Finder:
         runs = [n for n, one in self._lines.runs.items() if one["test"] == label and one["mounting"] == number]
         if not runs:
             return ()
-        return tuple(record for chunk in self._store.chunks(max(runs), LASER_CHANNEL) for record in decode_json(chunk.payload))
+        return tuple(record for chunk in self._store.chunks.of_run(max(runs), LASER_CHANNEL) for record in decode_json(chunk.payload))
 
 
 async def counting(session: Session) -> bool:

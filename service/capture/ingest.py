@@ -145,7 +145,7 @@ class Ingest:
     def _give(self, records: list[Record]) -> None:
         chunks = [chunk_of(record) for record in records if record.kind in (CHUNK, GAP)]
         if chunks:
-            self._store.ingest_chunks(chunks)
+            self._store.chunks.ingest(chunks)
 
     def _read(self, offset: int, length: int) -> Record:
         try:

@@ -372,18 +372,18 @@ def settle(store: Store, run_id: int, held: Scan) -> Ledger:
     StoreError
         The database does not take it now, or a chunk cannot be unpacked.
     """
-    keys = store.chunk_keys(run_id)
+    keys = store.chunks.crcs(run_id)
     known = {(record.channel, record.chunk_no) for record in held.records if record.kind in (CHUNK, GAP)}
     broken = bool(held.damaged or held.broken_links)
     if broken or not keys.keys() <= known:  # only where the segment does not tell all is every sample looked at
         streams = {one.chunk_no: one.stream for one in held.records if one.kind == CHUNK and one.channel == BAR}
-        ledger = ledger_of(store.chunks(run_id), streams)
+        ledger = ledger_of(store.chunks.of_run(run_id), streams)
     else:
         ledger = _of_headers(held)
     holes = _holes(ledger, held) if broken or held.tail_bytes else []
     begun = 1 + max((number for channel, number in {*keys, *known} if channel == GAPS), default=-1)
     drafter = Drafter(run_id, lambda: 0.0)
-    store.ingest_chunks([chunk_of(replace(drafter.gap_record(gap), chunk_no=begun + k)) for k, gap in enumerate(holes)])
+    store.chunks.ingest([chunk_of(replace(drafter.gap_record(gap), chunk_no=begun + k)) for k, gap in enumerate(holes)])
     for gap in holes:
         ledger.add_gap(gap)
     return ledger

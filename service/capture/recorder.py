@@ -178,7 +178,7 @@ async def close_run(store: Store, run_id: int, recorder: CaptureRecorder | None,
     try:
         if recorder is not None and recorder.behind:
             return  # the next start takes over what its segment holds, and closes it
-        await store.write(store.finish_run, run_id, status, reason, end)
+        await store.write(store.runs.finish, run_id, status, reason, end)
         if recorder is not None:
             recorder.discard()
     finally:
@@ -264,7 +264,7 @@ def _opened(
     folder = folder_of(store, settings)
     temporary = is_memory(store.url) and not settings.folder
     reserve = Reserve(io, folder, 0 if temporary else settings.reserve_bytes)
-    opening = about | {"run": run_id, "utc": clock.utc().isoformat(), "started_utc": store.run(run_id).started_utc}
+    opening = about | {"run": run_id, "utc": clock.utc().isoformat(), "started_utc": store.runs.find(run_id).started_utc}
     _make(folder, io)
     reserve.hold()
     path = segment_path(folder, run_id)

@@ -188,7 +188,7 @@ class _Runs:
     def get(self, number: int) -> RunRecord | None:
         """The run, None if there is none."""
         if number not in self._found:
-            self._found[number] = self._store.run_numbered(number) if 0 < number < MOST_RUNS else None
+            self._found[number] = self._store.runs.numbered(number) if 0 < number < MOST_RUNS else None
         return self._found[number]
 
 
@@ -280,7 +280,7 @@ def _of_closed(store: Store, path: Path, run: RunRecord, held: Scan, settings: C
     """A run that was closed before the process could delete the file, or that somebody else closed without it."""
     if settings.keep:
         return None
-    keys = store.chunk_keys(run.id)
+    keys = store.chunks.crcs(run.id)
     chunks = [record for record in held.records if record.kind in (CHUNK, GAP)]
     lacking = sum(keys.get((one.channel, one.chunk_no)) != zlib.crc32(one.payload) for one in chunks)
     if lacking:
@@ -295,9 +295,9 @@ def _closed(store: Store, run: RunRecord, text: str, ledger: Ledger | None, capt
     """Close a run; False when another process did it at the same time."""
     gaps = [gap.doc() for gap in ledger.gaps] if ledger is not None else []
     try:
-        store.finish_run(run.id, INTERRUPTED, text, {"gaps": gaps, "capture": capture} if ledger is not None else None)
+        store.runs.finish(run.id, INTERRUPTED, text, {"gaps": gaps, "capture": capture} if ledger is not None else None)
     except StoreError:
-        if store.run(run.id).status == RUNNING:
+        if store.runs.find(run.id).status == RUNNING:
             raise
         return False
     return True
@@ -310,7 +310,7 @@ def _give_up(store: Store, path: Path, run: RunRecord | None, error: Exception) 
     if run is not None and run.status == RUNNING:
         ledger: Ledger | None = None
         with suppress(ValueError, KeyError, TypeError, StoreError):
-            ledger = ledger_of(store.chunks(run.id))
+            ledger = ledger_of(store.chunks.of_run(run.id))
         _closed(store, run, f"interrupted: {done.text}", ledger, {} if ledger is None else ledger.doc())
     return done
 
@@ -346,7 +346,7 @@ def _belongs(held: Scan, run: RunRecord) -> bool:
 
 
 def _ingest(store: Store, run_id: int, held: Scan) -> int:
-    keys = store.chunk_keys(run_id)
+    keys = store.chunks.crcs(run_id)
     missing: list[ChunkRecord] = []
     for record in held.records:
         if record.kind not in (CHUNK, GAP):
@@ -359,7 +359,7 @@ def _ingest(store: Store, run_id: int, held: Scan) -> int:
                 f"run {run_id}: chunk {record.chunk_no} of channel {record.channel!r} is in the database with other content",
                 "nothing was overwritten: compare the segment with the database",
             )
-    return sum(store.ingest_chunks(missing[at : at + BATCH]) for at in range(0, len(missing), BATCH))
+    return sum(store.chunks.ingest(missing[at : at + BATCH]) for at in range(0, len(missing), BATCH))
 
 
 def _ending(held: Scan, added: int) -> str:

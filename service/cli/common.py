@@ -136,9 +136,9 @@ def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
     from abbe.service.errors import StoreError
 
     try:
-        return store.run(name)
+        return store.runs.find(name)
     except StoreError:
-        found = next((one for one in store.campaigns() if one.name == name), None)
+        found = next((one for one in store.campaigns.all() if one.name == name), None)
         if found is None:
             raise
         return found

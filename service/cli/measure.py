@@ -65,7 +65,7 @@ def measure(  # noqa: PLR0913 - one argument for each option
     source = _source(recipe, helix, rate_hz)
     if resume:
         with Store.open(loaded.database_url) as store:
-            store.campaign(resume)
+            store.campaigns.find(resume)
             source = source if recipe or helix else begun_source(store, resume)
     plan = source.plan(site.machine)
     title = resume or name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}"
@@ -102,15 +102,15 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
     from abbe.service.runs.columns import load_run
     from abbe.service.scheduler.record import Occasion, found
 
-    record = store.campaign(campaign)
+    record = store.campaigns.find(campaign)
     started = datetime.fromisoformat(record.created_utc)
-    runs = [load_run(store, run.id) for run in store.runs(record.id) if run.visible_status == "complete"]
+    runs = [load_run(store, run.id) for run in store.runs.all(record.id) if run.visible_status == "complete"]
     try:
         result = judged(config, runs, campaign, started, SystemClock().monotonic_s() - begun_s)
     except MeasurementFault as fault:
         return f"not judged: {fault.detail}"
     doc = found(Occasion(config.name, Schedule("by hand", "", "UTC", recipe), started), result)
-    number = store.add_verification(record.machine_id, record.id, str(doc["verdict"]), doc)
+    number = store.verifications.add(record.machine_id, record.id, str(doc["verdict"]), doc)
     return f"check {number}: {result.verdict}: {result.text}"
 
 
@@ -202,7 +202,7 @@ def correct(
     async def work(store: Store) -> Correction:
         from abbe.service.cli.progress import display
 
-        store.campaign(campaign)
+        store.campaigns.find(campaign)
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink)
@@ -234,7 +234,7 @@ async def verification_before(session: Session, store: Store, site: Site, campai
     from abbe.service.sequences.recipes.campaigns import verification
 
     if campaign:
-        ids = [r.id for r in store.runs(campaign) if r.visible_status == "complete"]
+        ids = [r.id for r in store.runs.all(campaign) if r.visible_status == "complete"]
     else:
         plan = paced(verification(site.machine, name=f"verify-before {SystemClock().utc():%Y-%m-%d %H:%M:%S}"), site.max_feed_mm_min)
         ids = await work_measure(session, store, site, plan, progress=sink)

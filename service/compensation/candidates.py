@@ -140,5 +140,5 @@ def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str
 
 
 def _last_push_s(store: Store, site: Site) -> float:
-    kept = [e for e in store.push_entries(site.name, site.control) if e.state == "KEEP"]
+    kept = [e for e in store.pushes.entries(site.name, site.control) if e.state == "KEEP"]
     return datetime.fromisoformat(kept[-1].utc).timestamp() if kept else float("-inf")

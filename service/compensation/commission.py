@@ -96,13 +96,13 @@ async def commission(session: Session, store: Store, site: Site, *, progress: Pr
     base = await read_base(session.controller)
     lsb_nm = (await session.controller.table_format()).lsb_nm
     known = identity(await session.controller.identify())
-    number = sum(c.name.startswith(KIND) for c in await asyncio.to_thread(store.campaigns)) + 1
+    number = sum(c.name.startswith(KIND) for c in await asyncio.to_thread(store.campaigns.all)) + 1
     context = CommissioningContext(session, store, site, BarPlaces(session, store, site, progress, f"{KIND} {number}", PLACES))
     steps = _steps(context, base, lsb_nm)  # and their limits, before anything is mounted
     async with context.bar.cleared_away():
         proof = await _prove(context, base, steps)
-        campaign = await asyncio.to_thread(store.campaign, f"{context.bar.name} before")
-        solution_id = await store.write(store.add_solution, campaign.id, KIND, context.bar.run_ids, _doc(proof) | {"identity": known})
+        campaign = await asyncio.to_thread(store.campaigns.find, f"{context.bar.name} before")
+        solution_id = await store.write(store.solutions.add, campaign.id, KIND, context.bar.run_ids, _doc(proof) | {"identity": known})
     return Proved(proof, solution_id)
 
 
@@ -141,9 +141,9 @@ async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> Si
     if moved_mm > HARMLESS * max(steps.small_mm, FIRST_MM):
         moved = f"a step of {steps.small_mm * 1e3:g} µm moved the tool by {moved_mm * 1e3:.1f} µm"
         what = f"{moved}: the control takes the numbers for another unit"
-        campaign = await asyncio.to_thread(context.store.campaign, f"{context.bar.name} before")
+        campaign = await asyncio.to_thread(context.store.campaigns.find, f"{context.bar.name} before")
         doc = {"step_mm": steps.small_mm, "faults": [what], "proved": False}
-        await context.store.write(context.store.add_solution, campaign.id, KIND, context.bar.run_ids, doc)
+        await context.store.write(context.store.solutions.add, campaign.id, KIND, context.bar.run_ids, doc)
         raise TableRefused(what, "the old table is in force; look up the unit of the control's table and its entry in the machine file")
     read = [await context.with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
     after = await context.bar.read("after")
@@ -204,8 +204,8 @@ async def commissioned(controller: Identity, store: Store, site: Site) -> bool |
 
 
 def _last(store: Store, site: Site) -> dict[str, Any] | None:
-    ids = {c.id for c in store.campaigns() if store.machine(c.machine_id).name == site.name}
-    last = [s for s in store.solutions() if s.kind == KIND and s.campaign_id in ids][-1:]
+    ids = {c.id for c in store.campaigns.all() if store.machines.get(c.machine_id).name == site.name}
+    last = [s for s in store.solutions.all() if s.kind == KIND and s.campaign_id in ids][-1:]
     return dict(last[0].doc) if last else None
 
 

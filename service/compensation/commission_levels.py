@@ -98,9 +98,9 @@ def how(shown: tuple[Shown, ...], flag: str) -> str:
 
 
 def _keep(store: Store, site: Site, doc: Doc) -> int:
-    machine_id = store.add_machine(site.name, site.doc)
-    number = sum(c.name.startswith(f"{KIND} ") for c in store.campaigns()) + 1
-    return store.add_solution(store.add_campaign(machine_id, f"{KIND} {number}", {}), KIND, [], doc)
+    machine_id = store.machines.add(site.name, site.doc)
+    number = sum(c.name.startswith(f"{KIND} ") for c in store.campaigns.all()) + 1
+    return store.solutions.add(store.campaigns.add(machine_id, f"{KIND} {number}", {}), KIND, [], doc)
 
 
 def _earlier_boots(store: Store, site: Site) -> set[int]:

@@ -142,7 +142,7 @@ async def _push(context: PushContext, admission: Admission, made: Made, before: 
     misfit_mm = None if helix is None else helix_misfit(made.solved, _as_solved(helix, made.solved, held.base.tables))
     bar = None
     if session.ballbar is not None and session.fixture is not None:
-        number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns)) + 1
+        number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns.all)) + 1
         bar = BarPlaces(session, store, site, context.progress, f"{SIGN} {number}", PLACES, context.control)
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
@@ -185,7 +185,7 @@ class _Correcting:
         drift = [] if self.drift_mm is not None else [UNSEEN]
         # Decisions are read anew: a person may have rejected it while the ball-bar was read.
         number, store = self.held.number, self.context.store
-        now = replace(self.held, rejections=tuple(store.rejections(number)), approvals=tuple(store.approvals(number)))
+        now = replace(self.held, rejections=tuple(store.proposals.rejections(number)), approvals=tuple(store.proposals.approvals(number)))
         return [*now.reasons(self.drift_mm), *drift]
 
     async def probe(self) -> Verdict:
@@ -200,7 +200,7 @@ class _Correcting:
 
     async def verify(self) -> Verdict:
         context = self.context
-        number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(context.store.campaigns)) + 1
+        number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(context.store.campaigns.all)) + 1
         name = f"{VERIFY}{number}"
         plan = paced(verification(context.site.machine, rate_hz=context.rate_hz, name=name), context.site.max_feed_mm_min)
         manner = Manner(control=context.control, part=True)
@@ -245,7 +245,7 @@ async def _store_verification(
 ) -> None:
     store, site = context.store, context.site
     rows = {k: {"value": v, "u": u} for k, (v, u) in figure_rows(after).items()}
-    machine_id = await store.write(store.add_machine, site.name, site.doc)
+    machine_id = await store.write(store.machines.add, site.name, site.doc)
     doc = {"text": decision.text, "push": pushed.push_id, "figures": rows}
-    campaign = await asyncio.to_thread(store.campaign, name)
-    await store.write(store.add_verification, machine_id, campaign.id, "pass" if decision.keep else "fail", doc)
+    campaign = await asyncio.to_thread(store.campaigns.find, name)
+    await store.write(store.verifications.add, machine_id, campaign.id, "pass" if decision.keep else "fail", doc)

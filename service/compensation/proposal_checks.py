@@ -14,12 +14,12 @@ from abbe.service.compensation.candidates import scene_of, until_s
 from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.compensation.proposals import by_whom, login
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableRefused
 from abbe.service.push.candidate import Candidate, CandidateContext, EvidenceSeal
 from abbe.service.push.operations import Approval
 from abbe.service.push.validate import content_digest, reasons_against
 from abbe.service.site import Site
-from abbe.service.storage.base import utc_text
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base, read_base
 
@@ -102,7 +102,7 @@ async def hold(
     """Read what a proposal is held against. Nothing is written."""
     base = await read_base(controller)
     scene = await scene_of(site, store, base, await controller.table_format(), proposed.tables, clock, attended=attended)
-    approvals, rejections = await asyncio.to_thread(lambda: (store.approvals(number), store.rejections(number)))
+    approvals, rejections = await asyncio.to_thread(lambda: (store.proposals.approvals(number), store.proposals.rejections(number)))
     return HoldReason(number, proposed, site, base, scene, tuple(approvals), tuple(rejections), attended)
 
 
@@ -149,10 +149,10 @@ def approve(
     if proposed.two_people and _same(name, proposed.by):
         raise TableRefused(f"{name} proposed it: this machine needs a second person to approve", "let somebody else approve it")
     expiry = utc_text(now + timedelta(seconds=min(hours * 3600.0, left_s)))
-    store.add_approval(
+    store.proposals.approve(
         ProposalApproval(proposal_id=number, name=name, login=account or login(), digest=proposed.binding(expiry), expiry=expiry)
     )
-    return store.approvals(number)[-1]
+    return store.proposals.approvals(number)[-1]
 
 
 def reject(store: Store, number: int, name: str, reason: str, account: str | None = None) -> ProposalRejection:
@@ -165,8 +165,8 @@ def reject(store: Store, number: int, name: str, reason: str, account: str | Non
     """
     if not reason.strip():
         raise TableRefused(f"proposal {number} is not rejected without a reason", "say why; the proposer has to know")
-    store.add_rejection(ProposalRejection(proposal_id=number, name=name, login=account or login(), reason=reason.strip()))
-    return store.rejections(number)[-1]
+    store.proposals.reject(ProposalRejection(proposal_id=number, name=name, login=account or login(), reason=reason.strip()))
+    return store.proposals.rejections(number)[-1]
 
 
 def _same(one: str, other: str) -> bool:

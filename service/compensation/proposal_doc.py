@@ -194,7 +194,7 @@ def load(store: Store, number: int) -> Proposed:
     StoreError
         There is none of this number, or its row is not what was stored.
     """
-    record = store.proposal(number)
+    record = store.proposals.get(number)
     try:
         sound = digest_of_doc(record.doc) == record.digest
         proposed = proposed_from(record.doc) if sound else None

@@ -29,8 +29,8 @@ class ProposalStatus:
 def proposal_status(store: Store, number: int, proposed: Proposed, now_s: float) -> ProposalStatus:
     """Where a stored proposal stands."""
     entries = read_entries(store, proposed.candidate.machine)
-    docs = {t.id: t.doc for t in store.tables()}
-    return status_of_proposal(number, proposed, store.approvals(number), entries, docs, now_s, store.rejections(number))
+    docs = {t.id: t.doc for t in store.tables.all()}
+    return status_of_proposal(number, proposed, store.proposals.approvals(number), entries, docs, now_s, store.proposals.rejections(number))
 
 
 def status_of_proposal(

@@ -23,6 +23,7 @@ from abbe.service.compensation.candidates import Promise, candidate_of, scene_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.identification.effect_removal import TakenOut, taken_out
 from abbe.service.identification.solve import Solved, solve_runs
@@ -31,7 +32,6 @@ from abbe.service.identification.table_removal import TableThen
 from abbe.service.push.validate import reasons_against
 from abbe.service.runs.columns import load_run
 from abbe.service.site import Site
-from abbe.service.storage.base import utc_text
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base, read_base
 from abbe.service.tables.nine_tables import added
@@ -79,13 +79,13 @@ async def gather(controller: TableController, store: Store, site: Site, campaign
     TableRefused
         The campaign is another machine's.
     """
-    record = await asyncio.to_thread(store.campaign, campaign)
-    measured_on = (await asyncio.to_thread(store.machine, record.machine_id)).name
+    record = await asyncio.to_thread(store.campaigns.find, campaign)
+    measured_on = (await asyncio.to_thread(store.machines.get, record.machine_id)).name
     if measured_on != site.name:
         raise TableRefused(
             f"campaign {record.name} was measured on {measured_on!r}, this is {site.name!r}", "name a campaign of this machine"
         )
-    records = [r for r in await asyncio.to_thread(store.runs, record.id) if r.visible_status == "complete"]
+    records = [r for r in await asyncio.to_thread(store.runs.all, record.id) if r.visible_status == "complete"]
     runs = await load_runs(store, [r.id for r in records])
     base = await read_base(controller)
     check_same_table(base, [r for r in runs if r["role"] == "identify"])
@@ -113,7 +113,7 @@ async def make(
     proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm)
     agree(proposal.predicted)
     doc = solution_doc(proposal.solved) | known.doc | {"machine": site.doc}
-    solution_id = await store.write(store.add_solution, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
+    solution_id = await store.write(store.solutions.add, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
     promise = Promise(proposal.tables, proposal.change, proposal.predicted, None, *_ends_s(gathered.records))
     candidate = candidate_of(site, promise, base, known.campaign.runs, form)
     scene = await scene_of(site, store, base, form, proposal.tables, clock)
@@ -124,7 +124,7 @@ async def make(
         by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, scene, site.limits)), known.lines,
     )  # fmt: skip
     plain = doc_of(proposed)
-    number = await store.write(store.add_proposal, site.name, solution_id, plain, digest_of_doc(plain))
+    number = await store.write(store.proposals.add, site.name, solution_id, plain, digest_of_doc(plain))
     return Made(number, proposed, proposal.solved)
 
 
@@ -217,7 +217,7 @@ def by_whom() -> str:
 
 async def load_runs(store: Store, run_ids: list[int]) -> list[dict[str, Any]]:
     """Runs of the store as ``abbe-run/1`` objects, read off the event loop; ``stored`` says when each ended."""
-    return await asyncio.to_thread(lambda: [load_run(store, k) | {"stored": {"ended_utc": store.run(k).ended_utc}} for k in run_ids])
+    return await asyncio.to_thread(lambda: [load_run(store, k) | {"stored": {"ended_utc": store.runs.find(k).ended_utc}} for k in run_ids])
 
 
 def check_before_runs(site: Site, base: Base, runs: list[dict[str, Any]], since_s: float, now_s: float) -> None:

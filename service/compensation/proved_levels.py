@@ -45,8 +45,8 @@ def flags_of(capabilities: Capabilities) -> dict[str, bool]:
 
 def last_proof(store: Store, site: Site) -> Doc | None:
     """Document of the last commissioning of this machine's controller; None if there was none."""
-    ids = {c.id for c in store.campaigns() if store.machine(c.machine_id).name == site.name}
-    last = [s for s in store.solutions() if s.kind == KIND and s.campaign_id in ids][-1:]
+    ids = {c.id for c in store.campaigns.all() if store.machines.get(c.machine_id).name == site.name}
+    last = [s for s in store.solutions.all() if s.kind == KIND and s.campaign_id in ids][-1:]
     return dict(last[0].doc) if last else None
 
 

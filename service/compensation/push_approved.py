@@ -66,7 +66,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
     """
     tried = {e.doc.get("approval") for e in entries if e.kind == AlarmKind.PUSHING}
     asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
-    given = [(rows[-1].id, record.id) for record in store.proposals(machine) if (rows := store.approvals(record.id))]
+    given = [(rows[-1].id, record.id) for record in store.proposals.all(machine) if (rows := store.proposals.approvals(record.id))]
     if not given:
         return None
     approval, number = max(given)

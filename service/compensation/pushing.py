@@ -175,8 +175,8 @@ class Pushing:
             raise TableRefused(f"the tables need {len(image) // 2} registers, a bank has {form.bank_registers}", "use a coarser grid")
         self.crc = crc32(image)
         level = self.level if self.level is not None else (await level_status(self.controller, self.store, self.site)).level
-        machine_id = await self.store.write(self.store.add_machine, self.site.name, self.site.doc)
-        table_id = await self.store.write(self.store.add_table, machine_id, wanted.solution_id, image, crc32(image), wanted.doc)
+        machine_id = await self.store.write(self.store.machines.add, self.site.name, self.site.doc)
+        table_id = await self.store.write(self.store.tables.add, machine_id, wanted.solution_id, image, crc32(image), wanted.doc)
         return OperationOrder(
             self.site.name, image, crc32(image), meaning, self.site.limits.digest(),
             owner=(secrets.randbits(15) + 1) << 16, level=level, attended=self.attended, table=table_id,

@@ -49,7 +49,7 @@ async def recover(controller: TableController, store: Store, site: Site, *, acce
     StoreError, CaptureFault
         The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only told.
     """
-    await store.write(store.add_machine, site.name, site.doc)  # the machine as it is described now
+    await store.write(store.machines.add, site.name, site.doc)  # the machine as it is described now
     # First: whatever is wrong with a segment, no unverified table stays active.
     pushed = await finish_push(controller, store, site, accept_by=accept_by)
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
@@ -135,7 +135,7 @@ async def accept(controller: TableController, store: Store, site: Site, by: str 
         Another process is in the middle of a push on this machine.
     """
     clock = SystemClock()
-    await store.write(store.add_machine, site.name, site.doc)
+    await store.write(store.machines.add, site.name, site.doc)
     book = await StoreBook.last(store, site.name, clock, site.control)
     journal: Journal = () if book is None else await book.entries()
     if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):
@@ -161,7 +161,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
             "take that one away at the control first; nothing was accepted",
         )
     known = await asyncio.to_thread(known_tables, store)
-    chain = await asyncio.to_thread(store.push_chain, site.name, site.control)
+    chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
     await _given_to_a_person(store, site, chain)
     for other_chain in _open_with(crc, known) - {chain}:
         book = await _given_to_a_person(store, site, other_chain)

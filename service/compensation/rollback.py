@@ -119,7 +119,7 @@ async def rollback(
 
 
 def _rollbacks(store: Store) -> frozenset[int]:
-    return frozenset(t.id for t in store.tables() if t.doc.get("kind") == KIND)
+    return frozenset(t.id for t in store.tables.all() if t.doc.get("kind") == KIND)
 
 
 def _base(journal: Journal, how: str) -> KnownTables:

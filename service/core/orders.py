@@ -34,8 +34,8 @@ from abbe.service.jobs.guided_campaign import is_full
 from abbe.service.scheduler.job import Job, failure
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
+from abbe.service.storage.store import Store
 from abbe.service.tables.push_outcome import STOPPED, in_force, last_push, ordered, put_right
 from abbe.service.tables.table_history import offered
 
@@ -189,7 +189,7 @@ class Orders(RetryingStore):
 
     Parameters
     ----------
-    store : ServiceStore
+    store : Store
         Holds the push journal.
     clock : Clock
         Now.
@@ -201,7 +201,7 @@ class Orders(RetryingStore):
         What can be ordered.
     """
 
-    def __init__(self, store: ServiceStore, clock: Clock, jobs: JobRegistry, context: OrderContext, actions: OrderActions) -> None:
+    def __init__(self, store: Store, clock: Clock, jobs: JobRegistry, context: OrderContext, actions: OrderActions) -> None:
         super().__init__(store, clock)
         self._jobs, self._context, self._actions = jobs, context, actions
 

@@ -19,7 +19,7 @@ def may(store: Store, who: str, need: Permission) -> bool:
         The right.
     """
     name = person(who)
-    user = store.user(name) if name else None
+    user = store.people.find(name) if name else None
     if user is None or user.disabled_utc is not None:
         return False
     return any(user.role == role and need in ALLOWED[role] for role in Role)  # a role that we do not know allows nothing

@@ -20,7 +20,7 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
 from abbe.service.scheduler.ready import AlwaysReady
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.tables.in_force import LookAtTable
 
 
@@ -84,20 +84,20 @@ class ServiceSetup:
     broker: Broker | None
     topics: Topics
     web: Web
-    check: Callable[[ServiceStore], Check]
+    check: Callable[[Store], Check]
     maintenance: tuple[Window, ...] = ()
     ready: Callable[[Clock], Readiness] = lambda _: AlwaysReady()
     opcua: OpcUa | None = None
     recipes: tuple[str, ...] = ()
-    recover: Callable[[ServiceStore], Recover] | None = None
+    recover: Callable[[Store], Recover] | None = None
     rules: Rules = field(default_factory=Rules)
-    duties: Callable[[ServiceStore], Duties] | None = None
-    table: Callable[[ServiceStore], LookAtTable] | None = None
+    duties: Callable[[Store], Duties] | None = None
+    table: Callable[[Store], LookAtTable] | None = None
     live: LiveFeed | None = None
     summary: MachineSummary | None = None
-    actions: Callable[[ServiceStore], OrderActions] | None = None
+    actions: Callable[[Store], OrderActions] | None = None
     campaigns: tuple[str, ...] = ()
-    campaign: Callable[[ServiceStore], MeasureCampaign] | None = None
+    campaign: Callable[[Store], MeasureCampaign] | None = None
     warnings: tuple[str, ...] = ()
     """What the machine file says that is possible and rarely meant: logged once the service serves."""
 

@@ -104,8 +104,8 @@ async def solved_today(session: Session, store: Store, site: Site, rate_hz: int)
     plan = paced(identification(site.machine, rate_hz=rate_hz, name="as delivered"), site.max_feed_mm_min)
     ids = await measure(session, store, site, plan, progress=ignore_progress)
     solved = await asyncio.to_thread(solve_runs, site, await load_runs(store, ids))
-    campaign = await asyncio.to_thread(store.campaign, plan.name)
-    await store.write(store.add_solution, campaign.id, "joint", ids, solution_doc(solved) | {"machine": site.doc})
+    campaign = await asyncio.to_thread(store.campaigns.find, plan.name)
+    await store.write(store.solutions.add, campaign.id, "joint", ids, solution_doc(solved) | {"machine": site.doc})
 
 
 def served_lines(port: int, limits_um: dict[str, float]) -> str:
@@ -244,7 +244,7 @@ async def story(world: SimulatorProcess, machine: str, store: Store, serving: Se
     if proposed.kind is not AlarmKind.PROPOSED:
         raise AbbeError("the story ends here: the service proposes nothing", f"{serving.log} says more; try another --seed")
     say(f"   approve it at {serving.page}proposal?id={proposal}")
-    who = (await _until(lambda: store.approvals(proposal)))[-1].name
+    who = (await _until(lambda: store.proposals.approvals(proposal)))[-1].name
     say(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")
     pushed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PUSHED))
     say(f"7. {pushed.doc['text']}")
@@ -255,8 +255,8 @@ async def story(world: SimulatorProcess, machine: str, store: Store, serving: Se
 
 def _checks(store: Store, machine: str) -> list[str]:
     """What the scheduled checks of a machine found, oldest first."""
-    number = next((m.id for m in store.machines() if m.name == machine), None)
-    rows = [] if number is None else store.verifications(number)
+    number = next((m.id for m in store.machines.all() if m.name == machine), None)
+    rows = [] if number is None else store.verifications.latest(number)
     return [str(v.doc.get("text", "")) for v in sorted(rows, key=lambda v: v.id) if v.doc.get("schedule")]
 
 

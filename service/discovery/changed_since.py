@@ -79,12 +79,12 @@ def since_of(store: Store, campaign: Campaign) -> Since | None:
 
 def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
     """Solutions of all 21 motions of this machine's earlier campaigns, the newest first."""
-    numbers = {m.id for m in store.machines() if m.name == campaign.site.name}
-    mine = [c for c in store.campaigns() if c.machine_id in numbers]
+    numbers = {m.id for m in store.machines.all() if m.name == campaign.site.name}
+    mine = [c for c in store.campaigns.all() if c.machine_id in numbers]
     at = next((c.id for c in mine if c.name == campaign.name), 0)
     digest = machine_digest(campaign.site.machine)
     for one in reversed([c for c in mine if c.id < at]):
-        for record in reversed(store.solutions(one.id)):
+        for record in reversed(store.solutions.all(one.id)):
             doc = record.doc
             if str(doc.get("model", "")).startswith("rigid21") and (doc.get("inputs") or {}).get("machine") == digest:
                 yield record
@@ -100,7 +100,7 @@ def _before_of(store: Store, record: SolutionRecord) -> _Before:
 def _tables_of(store: Store, record: SolutionRecord) -> list[Doc]:
     """What each run of a solution says of its table; what the solution says, where its runs say nothing."""
     used = set(record.run_ids)
-    starts = [r.start_doc for r in store.runs(record.campaign_id) if r.id in used]
+    starts = [r.start_doc for r in store.runs.all(record.campaign_id) if r.id in used]
     told = [start.get("imported", start).get("table") or {} for start in starts]
     return told if any(told) else tables_of(record.doc)
 

@@ -50,7 +50,7 @@ class Added:
 
 def rounds(store: Store, name: str) -> int:
     """How many additions a campaign stands on, itself counted if it is one: what its runs are labelled by is taken."""
-    before = {c.name: (c.doc.get("continues") or {}).get("campaign") for c in store.campaigns()}
+    before = {c.name: (c.doc.get("continues") or {}).get("campaign") for c in store.campaigns.all()}
     chain = [name]
     while (old := before.get(chain[-1])) is not None and old not in chain:
         chain.append(old)
@@ -69,10 +69,10 @@ def added(store: Store, campaign: Campaign, plan: CampaignPlan, after_s: float =
         Another process is measuring it.
     """
     link = {"campaign": campaign.name, "plan": hashlib.sha256(repr(plan.tests).encode()).hexdigest()}
-    begun = next((c for c in reversed(store.campaigns()) if c.doc.get("continues") == link), None)
+    begun = next((c for c in reversed(store.campaigns.all()) if c.doc.get("continues") == link), None)
     if begun is None:
         return Added(plan, plan, None, link, after_s)
-    runs = store.runs(begun.id)
+    runs = store.runs.all(begun.id)
     for run in runs:
         if run.visible_status == RUNNING:
             raise UnsafeToMove(

@@ -21,11 +21,11 @@ class StoredJournal(DiscoveryJournal):
     def __init__(self, store: Store, discovery_id: int, machine: str) -> None:
         super().__init__()
         self._store, self._id, self._machine = store, discovery_id, machine
-        base = base_of(store.discovery(discovery_id))
+        base = base_of(store.discoveries.get(discovery_id))
         self.base = base.model_version
         self._after = base.after
         self.steps = stored_steps(store, discovery_id)
-        self.version = next((m.version for m in store.models(machine) if m.discovery_id == discovery_id), None)
+        self.version = next((m.version for m in store.models.all(machine) if m.discovery_id == discovery_id), None)
 
     @property
     def id(self) -> int | None:
@@ -40,7 +40,7 @@ class StoredJournal(DiscoveryJournal):
     def _keep(self, seq: int, step: DiscoveryStep, model: ModelBook | None) -> None:
         new = None if model is None else NewVersion(self._machine, self._after, document(model))
         try:
-            self.version = self._store.add_discovery_step(self._id, seq, step.state, document(step), new)
+            self.version = self._store.discoveries.add_step(self._id, seq, step.state, document(step), new)
         except ModelMovedOn as moved:
             # Adding it to effects that its search has not seen could count one thing twice, or keep what was mended.
             again = "run the same command again: it searches anew with what the model knows now"
@@ -63,15 +63,15 @@ def journal_of(store: Store, job: DiscoveryJob, before: StoredJournal | None = N
         Another campaign of this name is in the store.
     """
     ensure_stored(store, job.campaign)
-    campaign = store.campaign(job.campaign.name)
+    campaign = store.campaigns.find(job.campaign.name)
     machine, digest = job.campaign.site.name, job.digest
-    for old in reversed(store.discoveries(campaign.id)):
+    for old in reversed(store.discoveries.all(campaign.id)):
         if old.digest == digest and (_goes_on(old, before) if before is not None else _holds(store, old, machine, job.seen)):
             return StoredJournal(store, old.id, machine)
     base = SearchBase(
         model_version=None if job.base is None else job.base.version, after=job.seen, continues=None if before is None else before.id
     )
-    return StoredJournal(store, store.add_discovery(campaign.id, digest, document(base)), machine)
+    return StoredJournal(store, store.discoveries.add(campaign.id, digest, document(base)), machine)
 
 
 def base_of(one: DiscoveryRecord) -> SearchBase:
@@ -87,7 +87,7 @@ def stored_steps(store: Store, discovery_id: int) -> list[DiscoveryStep]:
     Unusable
         One of them was stored by a version that kept another form.
     """
-    return [record(DiscoveryStep, s.doc, f"state {s.state} of discovery {discovery_id}") for s in store.discovery_steps(discovery_id)]
+    return [record(DiscoveryStep, s.doc, f"state {s.state} of discovery {discovery_id}") for s in store.discoveries.steps(discovery_id)]
 
 
 def _goes_on(old: DiscoveryRecord, before: StoredJournal) -> bool:
@@ -96,7 +96,7 @@ def _goes_on(old: DiscoveryRecord, before: StoredJournal) -> bool:
 
 def _holds(store: Store, old: DiscoveryRecord, machine: str, now: int | None) -> bool:
     """Whether a search has nothing to learn from the model's current version."""
-    brought = {m.version: m.discovery_id for m in store.models(machine)}
+    brought = {m.version: m.discovery_id for m in store.models.all(machine)}
     if old.id in _line(store, None if now is None else brought.get(now)):
         return True
     return old.id not in brought.values() and base_of(old).after == now
@@ -107,5 +107,5 @@ def _line(store: Store, discovery_id: int | None) -> list[int]:
     out: list[int] = []
     while discovery_id is not None:
         out.append(discovery_id)
-        discovery_id = base_of(store.discovery(discovery_id)).continues
+        discovery_id = base_of(store.discoveries.get(discovery_id)).continues
     return out

@@ -26,7 +26,7 @@ def linear_words(store: Store, made: Made) -> str:
 
     Only solutions that were measured with the same table in force are compared. What both share (the laser's wavelength) counts twice in U.
     """
-    new = store.solution(made.proposed.solution_id)
+    new = store.solutions.get(made.proposed.solution_id)
     means: Means = new.doc.get("mean_over_volume") or {}
     known = {k: v for k, v in means.items() if k in NAMES and v.get("value") is not None and v.get("u") is not None}
     if not known:
@@ -56,7 +56,7 @@ def _size(value: float, u: float) -> str:
 def _before(store: Store, new: SolutionRecord) -> SolutionRecord | None:
     """The last solution of the same machine, geometry included, that is comparable."""
     machine = new.doc["inputs"]["machine"]
-    same = [c.id for c in store.campaigns() if c.machine_id == store.campaign(new.campaign_id).machine_id]
-    found = [s for number in same for s in store.solutions(number) if s.id < new.id and s.doc.get("mean_over_volume")]
+    same = [c.id for c in store.campaigns.all() if c.machine_id == store.campaigns.find(new.campaign_id).machine_id]
+    found = [s for number in same for s in store.solutions.all(number) if s.id < new.id and s.doc.get("mean_over_volume")]
     found = [s for s in found if s.doc["inputs"]["machine"] == machine and s.doc["inputs"].get("tables") == new.doc["inputs"].get("tables")]
     return max(found, key=lambda s: s.id, default=None)

@@ -122,7 +122,7 @@ def _coefficients(entry: EffectSize) -> F1:
 
 def versions(store: Store, machine: str | None = None) -> list[ModelVersion]:
     """All versions of a machine's model, or of all machines, oldest first."""
-    return [_parsed(one) for one in store.models(machine)]
+    return [_parsed(one) for one in store.models.all(machine)]
 
 
 def _parsed(one: ModelRecord) -> ModelVersion:
@@ -132,7 +132,7 @@ def _parsed(one: ModelRecord) -> ModelVersion:
 
 def current(store: Store, machine: str) -> ModelVersion | None:
     """The newest version of a machine's model; None if its book is empty."""
-    found = store.models(machine)
+    found = store.models.all(machine)
     return _parsed(found[-1]) if found else None
 
 
@@ -144,7 +144,7 @@ def version(store: Store, machine: str, number: int) -> ModelVersion:
     ModelUnknown
         There is no such version, or no book of this machine.
     """
-    known = store.models(machine)
+    known = store.models.all(machine)
     found = next((m for m in known if m.version == number), None)
     if found is None:
         have = f"versions 1 to {len(known)}" if known else "no model"
@@ -211,7 +211,7 @@ def revert(store: Store, machine: str, number: int) -> int:
     if newest is None or newest.version == number:
         raise ModelUnknown(f"version {number} of machine {machine!r} is the current one", LOOK)
     book = replace(old.book, parent=newest.version, why=f"back to version {number}, by hand")
-    return store.add_model(NewVersion(machine, newest.version, document(book)))
+    return store.models.add(NewVersion(machine, newest.version, document(book)))
 
 
 def differences(first: ModelVersion, second: ModelVersion, effects: tuple[Effect, ...] = ()) -> list[Difference]:

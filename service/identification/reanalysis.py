@@ -53,7 +53,7 @@ def solve_task(task: ReanalysisTask) -> Reanalysed:
 
 def tasks_of(store: Store, url: str, pattern: str, model: Model) -> list[ReanalysisTask]:
     """Every campaign whose name matches (``june-*``), in order of their numbers."""
-    return [ReanalysisTask(url, one.name, model) for one in store.campaigns() if fnmatchcase(one.name, pattern)]
+    return [ReanalysisTask(url, one.name, model) for one in store.campaigns.all() if fnmatchcase(one.name, pattern)]
 
 
 def solve_all(tasks: Sequence[ReanalysisTask], executor: Executor, store: Store | None = None) -> Iterator[Reanalysed]:

@@ -96,7 +96,7 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
     if "prediction" not in doc:
         raise Unusable(f"solution {record.id} does not hold its covariance: a version before it was kept stored it", "solve again")
     terms, coefficients, covariance = stored_prediction(doc["prediction"])
-    machine = machine_from_doc(store.machine(store.campaign(record.campaign_id).machine_id).doc)
+    machine = machine_from_doc(store.machines.get(store.campaigns.find(record.campaign_id).machine_id).doc)
     motions: Mapping[str, Mapping[str, Any]] = doc.get("motions") or {}
     statuses = {name: str(told.get("status", "")) for name, told in motions.items()}
     means = {name: (float(m["value"]), float(m["u"])) for name, m in (doc.get("mean_over_volume") or {}).items()}

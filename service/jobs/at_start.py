@@ -43,7 +43,7 @@ async def push_is_open(store: Store, machine: str, control: str = "") -> bool:
     StoreError
         The database does not answer.
     """
-    journal = await asyncio.to_thread(store.last_push, machine, control)
+    journal = await asyncio.to_thread(store.pushes.last, machine, control)
     if not journal:
         return False
     state = PushState(journal[-1].state)

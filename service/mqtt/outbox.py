@@ -57,19 +57,19 @@ class Outbox(Protocol):
 class OutboxStore(Protocol):
     """The part of the store that is used here."""
 
-    def outbox_pending(self, limit: int = ...) -> Sequence[OutboxRow]:
+    def pending(self, limit: int = ...) -> Sequence[OutboxRow]:
         """Return the oldest unacknowledged messages."""
         ...
 
-    def outbox_done(self, outbox_id: int, /) -> None:
+    def done(self, outbox_id: int, /) -> None:
         """Note that the broker has this one."""
         ...
 
-    def outbox_prune(self, keep: int, at_most: int = ..., /) -> int:
+    def prune(self, keep: int, at_most: int = ..., /) -> int:
         """Forget delivered messages but the newest; return how many."""
         ...
 
-    def outbox_shed(
+    def shed(
         self, topics: Sequence[str], most: int, down_to: int, notice: Callable[[int, str, str], tuple[str, bytes]] | None = ..., /
     ) -> int:
         """Drop the oldest waiting messages of some topics when there are too many; return how many."""
@@ -107,17 +107,17 @@ class StoreOutbox:
 
     async def pending(self) -> Sequence[OutboxRow]:
         """Return up to 100 messages, oldest first."""
-        return await asyncio.to_thread(self._store.outbox_pending, 100)
+        return await asyncio.to_thread(self._store.pending, 100)
 
     async def done(self, number: int) -> None:
         """Note that the broker has this one."""
-        await asyncio.to_thread(self._store.outbox_done, number)
+        await asyncio.to_thread(self._store.done, number)
 
     async def tidy(self) -> int:
         """Forget what was delivered long ago; drop the oldest alarms when too many wait, and queue a message that says so."""
-        while await asyncio.to_thread(self._store.outbox_prune, self._kept, PRUNED_AT_ONCE) == PRUNED_AT_ONCE:
+        while await asyncio.to_thread(self._store.prune, self._kept, PRUNED_AT_ONCE) == PRUNED_AT_ONCE:
             pass
-        return await asyncio.to_thread(self._store.outbox_shed, (self._topics.alarm,), self._most, self._down_to, self._notice)
+        return await asyncio.to_thread(self._store.shed, (self._topics.alarm,), self._most, self._down_to, self._notice)
 
     def _notice(self, count: int, first_utc: str, last_utc: str) -> tuple[str, bytes]:
         what = f"the broker was away too long: {count} alarms from {first_utc} to {last_utc} were dropped before they could be delivered"

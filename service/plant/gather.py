@@ -5,28 +5,17 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from datetime import datetime
-from typing import Any, Protocol
+from typing import Any
 
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import CheckFailure, Verification
 from abbe.service.plant.facts import ActiveTable, PlantAlarm, PlantFacts
 from abbe.service.queries.status import Status
+from abbe.service.storage.store import Store
 
 SHOWN_ALARMS = 20
 _NOT_RUN = {"missed": "SCH-001", "skipped": "SCH-002", "interrupted": "SCH-007"}
-
-
-class Archive(Protocol):
-    """The part of the store that is read here beside the status."""
-
-    def slots_not_run(self, machine: str, limit: int = ..., /) -> Sequence[SlotRecord]:
-        """Return the latest slots of a machine that were missed, skipped or interrupted, newest first."""
-        ...
-
-    def last_push(self, machine: str, control: str = "", /) -> Sequence[PushEntryRecord]:
-        """Return the journal of the last push of a machine; empty if there was none."""
-        ...
 
 
 class Gatherer:
@@ -36,12 +25,12 @@ class Gatherer:
     ----------
     status : callable
         Gives what the status page shows : machine, job, devices, next due and last checks.
-    archive : Archive, optional
+    store : Store, optional
         Slots and pushes. Without it there are only the alarms of failed checks, and no table.
     """
 
-    def __init__(self, status: Callable[[], Awaitable[Status]], archive: Archive | None = None, control: str = "") -> None:
-        self._status, self._archive, self._control = status, archive, control
+    def __init__(self, status: Callable[[], Awaitable[Status]], store: Store | None = None, control: str = "") -> None:
+        self._status, self._store, self._control = status, store, control
         self._revision = ""
         self._slow: tuple[tuple[PlantAlarm, ...], ActiveTable | None] = ((), None)
 
@@ -55,8 +44,8 @@ class Gatherer:
         """
         status = await self._status()
         revision = f"{status.revision} {status.now_utc:%H:%M}"
-        if self._archive is not None and revision != self._revision:
-            self._slow = await asyncio.to_thread(self._read, self._archive, status.machine)
+        if self._store is not None and revision != self._revision:
+            self._slow = await asyncio.to_thread(self._read, self._store, status.machine)
             self._revision = revision
         failed = [_alarm_of(check, check.cause) for check in status.last if check.cause is not None]
         alarms = sorted([*failed, *self._slow[0]], key=lambda alarm: alarm.at_utc, reverse=True)
@@ -73,9 +62,9 @@ class Gatherer:
             verified=status.verified,
         )
 
-    def _read(self, archive: Archive, machine: str) -> tuple[tuple[PlantAlarm, ...], ActiveTable | None]:
-        slots = archive.slots_not_run(machine, SHOWN_ALARMS)
-        return tuple(_slot_alarm(slot) for slot in slots), table_in_force(archive.last_push(machine, self._control))
+    def _read(self, store: Store, machine: str) -> tuple[tuple[PlantAlarm, ...], ActiveTable | None]:
+        slots = store.slots.not_run(machine, SHOWN_ALARMS)
+        return tuple(_slot_alarm(slot) for slot in slots), table_in_force(store.pushes.last(machine, self._control))
 
 
 def _alarm_of(check: Verification, cause: CheckFailure) -> PlantAlarm:

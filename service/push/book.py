@@ -6,10 +6,10 @@ import asyncio
 
 from abbe.service.clock import Clock
 from abbe.service.domain.decisions import PushEntryRecord
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import UnsafeToMove
 from abbe.service.push.entries import GENESIS, WORD, Doc, Journal, JournalEntry, follow
 from abbe.service.push.states import TERMINAL, PushState
-from abbe.service.storage.base import utc_text
 from abbe.service.storage.store import Store
 
 
@@ -39,7 +39,7 @@ class StoreBook:
     @classmethod
     async def last(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook | None:
         """Journal of the last push of a machine's control, or of the word before the first (`WORD`); None if there was none."""
-        chain = await asyncio.to_thread(store.push_chain, machine, control)
+        chain = await asyncio.to_thread(store.pushes.chain, machine, control)
         return await cls.of_chain(store, chain, clock)
 
     @classmethod
@@ -54,7 +54,7 @@ class StoreBook:
     @classmethod
     async def word(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
         """Where a person's word about the table in force is written: with the last push, or under `WORD` where there was none."""
-        chain = await asyncio.to_thread(store.push_chain, machine, control)
+        chain = await asyncio.to_thread(store.pushes.chain, machine, control)
         return await cls.of_chain(store, chain, clock) or cls(store, chain, clock, WORD, GENESIS, ())
 
     @classmethod
@@ -66,7 +66,7 @@ class StoreBook:
         UnsafeToMove
             The last push has not come to an end: it is finished first.
         """
-        chain = await asyncio.to_thread(store.push_chain, machine, control)
+        chain = await asyncio.to_thread(store.pushes.chain, machine, control)
         book = await cls.of_chain(store, chain, clock)
         if book is None:
             return cls(store, chain, clock, 1, GENESIS, ())
@@ -100,18 +100,18 @@ class StoreBook:
             prev=entry.prev,
             digest=entry.digest,
         )
-        await self._store.write(self._store.add_push_entry, row)
+        await self._store.write(self._store.pushes.append, row)
         self._head, self._journal = entry.digest, (*journal, entry)
         return entry
 
 
 def read_entries(store: Store, machine: str, control: str = "") -> list[JournalEntry]:
     """All entries of a machine's control, of all its pushes, whatever the machine was called; ``control`` empty: by the name alone."""
-    return [_entry(r) for r in store.push_entries(machine, control)]
+    return [_entry(r) for r in store.pushes.entries(machine, control)]
 
 
 def _entries_of(store: Store, chain: str) -> list[JournalEntry]:
-    return [_entry(r) for r in store.push_entries_of(chain)]
+    return [_entry(r) for r in store.pushes.entries_of(chain)]
 
 
 def _entry(r: PushEntryRecord) -> JournalEntry:

@@ -70,5 +70,5 @@ def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limi
     if not storable(machine):
         return Trends(machine=machine)
     known = verified_by(reader.store, machine, control=reader.control_of(machine))
-    found = figure_trends(reader.store.verifications_of(machine, limit), after_utc or known.since)
+    found = figure_trends(reader.store.verifications.of_machine(machine, limit), after_utc or known.since)
     return Trends(machine=machine, figures=found, verified=known)

@@ -88,9 +88,9 @@ def campaign(reader: Reader, number: int) -> CampaignDetail:
     """A campaign with its runs. Raises NotStored."""
     row = reader.row("campaigns", number, "campaign")
     given = {"campaign": row["name"]}
-    runs = [_run(one) for one in reversed(reader.store.page("runs", given, None, MOST_RUNS))]
+    runs = [_run(one) for one in reversed(reader.store.pages.page("runs", given, None, MOST_RUNS))]
     solutions, discoveries = (
-        [one["id"] for one in reader.store.page(kind, given, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
+        [one["id"] for one in reader.store.pages.page(kind, given, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
     )
     return of_row(CampaignDetail, row, runs=runs, solutions=solutions, discoveries=discoveries)
 
@@ -123,17 +123,17 @@ def runs_by_state(reader: Reader, campaign: str, test: str, state: str, limit: i
 def run(reader: Reader, number: int) -> RunDetail:
     """One run, and which channels it holds. Raises NotStored."""
     row = reader.row("runs", number, "run")
-    end = reader.store.run(number).end_doc or {}
+    end = reader.store.runs.find(number).end_doc or {}
     state = visible_status(row)
     known = {"run_id": row["label"], "status": state, "reason": _reason(state, row["reason"], end)}
-    return of_row(RunDetail, row, **known, channels=reader.store.channels(number), gaps=len(end.get("gaps") or []))
+    return of_row(RunDetail, row, **known, channels=reader.store.chunks.channels(number), gaps=len(end.get("gaps") or []))
 
 
 def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
     """Runs (of one campaign), oldest first; a complete run with gaps says how many samples it lacks. Raises NotStored."""
-    owners = [store.campaign(campaign)] if campaign is not None else store.campaigns()
-    names = {one.id: store.machine(one.machine_id).name for one in owners}
-    found = store.runs(owners[0].id if campaign is not None else None)
+    owners = [store.campaigns.find(campaign)] if campaign is not None else store.campaigns.all()
+    names = {one.id: store.machines.get(one.machine_id).name for one in owners}
+    found = store.runs.all(owners[0].id if campaign is not None else None)
     return [run_summary(one, names[one.campaign_id]) for one in found]
 
 

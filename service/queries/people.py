@@ -20,9 +20,9 @@ class UserSummary:
 
 def users(store: Store) -> list[UserSummary]:
     """All users."""
-    return [UserSummary(**{one.name: getattr(user, one.name) for one in fields(UserSummary)}) for user in store.users()]
+    return [UserSummary(**{one.name: getattr(user, one.name) for one in fields(UserSummary)}) for user in store.people.all()]
 
 
 def audit(store: Store, limit: int) -> list[AuditEvent]:
     """The newest records of the audit, oldest first."""
-    return store.audit(limit)
+    return store.audit.events(limit)

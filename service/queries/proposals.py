@@ -10,11 +10,11 @@ from abbe.service.compensation.proposal_diff import ACTIVE, TableDifference, com
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.compensation.proposal_states import ProposalStatus, status_of_proposal
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import JournalEntry
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
-from abbe.service.storage.base import utc_text
 
 ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
 OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
@@ -66,7 +66,7 @@ class _Standings:
 
     def __init__(self, reader: Reader) -> None:
         self._reader = reader
-        self._tables = {table.id: table.doc for table in reader.store.tables()}
+        self._tables = {table.id: table.doc for table in reader.store.tables.all()}
         self._journals: dict[str, list[JournalEntry]] = {}
 
     def of(self, number: int, proposed: Proposed) -> ProposalStatus:
@@ -76,7 +76,13 @@ class _Standings:
             self._journals[machine] = read_entries(store, machine, self._reader.control_of(machine))
         entries = self._journals[machine]
         return status_of_proposal(
-            number, proposed, store.approvals(number), entries, self._tables, self._reader.now_s, store.rejections(number)
+            number,
+            proposed,
+            store.proposals.approvals(number),
+            entries,
+            self._tables,
+            self._reader.now_s,
+            store.proposals.rejections(number),
         )
 
 
@@ -131,8 +137,8 @@ def proposal(reader: Reader, number: int) -> ProposalDetail:
         two_people=proposed.two_people,
         reasons=list(proposed.reasons),
         not_for_tables=list(proposed.not_for_tables),
-        approvals=store.approvals(number),
-        rejections=store.rejections(number),
+        approvals=store.proposals.approvals(number),
+        rejections=store.proposals.rejections(number),
     )
 
 

@@ -28,7 +28,7 @@ def push_entries(
     reader: Reader, machine: str | None, push: int | None, state: str | None, cursor: int | None, limit: int
 ) -> tuple[list[PushEntry], int | None]:
     """The journal of pushes, newest entry first; of a machine that was renamed under the name that its journal was begun with."""
-    journal = machine and reader.store.push_chain(machine, reader.control_of(machine))
+    journal = machine and reader.store.pushes.chain(machine, reader.control_of(machine))
     rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
     return [of_row(PushEntry, row) for row in rows], after
 

@@ -60,7 +60,7 @@ class Reader:
         """Rows of a page, newest first, and the cursor of the next one; None: there is none."""
         if any(isinstance(value, str) and not storable(value) for value in given.values()):
             return [], None
-        rows = self.store.page(kind, given, cursor, limit + 1)
+        rows = self.store.pages.page(kind, given, cursor, limit + 1)
         return rows[:limit], rows[limit - 1]["id"] if len(rows) > limit else None
 
     def row(self, kind: str, number: int, what: str) -> Doc:
@@ -71,7 +71,7 @@ class Reader:
         NotStored
             There is none.
         """
-        found = self.store.row(kind, number)
+        found = self.store.pages.row(kind, number)
         if found is None:
             raise NotStored(f"there is no {what} {number}")
         return found

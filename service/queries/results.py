@@ -126,7 +126,7 @@ def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) 
     """
     reader.row("solutions", number, "solution")
     with as_stored():
-        stored = stored_field(reader.store, reader.store.solution(number))
+        stored = stored_field(reader.store, reader.store.solutions.get(number))
         found = node_map(stored, nodes, motions)
     grid = found.points_mm.reshape(nodes, nodes, nodes, 3)
     x, y, z = ([round(float(v), 3) for v in axis] for axis in (grid[:, 0, 0, 0], grid[0, :, 0, 1], grid[0, 0, :, 2]))
@@ -149,13 +149,13 @@ def discoveries(
 ) -> tuple[list[DiscoverySummary], int | None]:
     """Searches for missing effects, newest first."""
     rows, after = reader.page("discoveries", {"campaign": campaign, "machine": machine}, cursor, limit)
-    return [of_row(DiscoverySummary, row, **_last(_states(reader.store.discovery_steps(row["id"])))) for row in rows], after
+    return [of_row(DiscoverySummary, row, **_last(_states(reader.store.discoveries.steps(row["id"])))) for row in rows], after
 
 
 def discovery(reader: Reader, number: int) -> DiscoveryDetail:
     """A search: its states, and what it found. Raises NotStored."""
     row = reader.row("discoveries", number, "discovery")
-    states = _states(reader.store.discovery_steps(number))
+    states = _states(reader.store.discoveries.steps(number))
     found = next((step.finding for step in stored_steps(reader.store, number) if step.finding is not None), None)
     answer = None if found is None else read_as(DiscoveryFile, answer_doc(found))
     changed = None if found is None else found.changed

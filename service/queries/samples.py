@@ -111,7 +111,7 @@ def _columns(taken: list[BarSample]) -> BarSamples:
 
 def _chunks(store: Store, run: int, channel: str, first: int, limit: int) -> tuple[list[ChunkRecord], slice, int]:
     """Chunks that hold a stretch, where the stretch lies in them, and how many samples the channel has."""
-    sizes = store.chunk_sizes(run, channel) if storable(channel) and channel != IMPORTED_CHANNEL else []
+    sizes = store.chunks.sizes(run, channel) if storable(channel) and channel != IMPORTED_CHANNEL else []
     if not sizes:
         raise NotStored(
             f"run {run} has no samples of channel {channel[:40]!r}", "the run's `channels` name them; imported runs have columns"
@@ -125,7 +125,7 @@ def _chunks(store: Store, run: int, channel: str, first: int, limit: int) -> tup
         at += n
     if not wanted:
         return [], slice(0, 0), at
-    found = store.chunk_range(run, channel, wanted[0], wanted[-1])
+    found = store.chunks.between(run, channel, wanted[0], wanted[-1])
     for chunk in found:
         if zlib.crc32(chunk.payload) != chunk.crc32:
             raise StoreError(f"run {run}, chunk {chunk.seq} of channel {channel!r}: stored bytes do not match their CRC")

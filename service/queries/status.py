@@ -175,9 +175,9 @@ class StatusReader:
         reader, core, upcoming = self.reader, self._core, self._upcoming()
         now, machine = reader.clock.utc(), reader.machine
         job, attention = core.job, core.attention
-        entries = await asyncio.to_thread(reader.store.alarm_entries, machine)
+        entries = await asyncio.to_thread(reader.store.alarms.entries, machine)
         # A slot that was skipped leaves no check and may leave no alarm: without it an open page would go on as if it had not been due.
-        slot = await asyncio.to_thread(reader.store.newest_slot, [f"{machine}/{schedule.name}" for schedule, _ in upcoming])
+        slot = await asyncio.to_thread(reader.store.slots.newest, [f"{machine}/{schedule.name}" for schedule, _ in upcoming])
         strange = strange_table(attention)
         known = await asyncio.to_thread(verified_by, reader.store, machine, control=reader.control, strange=strange)
         last = await self.verifications(LATEST)
@@ -200,5 +200,5 @@ class StatusReader:
     async def _mqtt(self) -> BrokerStatus:
         if not self._broker:
             return BrokerStatus(configured=False)
-        core, waiting = self._core, await asyncio.to_thread(self.reader.store.waiting_messages)
+        core, waiting = self._core, await asyncio.to_thread(self.reader.store.outbox.count)
         return BrokerStatus(configured=True, broker=self._broker, connected=core.mqtt_connected, waiting=waiting, dropped=core.mqtt_dropped)

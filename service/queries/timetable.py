@@ -59,7 +59,7 @@ def schedule_state(reader: Reader, schedule: Schedule) -> ScheduleState:
 
 def past_slots(reader: Reader, schedule: str, limit: int) -> list[SlotRecord]:
     """The latest slots of a schedule of this service's machine, newest first."""
-    return reader.store.slots_of(f"{reader.machine}/{schedule}", limit)
+    return reader.store.slots.latest(f"{reader.machine}/{schedule}", limit)
 
 
 def due_in_words(moment: datetime, now: datetime, zone: tzinfo) -> str:

@@ -45,9 +45,9 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
         return discovery_report(store, number, rules)
     if what == "verification":
         return verification_report(store, number, rules)
-    names = list(dict.fromkeys(m.name for m in store.machines())) if machine is None else [machine]
-    chains = {store.push_chain(n): n for n in names}  # machines that were renamed share one
-    having = [n for chain, n in chains.items() if any(e.push == number for e in store.push_entries_of(chain))]
+    names = list(dict.fromkeys(m.name for m in store.machines.all())) if machine is None else [machine]
+    chains = {store.pushes.chain(n): n for n in names}  # machines that were renamed share one
+    having = [n for chain, n in chains.items() if any(e.push == number for e in store.pushes.entries_of(chain))]
     if len(having) != 1:
         if not having:
             raise NotStored(f"no push {number} in the database", "abbe correct pushes tables; pushes count from 1")
@@ -88,7 +88,7 @@ def solution_report(store: Store | None, campaign: Campaign, solution: SolutionR
     left_out = {r["run_id"] for r in found.campaign.runs} - {r["run_id"] for r in campaign.runs}
     states = [s for s in found.states if s[0] not in left_out]
     found = replace(found, campaign=campaign, facts=found.facts | solved, states=states, solution=solution)
-    return _of_then(store, found, store.campaign(campaign.name).created_utc, rules)
+    return _of_then(store, found, store.campaigns.find(campaign.name).created_utc, rules)
 
 
 def _of_then(store: Store, found: Measured, created_utc: str, rules: Rules) -> Document:
@@ -101,13 +101,13 @@ def folder_report(folder: Path, rules: Rules) -> Document:
 
 
 def _measured(store: Store, name: str) -> Measured:
-    record = store.campaign(name)
-    runs = store.runs(record.id)
+    record = store.campaigns.find(name)
+    runs = store.runs.all(record.id)
     facts = {"Created": record.created_utc}
     if runs:
         ends = [r.ended_utc for r in runs if r.ended_utc]
         facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
-    solution = next((SolutionResult(s.doc, s.id) for s in reversed(store.solutions(record.id)) if "mean_over_volume" in s.doc), None)
+    solution = next((SolutionResult(s.doc, s.id) for s in reversed(store.solutions.all(record.id)) if "mean_over_volume" in s.doc), None)
     campaign = from_store(store, name)
     table = table_said(store, campaign.site.name, campaign.runs)
     return Measured(campaign, facts, [_state(r) for r in runs], solution, table)

@@ -30,13 +30,13 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
     StoreError
         There is no such discovery, or it has not found anything yet.
     """
-    record = store.discovery(number)
+    record = store.discoveries.get(number)
     steps = stored_steps(store, number)
     finding = next((step.finding for step in steps if step.finding is not None), None)
     start = steps[0].start if steps else None
     if finding is None or start is None:
         raise StoreError(f"discovery {number} has not ended", "give the same abbe discover command again: it goes on there")
-    name = next(c.name for c in store.campaigns() if c.id == record.campaign_id)
+    name = next(c.name for c in store.campaigns.all() if c.id == record.campaign_id)
     campaign = from_store(store, name)
     states = [(step.state, step.why) for step in steps]
     page = discovery_page(
@@ -48,7 +48,7 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
         kind="discovery",
         title=f"Discovery {number}: what the simulation of {campaign.site.name} lacks",
         about=parts.machine_facts(campaign.site.doc)
-        | {"Campaign": name, "Begun": record.created_utc, "Ended": store.discovery_steps(number)[-1].utc, "State": steps[-1].state}
+        | {"Campaign": name, "Begun": record.created_utc, "Ended": store.discoveries.steps(number)[-1].utc, "State": steps[-1].state}
         | {"Present model": ", ".join(start.present_model)},
         verdict=(SIGNS[sign], word, text),
         figures=_figures(finding),

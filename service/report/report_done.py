@@ -50,11 +50,11 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     NotStored
         There is none of this number.
     """
-    record = next((v for v in store.verifications(limit=MANY) if v.id == number), None)
+    record = next((v for v in store.verifications.latest(limit=MANY) if v.id == number), None)
     if record is None:
         raise NotStored(f"no verification {number} in the database", "abbe serve and abbe correct store verifications; count from 1")
-    machine = store.machine(record.machine_id)
-    campaign = None if record.campaign_id is None else from_store(store, store.campaign(record.campaign_id).name)
+    machine = store.machines.get(record.machine_id)
+    campaign = None if record.campaign_id is None else from_store(store, store.campaigns.find(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
     told = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"))
     table = table_said(store, machine.name, runs)
@@ -124,8 +124,8 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     known = facts(journal)
     machine = str(known.get("machine", machine))  # as it was called then
     doc = _machine_doc(store, machine)
-    verified = [v for v in store.verifications(limit=MANY) if _is_of(store, v, machine, number)]
-    campaigns = [from_store(store, store.campaign(v.campaign_id).name) for v in verified if v.campaign_id is not None]
+    verified = [v for v in store.verifications.latest(limit=MANY) if _is_of(store, v, machine, number)]
+    campaigns = [from_store(store, store.campaigns.find(v.campaign_id).name) for v in verified if v.campaign_id is not None]
     runs = [r for c in campaigns for r in c.runs]
     condition, remarks = parts.conditions(runs, rules) if runs else ({}, [])
     tables = _tables(str(known.get("image", "")))
@@ -151,12 +151,12 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
 
 
 def _is_of(store: Store, record: VerificationRecord, machine: str, push: int) -> bool:
-    return record.doc.get("push") == push and store.machine(record.machine_id).name == machine
+    return record.doc.get("push") == push and store.machines.get(record.machine_id).name == machine
 
 
 def _machine_doc(store: Store, machine: str) -> Doc:
     """The latest description of the machine."""
-    return next(m.doc for m in reversed(store.machines()) if m.name == machine)
+    return next(m.doc for m in reversed(store.machines.all()) if m.name == machine)
 
 
 def _about(store: Store, journal: Sequence[JournalEntry], known: Doc) -> dict[str, str]:
@@ -165,7 +165,7 @@ def _about(store: Store, journal: Sequence[JournalEntry], known: Doc) -> dict[st
         out["New table"] = f"CRC {known['crc']:08X}, bank {known['target']}"
         out["Table before"] = f"CRC {known['base_crc']:08X}, bank {known['base_bank']}"
     if known.get("table"):
-        table = store.table(int(known["table"]))
+        table = store.tables.get(int(known["table"]))
         out["Stored as"] = f"table {table.id}" + ("" if table.solution_id is None else f", from solution {table.solution_id}")
     out["Capability of the control"] = f"level {known.get('level', 'unknown')}" + (", a person is there" if known.get("attended") else "")
     for key, name in (("approved_by", "Approved by"), ("probe", "Proof of sign, axis and unit"), ("verify", "Verification")):

@@ -38,7 +38,7 @@ def table_said(store: Store, machine: str, runs: Sequence[Doc]) -> TableSaid:
     used = {int(t["crc"]): t for r in runs if (t := r.get("table")) and t.get("crc") is not None}
     if not used:
         return TableSaid()
-    known, images, chain = known_tables(store), images_of(store), store.push_chain(machine)
+    known, images, chain = known_tables(store), images_of(store), store.pushes.chain(machine)
     unverified = [
         f"measured with the table of push {push.push} of machine {push.machine!r} (CRC {crc:08X}), which was never verified"
         for crc in sorted(used)

@@ -101,7 +101,7 @@ def load_run(store: Store, id_or_label: int | str) -> Doc:
     MeasurementFault
         If its samples contradict its path.
     """
-    return whole_document(store, store.run(id_or_label))
+    return whole_document(store, store.runs.find(id_or_label))
 
 
 def whole_document(store: Store, record: RunRecord) -> Doc:
@@ -109,12 +109,12 @@ def whole_document(store: Store, record: RunRecord) -> Doc:
 
     One that is not complete says so under ``state`` (`abbe.service.runs.coverage`).
     """
-    document = run_document(record, store.chunks(record.id))
+    document = run_document(record, store.chunks.of_run(record.id))
     pieces = pieces_of(record.start_doc)
     if not pieces:
         return with_state(document, record)
-    broken = [(store.run(p.run), p.to_mm) for p in pieces]
-    pieces_doc = [run_document(run, store.chunks(run.id)) for run, _ in broken]
+    broken = [(store.runs.find(p.run), p.to_mm) for p in pieces]
+    pieces_doc = [run_document(run, store.chunks.of_run(run.id)) for run, _ in broken]
     parts = [up_to(run, one["columns"], to_mm) for (run, to_mm), one in zip(broken, pieces_doc, strict=True)]
     named = [{"run": run.label, "readings": len(part["t_s"])} for (run, _), part in zip(broken, parts, strict=True)]
     timing = document.get("timing", {}) | {"pieces": named}
@@ -130,11 +130,11 @@ def _trouble(document: Doc) -> str:
 
 def path_so_far(store: Store, run: int) -> SoFar | None:
     """How far a path was read by its last broken run and the pieces before it; None if it has to begin again."""
-    record = store.run(run)
+    record = store.runs.find(run)
     if record.reason.startswith(StretchDiffers.code):
         return None  # nobody knows which of the two was right
     try:
-        chunks = store.chunks(run)
+        chunks = store.chunks.of_run(run)
         document = run_document(record, chunks)
         samples = [sample for chunk in _of(chunks, BAR_CHANNEL, BAR_CODEC) for sample in decode_bar(chunk.payload)]
         found = read_so_far(record, document["columns"]) if begins_seen(samples) and not _trouble(document) else None

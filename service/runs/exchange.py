@@ -115,7 +115,7 @@ def import_folder(store: Store, folder: Path) -> int:
     campaign, machine = content.campaign, content.campaign["machine"]
     imported = [_imported(entry, run) for entry, run in zip(campaign["runs"], content.runs, strict=True)]
     doc = {"imported": campaign, "errors": content.errors}
-    return store.import_campaign((machine.get("name") or campaign["campaign"], machine), (campaign["campaign"], doc), imported)
+    return store.runs.import_campaign((machine.get("name") or campaign["campaign"], machine), (campaign["campaign"], doc), imported)
 
 
 def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
@@ -144,8 +144,8 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise FileFormatError(f"{target} exists and is not an empty folder: nothing was written", "give a new folder")
-    record = store.campaign(name_or_id)
-    runs = store.runs(record.id)
+    record = store.campaigns.find(name_or_id)
+    runs = store.runs.all(record.id)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -170,7 +170,7 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
     for run in runs:
         if run.id in joined:
             continue  # its readings are in the run that it belongs to: one measurement must not count twice
-        document = whole_document(store, run) if run.status == COMPLETE else run_document(run, store.chunks(run.id))
+        document = whole_document(store, run) if run.status == COMPLETE else run_document(run, store.chunks.of_run(run.id))
         entry = run.start_doc.get("entry") or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
         setup = document["setup"]
@@ -188,7 +188,7 @@ def _campaign_document(store: Store, record: CampaignRecord, entries: list[Doc],
             "runs": entries,
             "setups": setups | imported["setups"] if set(setups) - set(imported["setups"]) else imported["setups"],
         }
-    base = {"format": CAMPAIGN_FORMAT, "campaign": record.name, "machine": store.machine(record.machine_id).doc}
+    base = {"format": CAMPAIGN_FORMAT, "campaign": record.name, "machine": store.machines.get(record.machine_id).doc}
     assumed = {"current_model": {"includes": list(ASSUMED_MODEL), "errors": None}, "instruments": {}, "temperature_sensors": False}
     return base | assumed | record.doc | {"setups": setups, "runs": entries}
 

@@ -24,8 +24,8 @@ from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FollowUp, Job, failure
 from abbe.service.scheduler.ports import Doc, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
+from abbe.service.storage.store import Store
 from abbe.service.tables.push_outcome import OPEN, STOPPED, by_journal, in_force, last_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
@@ -83,7 +83,7 @@ class AlarmManager(RetryingStore):
 
     Parameters
     ----------
-    store : ServiceStore
+    store : Store
         Where checks, alarms, proposals and pushes are.
     clock : Clock
         Now.
@@ -98,7 +98,7 @@ class AlarmManager(RetryingStore):
     """
 
     def __init__(
-        self, store: ServiceStore, clock: Clock, machine: str, schedules: Sequence[Schedule], duties: Duties, channels: AlarmChannels
+        self, store: Store, clock: Clock, machine: str, schedules: Sequence[Schedule], duties: Duties, channels: AlarmChannels
     ) -> None:
         super().__init__(store, clock)
         self._machine = machine
@@ -111,7 +111,7 @@ class AlarmManager(RetryingStore):
     async def checked(self, doc: Doc, number: int) -> str:
         """Compare a kept verification with those before it; raise, hold or clear the alarm of its recipe. Return that as a sentence."""
         recipe, warn_days = doc["recipe"], self.duties.warn_days
-        records = await self._read(self._store.verifications_of, self._machine, READ_CHECKS)
+        records = await self._read(self._store.verifications.of_machine, self._machine, READ_CHECKS)
         looked = await self._read(look, self._store, self._machine, recipe, records, warn_days)
         if looked.kind is None:
             return ""
@@ -122,7 +122,7 @@ class AlarmManager(RetryingStore):
     async def due(self) -> FollowUp | None:
         """Return what may start now: first the check after a push, then a push, then an investigation."""
         try:
-            entries = await asyncio.to_thread(self._store.alarm_entries, self._machine)
+            entries = await asyncio.to_thread(self._store.alarms.entries, self._machine)
             entries = await self._pushes_settled(entries)
             alarms = [one for one in folded(entries) if one.active]
             return self._check_again(alarms) or await self._push(entries) or self._investigation(alarms)
@@ -146,7 +146,7 @@ class AlarmManager(RetryingStore):
                 text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
                 await self._record_pushed(entry.alarm, proposal, after, JobOutcome(now.word, text))
                 changed = True
-        return await asyncio.to_thread(self._store.alarm_entries, self._machine) if changed else entries
+        return await asyncio.to_thread(self._store.alarms.entries, self._machine) if changed else entries
 
     async def note(self, number: int, kind: AlarmKind, doc: Doc) -> Alarm:
         """Write an entry of an alarm; return the alarm with it."""
@@ -226,8 +226,8 @@ class AlarmManager(RetryingStore):
             messages.append((self._channels.topic, head | {"kind": str(kind), "what": doc["text"], "signals": doc.get("signals", [])}))
 
         def append() -> AlarmEntryRecord:
-            seq = 0 if number is None else last_seq(self._store.alarm_entries(self._machine), number) + 1
-            return self._store.add_alarm_entry(self._machine, number, seq, str(kind), doc, messages)
+            seq = 0 if number is None else last_seq(self._store.alarms.entries(self._machine), number) + 1
+            return self._store.alarms.append(self._machine, number, seq, str(kind), doc, messages)
 
         entry = await self._write(append)
         if messages:

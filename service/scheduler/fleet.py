@@ -10,7 +10,7 @@ from typing import Any
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.service_records import HeartbeatRecord
 from abbe.service.scheduler.heartbeat import SILENT_AFTER
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.verification.trend_table import FigureTrend, trends
 from abbe.service.verification.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
 
@@ -93,27 +93,27 @@ class MachineLine(MachineStatus):
     limit_days: tuple[float, float, float] | None = None
 
 
-def stands(store: ServiceStore, now: datetime) -> list[MachineStatus]:
+def stands(store: Store, now: datetime) -> list[MachineStatus]:
     """Where every machine of a database stands, by name. Only its last check is read, so that it costs the same after years.
 
     Parameters
     ----------
-    store : ServiceStore
+    store : Store
         SQLite or PostgreSQL; many services may write to it.
     now : datetime
         With time zone.
     """
-    said = store.heartbeats()
-    return [_stand(store, name, said.get(name), store.verifications_of(name, LOOKED), now) for name in store.machine_names()]
+    said = store.heartbeats.all()
+    return [_stand(store, name, said.get(name), store.verifications.of_machine(name, LOOKED), now) for name in store.machines.names()]
 
 
-def fleet(store: ServiceStore, now: datetime) -> list[MachineLine]:
+def fleet(store: Store, now: datetime) -> list[MachineLine]:
     """One line for each machine of a database, by name, with the trends of its figures; parameters as for `stands`."""
-    said = store.heartbeats()
-    return [_line(store, name, said.get(name), store.verifications_of(name, limit=CHECKS), now) for name in store.machine_names()]
+    said = store.heartbeats.all()
+    return [_line(store, name, said.get(name), store.verifications.of_machine(name, limit=CHECKS), now) for name in store.machines.names()]
 
 
-def _line(store: ServiceStore, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
+def _line(store: Store, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
     stand = _stand(store, name, said, checks, now)
     found = trends(checks, stand.verified.since)
     soonest = min((one for one in found if one.days_until_limit is not None), key=lambda one: one.days_until_limit or 0.0, default=None)
@@ -125,9 +125,7 @@ def _line(store: ServiceStore, name: str, said: HeartbeatRecord | None, checks: 
     )
 
 
-def _stand(
-    store: ServiceStore, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime
-) -> MachineStatus:
+def _stand(store: Store, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineStatus:
     """``checks``: newest first."""
     state = state_of(said, now)
     due = said.doc.get("due", []) if said is not None and state not in {NOT_RUNNING, NO_SERVICE} else []

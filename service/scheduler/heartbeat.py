@@ -28,8 +28,8 @@ WAITING = "waiting"
 class HeartbeatSink(Protocol):
     """The part of the store that is written here."""
 
-    def put_heartbeat(self, machine: str, doc: Doc) -> None:
-        """Write what the service of a machine says of itself now."""
+    def put(self, machine: str, doc: Doc) -> None:
+        """Write the present state of a machine's service."""
         ...
 
 
@@ -94,7 +94,7 @@ class Heartbeat:
         while True:
             self._news.clear()
             try:
-                await asyncio.to_thread(self._store.put_heartbeat, self._machine, self.doc())
+                await asyncio.to_thread(self._store.put, self._machine, self.doc())
             except StoreError as trouble:
                 log.warning("the fleet's list was not told", cause=trouble.detail)
             await self._beat()

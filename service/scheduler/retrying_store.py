@@ -13,8 +13,8 @@ from abbe.service.clock import Clock
 from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
 from abbe.service.scheduler.ports import Doc, OpenSlot
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.storage.repositories.slots import RUNNING
+from abbe.service.storage.store import Store
 
 log = structlog.get_logger("abbe.store")
 
@@ -28,7 +28,7 @@ PAUSES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 class RetryingStore:
     """Writes, and reads, again and again while the database does not take it."""
 
-    def __init__(self, store: ServiceStore, clock: Clock) -> None:
+    def __init__(self, store: Store, clock: Clock) -> None:
         self._store = store
         self._clock = clock
 
@@ -51,34 +51,34 @@ class RetryingStore:
 class StoreLedger(RetryingStore):
     """Slots in the store. Each key names the machine: one database may serve several services."""
 
-    def __init__(self, store: ServiceStore, clock: Clock, machine: str) -> None:
+    def __init__(self, store: Store, clock: Clock, machine: str) -> None:
         super().__init__(store, clock)
         self._machine = machine
 
     async def claim(self, schedule: str, slot_utc: datetime) -> bool:
         """Return True to exactly one caller, ever, for each (schedule, slot)."""
-        return await self._write(self._store.claim_slot, self._key(schedule), slot_utc)
+        return await self._write(self._store.slots.claim, self._key(schedule), slot_utc)
 
     async def begin(self, schedule: str, slot_utc: datetime) -> None:
         """Note that the check of a claimed slot starts: nobody may start it again."""
-        await self._write(self._store.begin_slot, self._key(schedule), slot_utc)
+        await self._write(self._store.slots.begin, self._key(schedule), slot_utc)
 
     async def release(self, schedule: str, slot_utc: datetime) -> None:
         """Give back a claimed slot that was not started."""
-        await self._write(self._store.release_slot, self._key(schedule), slot_utc)
+        await self._write(self._store.slots.release, self._key(schedule), slot_utc)
 
     async def adopt(self, schedule: str) -> list[OpenSlot]:
         """Take over the open slots whose service is gone, in order of time. Each is given to exactly one caller."""
-        found = await self._write(self._store.adopt_slots, self._key(schedule))
+        found = await self._write(self._store.slots.adopt, self._key(schedule))
         return [OpenSlot(datetime.fromisoformat(one.slot_utc), one.state == RUNNING) for one in found]
 
     async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
         """Write down what became of a claimed slot: state (30 characters) and the sentence to it."""
-        await self._write(self._store.finish_slot, self._key(schedule), slot_utc, state[:30], reason)
+        await self._write(self._store.slots.finish, self._key(schedule), slot_utc, state[:30], reason)
 
     async def last_claimed(self, schedule: str) -> datetime | None:
         """Return the latest slot ever claimed for this schedule, or None if it is new."""
-        return await asyncio.to_thread(self._store.last_slot, self._key(schedule))
+        return await asyncio.to_thread(self._store.slots.last_due, self._key(schedule))
 
     def _key(self, schedule: str) -> str:
         return f"{self._machine}/{schedule}"
@@ -89,7 +89,7 @@ class StoreShelf(RetryingStore):
 
     Parameters
     ----------
-    store : ServiceStore
+    store : Store
         Where to.
     clock : Clock
         Pauses while the store is not available.
@@ -102,7 +102,7 @@ class StoreShelf(RetryingStore):
     """
 
     def __init__(
-        self, store: ServiceStore, clock: Clock, machine: tuple[str, int], topics: tuple[str, str] | None, posted: Callable[[], None]
+        self, store: Store, clock: Clock, machine: tuple[str, int], topics: tuple[str, str] | None, posted: Callable[[], None]
     ) -> None:
         super().__init__(store, clock)
         self._machine, self._machine_id = machine
@@ -117,14 +117,14 @@ class StoreShelf(RetryingStore):
             messages.append((verification_topic, doc))
             if doc["cause"] is not None:
                 messages.append((alarm_topic, self._of_machine(record.alarm(doc))))
-        number = await self._write(self._store.keep_verification, self._machine_id, doc, messages)
+        number = await self._write(self._store.verifications.add_with_messages, self._machine_id, doc, messages)
         self._posted()
         return number
 
     async def alarm(self, doc: Doc) -> None:
         """Queue an alarm."""
         if self._topics is not None:
-            await self._write(self._store.put_message, self._topics[1], self._of_machine(doc))
+            await self._write(self._store.outbox.add_document, self._topics[1], self._of_machine(doc))
             self._posted()
 
     def _of_machine(self, doc: Doc) -> Doc:

@@ -53,7 +53,7 @@ class StoreJournal:
         until_s = clock() + self.longest_s
         while True:
             try:
-                await self._store.write(self._store.add_checkpoint, self.campaign, kind, doc)
+                await self._store.write(self._store.checkpoints.add, self.campaign, kind, doc)
                 return
             except StoreError as error:
                 if not may_pass(error) or clock() > until_s:

@@ -12,10 +12,10 @@ from typing import Any
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import SignatureRefused
 from abbe.service.push.entries import canonical
 from abbe.service.signed.keys import public_of
-from abbe.service.storage.base import utc_text
 
 FORM = "abbe-signed/1"
 PURPOSE = b"abbe compensation files\x00"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, Generic, TypeVar
 
-from sqlalchemy import ColumnElement, FromClause, Row, Select, Table, select
+from sqlalchemy import Column, ColumnElement, FromClause, Row, Select, Table, select
 
 R = TypeVar("R")
 
@@ -71,6 +71,6 @@ class RecordMapping(Generic[R]):
         for name, column in self._fields.items():
             if isinstance(column, RecordMapping):
                 found |= column.values(getattr(record, name))
-            elif name not in without and name in self.table.c:
-                found[name] = getattr(record, name)
+            elif isinstance(column, Column) and column.table is self.table and name not in without:
+                found[column.name] = getattr(record, name)
         return found

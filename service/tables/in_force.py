@@ -61,7 +61,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
             pass  # not held, as for preconditions: who comes to measure is not turned away by somebody who only looks
         async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
             known = await asyncio.to_thread(known_tables, store)
-            chain = await asyncio.to_thread(store.push_chain, site.name, site.control)
+            chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
             now = await _seen(session.controller, known, chain, corrects)
         # After the controller: a push that ended in between is known to the journal before it can be missed here.
         wanted, settled = wanted_by(await asyncio.to_thread(read_entries, store, site.name, site.control))

@@ -37,16 +37,16 @@ def tables_of(doc: dict[str, Any]) -> list[Doc]:
 
 def stored_tables(store: Store, solution_id: int) -> list[Doc]:
     """Tables of a stored solution's runs, also where its document is older than that it names them."""
-    solution = store.solution(solution_id)
-    runs = [r.start_doc for r in store.runs(solution.campaign_id) if r.id in set(solution.run_ids)]
+    solution = store.solutions.get(solution_id)
+    runs = [r.start_doc for r in store.runs.all(solution.campaign_id) if r.id in set(solution.run_ids)]
     told = [start.get("imported", start).get("table", {}) for start in runs]
     return distinct([t for t in told if "crc" in t] + tables_of(solution.doc))
 
 
 def images_of(store: Store) -> Images:
     """Images by their CRC, as far as this database has met them: written by a push, or in force before one."""
-    found = {t.crc: t.image for t in store.tables()}
-    for name in {store.machine(t.machine_id).name for t in store.tables()}:
+    found = {t.crc: t.image for t in store.tables.all()}
+    for name in {store.machines.get(t.machine_id).name for t in store.tables.all()}:
         for entry in read_entries(store, name):
             if "base_image" in entry.doc:
                 found[int(entry.doc["base_crc"])] = bytes.fromhex(entry.doc["base_image"])

@@ -51,7 +51,7 @@ def ordered(store: Store, machine: str, order: str) -> JobOutcome | None:
 
 
 def _last_own(store: Store, machine: str, own: Callable[[int, dict[str, Any]], bool], names: Names) -> JobOutcome | None:
-    docs = {table.id: table.doc for table in store.tables()}
+    docs = {table.id: table.doc for table in store.tables.all()}
     journals = pushes_of(read_entries(store, machine))
     mine = [journal for number, journal in journals.items() if own(number, docs.get(int(facts(journal).get("table", 0)), {}))]
     return outcome_of(mine[-1], names) if mine else None
@@ -68,7 +68,7 @@ def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
     """The same, and every push of another journal whose table nothing has verified and may be in force: it may be that of this control,
     under another name or address.
     """
-    chain, own = store.push_chain(machine, control), open_push(store, machine, control)
+    chain, own = store.pushes.chain(machine, control), open_push(store, machine, control)
     others = [p for p in known_tables(store).unverified.values() if p.may_be_active and p.chain != chain]
     return [*filter(None, [own]), *map(_other, others)]
 

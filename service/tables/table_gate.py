@@ -98,11 +98,11 @@ async def check_in_force(controller: TableController, store: Store, site: Site) 
 
 
 def _journals(store: Store, site: Site) -> tuple[KnownState, str]:
-    return known_tables(store), store.push_chain(site.name, site.control)
+    return known_tables(store), store.pushes.chain(site.name, site.control)
 
 
 def _whose(store: Store, site: Site, push: PushedTable) -> str:
-    if push.chain == store.push_chain(site.name, site.control) and push.machine == site.name:
+    if push.chain == store.pushes.chain(site.name, site.control) and push.machine == site.name:
         return f"push {push.push}"
     at = f" at {push.control}" if push.control and push.control != site.control else ""
     return f"push {push.push} of machine {push.machine!r}{at}"

@@ -80,7 +80,7 @@ def table_history(store: Store, machine: str, control: str = "") -> TableHistory
         It cannot be read, or is not what was written.
     """
     entries = read_entries(store, machine, control)
-    docs = {table.id: table.doc for table in store.tables()}
+    docs = {table.id: table.doc for table in store.tables.all()}
     told = tuple(_told(journal, _doc(journal, docs)) for journal in pushes_of(entries).values())
     try:
         offer, refusal = offer_of(entries, _rollbacks(docs)), ""
@@ -99,7 +99,7 @@ def offered(store: Store, machine: str, control: str = "") -> RollbackOffer:
     StoreError
         The journal cannot be read, or is not what was written.
     """
-    return offer_of(read_entries(store, machine, control), _rollbacks({table.id: table.doc for table in store.tables()}))
+    return offer_of(read_entries(store, machine, control), _rollbacks({table.id: table.doc for table in store.tables.all()}))
 
 
 def offer_of(entries: list[JournalEntry], rollbacks: frozenset[int]) -> RollbackOffer:

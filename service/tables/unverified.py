@@ -87,7 +87,7 @@ class KnownState:
 
 def known_tables(store: Store) -> KnownState:
     """Read the journals of all machines, without the images in them."""
-    marks = store.push_marks()
+    marks = store.pushes.marks()
     unverified = _unverified([((m.machine, m.push), m.state, m.doc) for m in marks])
     last: dict[Hashable, PushedTable] = {}
     crc: dict[Hashable, int] = {}

@@ -11,8 +11,8 @@ from datetime import UTC, datetime, timedelta
 
 from abbe.service.clock import Clock
 from abbe.service.domain.people import TokenRecord, UserRecord
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import UserRefused
-from abbe.service.storage.base import utc_text
 from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords, check_new
 from abbe.service.users.roles import ALLOWED, Permission, Role
@@ -84,7 +84,7 @@ class People:
         if not NAME.fullmatch(name):
             raise UserRefused(f"{name!r} is no name of a user", "1 to 64 letters, digits and . _ @ -, beginning with a letter or digit")
         check_new(name, password)
-        self._store.add_user(name, role_of(role), self.passwords.hash(password))
+        self._store.people.add(name, role_of(role), self.passwords.hash(password))
 
     def get(self, name: str) -> UserRecord:
         """A user by name.
@@ -94,7 +94,7 @@ class People:
         UserRefused
             There is none.
         """
-        user = self._store.user(name)
+        user = self._store.people.find(name)
         if user is None:
             raise UserRefused(f"there is no user {name!r}", "`abbe user list` lists them")
         return user
@@ -104,49 +104,49 @@ class People:
         user, new = self.get(name), role_of(role)
         if new is not Role.ADMIN:
             self._keep_an_admin(user)
-        self._store.change_user(user.id, role=new)
+        self._store.people.change(user.id, role=new)
 
     def set_password(self, name: str, password: str) -> None:
         """Give a user another password; his sessions end."""
         user = self.get(name)
         check_new(name, password)
-        self._store.change_user(user.id, password=self.passwords.hash(password))
+        self._store.people.change(user.id, password=self.passwords.hash(password))
 
     def disable(self, name: str, *, enable: bool = False) -> None:
         """Shut a user out, sessions and tokens with him, or let him in again. He is never deleted: the audit names him."""
         user = self.get(name)
         if not enable:
             self._keep_an_admin(user)
-        self._store.change_user(user.id, disabled_utc=None if enable else utc_text(self._clock.utc()))
+        self._store.people.change(user.id, disabled_utc=None if enable else utc_text(self._clock.utc()))
 
     def _keep_an_admin(self, user: UserRecord) -> None:
-        others = [u for u in self._store.users() if u.id != user.id and u.role == Role.ADMIN and u.disabled_utc is None]
+        others = [u for u in self._store.people.all() if u.id != user.id and u.role == Role.ADMIN and u.disabled_utc is None]
         if user.role == Role.ADMIN and user.disabled_utc is None and not others:
             raise UserRefused(f"{user.name!r} is the only admin", "make somebody else admin first: abbe user role")
 
     def check(self, name: str, password: str) -> UserRecord | None:
         """The user, if the password is his and he is not disabled. Takes as long for one that does not exist."""
-        user = self._store.user(name) if NAME.fullmatch(name) else None
+        user = self._store.people.find(name) if NAME.fullmatch(name) else None
         right = self.passwords.verify(None if user is None else user.password, password)
         if not right or user is None or user.disabled_utc is not None:
             return None
         if self.passwords.outdated(user.password):
-            self._store.change_user(user.id, keep_session=True, password=self.passwords.hash(password))
+            self._store.people.change(user.id, keep_session=True, password=self.passwords.hash(password))
         return user
 
     def known(self, name: str) -> bool:
         """Tell whether there is such a user: what else is typed where a name belongs is not repeated anywhere, it may be a password."""
-        return bool(NAME.fullmatch(name)) and self._store.user(name) is not None
+        return bool(NAME.fullmatch(name)) and self._store.people.find(name) is not None
 
     def begin(self, user: UserRecord, instead_of: str = "") -> str:
         """Begin a session, always with a new secret; the session whose secret came with the login ends. Returns the secret."""
         secret = secrets.token_urlsafe(32)
-        self._store.add_session(user.id, digest_of(secret), digest_of(instead_of) if instead_of else "")
+        self._store.people.add_session(user.id, digest_of(secret), digest_of(instead_of) if instead_of else "")
         return secret
 
     def end(self, secret: str) -> None:
         """End a session."""
-        self._store.end_session(digest_of(secret))
+        self._store.people.end_session(digest_of(secret))
 
     def by_session(self, secret: str, *, in_use: bool = True) -> Principal:
         """Who has this secret; `NOBODY` if the session has ended, was idle or is too old, or its user is disabled.
@@ -154,7 +154,7 @@ class People:
         ``in_use`` False: this question is no use of the session, it goes on being idle.
         """
         digest = digest_of(secret)
-        found = self._store.session(digest)
+        found = self._store.people.session(digest)
         if found is None:
             return NOBODY
         session, user = found
@@ -163,7 +163,7 @@ class People:
         if session.ended_utc is not None or user.disabled_utc is not None or now - seen > IDLE or now - begun > LONGEST:
             return NOBODY
         if in_use and now - seen > TOUCH:
-            self._store.touch_session(session.id)
+            self._store.people.touch_session(session.id)
         role = Role(user.role)
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
 
@@ -173,7 +173,7 @@ class People:
         The cookie is not kept: its seal is made with the hash of the user's password, which leaves the database nowhere.
         """
         label, _, seal = cookie.partition(".")
-        user = self._store.user(name) if DEVICE.fullmatch(cookie) and NAME.fullmatch(name) else None
+        user = self._store.people.find(name) if DEVICE.fullmatch(cookie) and NAME.fullmatch(name) else None
         return label if user is not None and hmac.compare_digest(seal, _device_seal(user, label)) else ""
 
     def new_device(self, user: UserRecord) -> str:
@@ -203,7 +203,7 @@ class People:
         prefix, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
         text = f"abbe_{prefix}_{secret}"
         expires = utc_text(self._clock.utc() + timedelta(days=days))
-        self._store.add_token(
+        self._store.people.add_token(
             TokenRecord(user_id=user.id, name=title, prefix=prefix, digest=digest_of(text), scopes=sorted(set(scopes)), expires_utc=expires)
         )
         return text
@@ -216,15 +216,15 @@ class People:
         UserRefused
             There is none of this name.
         """
-        found = [token for token, owner in self._store.tokens() if (owner, token.name) == (name, title)]
+        found = [token for token, owner in self._store.people.tokens() if (owner.name, token.name) == (name, title)]
         if not found:
             raise UserRefused(f"{name!r} has no token {title!r}", "`abbe user token list` lists them")
-        self._store.revoke_token(found[0].id)
+        self._store.people.revoke_token(found[0].id)
 
     def by_token(self, text: str) -> Principal:
         """Who has this token: the rights of its user today, at most those of its scopes; `NOBODY` if it does not hold."""
         match = TOKEN.fullmatch(text)
-        found = self._store.token(match[1]) if match else None
+        found = self._store.people.token(match[1]) if match else None
         if found is None:
             return NOBODY
         token, user = found
@@ -238,7 +238,7 @@ class People:
 
     def anybody(self) -> bool:
         """Tell whether there is a user, also a disabled one: then nobody looks on without a name."""
-        return bool(self._store.users())
+        return bool(self._store.people.all())
 
 
 def role_of(text: str) -> Role:

@@ -103,7 +103,7 @@ class Looked:
 
 def alarms_of(store: Store, machine: str) -> list[Alarm]:
     """All alarms of a machine, oldest first."""
-    return folded(store.alarm_entries(machine))
+    return folded(store.alarms.entries(machine))
 
 
 def open_alarms(store: Store, machine: str) -> list[Alarm]:
@@ -144,7 +144,7 @@ def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
     one = alarm_numbered(store, machine, number)
     if one.acknowledged_by:
         raise StoreError(f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc}")
-    store.add_alarm_entry(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, {"name": name})
+    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, {"name": name})
     return alarm_numbered(store, machine, number)
 
 

@@ -143,7 +143,7 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
         check_chain(entries)
     except JournalBroken:
         return VerifiedBy("unknown", "journal")
-    checks = store.verifications_of(machine, LOOKED)
+    checks = store.verifications.of_machine(machine, LOOKED)
     return of_journal(store, entries, checks, strange=strange or _said_strange(store, machine, entries, checks))
 
 
@@ -151,7 +151,7 @@ def _said_strange(store: Store, machine: str, entries: Sequence[JournalEntry], c
     """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
     the journal's one in force.
     """
-    said = store.heartbeats().get(machine)
+    said = store.heartbeats.all().get(machine)
     if said is None or not strange_table(said.doc.get("attention") or []):
         return False
     seen = datetime.fromisoformat(said.seen_utc)
@@ -193,7 +193,7 @@ def _since(store: Store, entries: Sequence[JournalEntry], change: JournalEntry, 
 
 def _kind(store: Store, table: int) -> str:
     try:
-        return str(store.table(table).doc.get("kind", "push"))
+        return str(store.tables.get(table).doc.get("kind", "push"))
     except StoreError:  # without its document it counts as one that nothing has measured
         return KIND
 
@@ -221,7 +221,7 @@ def began(store: Store, record: VerificationRecord) -> datetime:
     """When a check's campaign began, after a word for the table that was given with the command; without a campaign: the check itself."""
     if record.campaign_id is None:
         return started(record)
-    return datetime.fromisoformat(store.campaign(record.campaign_id).created_utc)
+    return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)
 
 
 def started(record: VerificationRecord) -> datetime:
@@ -233,5 +233,5 @@ def table_of(store: Store, record: VerificationRecord) -> int | None:
     """CRC-32 of the table that was in force while a check was measured; None where nobody wrote it down."""
     crc = record.doc.get("table_crc")
     if crc is None and record.campaign_id is not None:
-        crc = store.campaign(record.campaign_id).doc.get("table_crc")
+        crc = store.campaigns.find(record.campaign_id).doc.get("table_crc")
     return None if crc is None else int(crc)

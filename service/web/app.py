@@ -18,7 +18,7 @@ from abbe.service.plant.facts import FactsSource
 from abbe.service.plant.gather import Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusSource
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.roles import Permission
 from abbe.service.web import problems
 from abbe.service.web.api.install import add_api
@@ -57,7 +57,7 @@ class Parts:
     ----------
     core : CoreLine
         The core.
-    store : ServiceStore
+    store : Store
         What is counted.
     machine : str
         Name of the machine.
@@ -72,7 +72,7 @@ class Parts:
     """
 
     core: CoreLine
-    store: ServiceStore
+    store: Store
     machine: str
     recipes: tuple[str, ...]
     plans: Rehearsals = field(default_factory=Rehearsals)

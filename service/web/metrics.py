@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 
 from abbe.service.channel.messages import Snapshot
 from abbe.service.errors import CoreSilent
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.core_link.core_line import CoreLine
@@ -24,7 +24,7 @@ VERDICTS = ("pass", "fail", "cannot tell")
 
 
 class _Figures(Collector):
-    def __init__(self, store: ServiceStore, core: CoreLine, machine: str, control: str) -> None:
+    def __init__(self, store: Store, core: CoreLine, machine: str, control: str) -> None:
         self._store, self._core, self._machine, self._control = store, core, machine, control
 
     def collect(self) -> Iterable[Metric]:
@@ -39,20 +39,20 @@ class _Figures(Collector):
 
     def _of_store(self) -> Iterator[Metric]:
         checks = CounterMetricFamily("abbe_checks", "Checks of the whole history by verdict", labels=["verdict"])
-        counts = dict.fromkeys(VERDICTS, 0) | self._store.verdict_counts(self._machine)
+        counts = dict.fromkeys(VERDICTS, 0) | self._store.verifications.counts(self._machine)
         for verdict, number in sorted(counts.items()):
             checks.add_metric([verdict], number)
         yield checks
         slots = CounterMetricFamily("abbe_slots_not_run", "Slots of the timetable that were not run, by why", labels=["why"])
-        states = self._store.slot_counts(self._machine)
+        states = self._store.slots.counts(self._machine)
         for why in ("missed", "skipped", "interrupted"):
             slots.add_metric([why], sum(number for state, number in states.items() if state.startswith(why)))
         yield slots
-        yield GaugeMetricFamily("abbe_outbox_waiting", "Messages that wait for the broker", self._store.waiting_messages())
+        yield GaugeMetricFamily("abbe_outbox_waiting", "Messages that wait for the broker", self._store.outbox.count())
         known = verified_by(self._store, self._machine, control=self._control)
         about = "1: a check, or the push that brought it, measured the table in force; 0: nothing has since it came"
         yield GaugeMetricFamily("abbe_table_verified", about, float(known.state == "verified"))
-        checks_now = self._store.verifications_of(self._machine, 1) if known.holds else []
+        checks_now = self._store.verifications.of_machine(self._machine, 1) if known.holds else []
         last = next(iter(checks_now), None)
         figures = GaugeMetricFamily(
             "abbe_last_figure", "Figures of the last check with the table in force; the unit is at the end of the name", labels=["figure"]
@@ -75,7 +75,7 @@ def _of_core(moment: Snapshot) -> Iterator[Metric]:
     yield CounterMetricFamily("abbe_web_restarts", "How often the web process was started again", moment.web_restarts)
 
 
-def add_metrics(app: FastAPI, store: ServiceStore, core: CoreLine, machine: str, control: str = "") -> None:
+def add_metrics(app: FastAPI, store: Store, core: CoreLine, machine: str, control: str = "") -> None:
     """Add the route to the application. Who may look at the page may ask for these; a program with a token of the scope ``read``."""
     registry = CollectorRegistry()
     registry.register(_Figures(store, core, machine, control))

@@ -67,12 +67,12 @@ async def at_work(urls: DeviceUrls, store: Store, site: Site, campaign: Campaign
     """Open the devices, and measure what is left."""
     async with open_session(urls) as session:
         await recover(session.controller, store, site)
-        begun = any(c.name == campaign.name and store.checkpoints(c.id) for c in store.campaigns())
+        begun = any(c.name == campaign.name and store.checkpoints.of_campaign(c.id) for c in store.campaigns.all())
         found = await resume(session, store, site, campaign, campaign.name, confirm) if begun else None
         for line in found.said if found is not None else ():
             print(line, file=sys.stderr)  # noqa: T201
         # killed between a campaign's first line and its journal's: there is nothing to go on with, and nothing was measured
-        empty = next((c for c in store.campaigns() if c.name == campaign.name and found is None), None)
+        empty = next((c for c in store.campaigns.all() if c.name == campaign.name and found is None), None)
         first = None if empty is None else (empty.id, int(empty.doc["ctrl0_us"]))
         await measure(session, store, site, campaign, campaign=first, manner=Manner(confirm=confirm, resumed=found))
 

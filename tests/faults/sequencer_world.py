@@ -193,7 +193,7 @@ class InTest(Control):
 
     def place(self, step: int, steps: int, points: int) -> None:
         super().place(step, steps, points)
-        if not self.done and step == self._where[1] and len(self._store.runs()) == self._where[0] + 1:
+        if not self.done and step == self._where[1] and len(self._store.runs.all()) == self._where[0] + 1:
             self.done = True
             self._do()
 

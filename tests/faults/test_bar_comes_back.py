@@ -75,7 +75,7 @@ def pulled_on_the_path(hand: Hand, plug_s: float | None) -> AtStep:
 
 def whole(store: Store, run_id: int) -> list[int]:
     """Sequence numbers of a run's stream, which begins at 0 and has none twice and none unaccounted."""
-    chunks = store.chunks(run_id)
+    chunks = store.chunks.of_run(run_id)
     ledger = ledger_of(chunks)
     assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
     return [sample.seq for chunk in chunks if chunk.channel == "bar" for sample in decode_bar(chunk.payload)]
@@ -87,7 +87,7 @@ async def test_the_cable_is_pulled_and_put_back_and_the_test_begins_again(place,
     before = b.session.ballbar.settings
     site = replace(b.site, watching=Watching(None, GOES_ON, unknown_s=5.0))
     (run_id,) = await measure(b.session, store, site, PLAN, manner=Manner(pulled_on_the_path(hand, 0.3), yes))
-    broken, complete = store.runs()
+    broken, complete = store.runs.all()
     assert [(one.label, one.status) for one in (broken, complete)] == [("test", "failed"), ("test-2", "complete")]
     assert broken.reason.startswith("DRV-002")
     assert run_id == complete.id
@@ -96,8 +96,8 @@ async def test_the_cable_is_pulled_and_put_back_and_the_test_begins_again(place,
     first, second = whole(store, broken.id), whole(store, complete.id)
     assert first[0] == second[0] == 0
     assert second[-1] > first[-1]
-    assert ledger_of(store.chunks(broken.id)).gaps[-1].last is None, "how many samples were cut off nobody knows, and that is said"
-    journal = store.checkpoints(complete.campaign_id)
+    assert ledger_of(store.chunks.of_run(broken.id)).gaps[-1].last is None, "how many samples were cut off nobody knows, and that is said"
+    journal = store.checkpoints.of_campaign(complete.campaign_id)
     asked = [one.doc["what"] for one in journal if one.kind == HAND and one.doc["phase"] == "asked"]
     assert asked.count("MountBar") == 1, "nothing was complete on this set-up: it stays as it is"
     found = [(one.doc["phase"], one.doc["code"], one.doc["run"]) for one in journal if one.kind == INCIDENT]
@@ -114,7 +114,7 @@ async def test_without_the_option_it_ends_and_goes_on_in_the_same_session(place,
     await b.sim.plug()
     found = await resume(b.session, store, b.site, PLAN, "c", yes)
     (run_id,) = await measure(b.session, store, b.site, PLAN, manner=Manner(None, yes, {}, found))
-    assert [(one.label, one.status) for one in store.runs()] == [("test", "failed"), ("test-2", "complete")]
+    assert [(one.label, one.status) for one in store.runs.all()] == [("test", "failed"), ("test-2", "complete")]
     assert whole(store, run_id)[0] == 0
     assert b.session.ballbar.settings.zero_nm == 0
 
@@ -131,7 +131,7 @@ async def test_whoever_waits_for_the_box_can_be_stopped(place, monkeypatch) -> N
             control.stop()
     with pytest.raises(Stopped):
         await task
-    assert [one.status for one in store.runs()] == ["failed"]
+    assert [one.status for one in store.runs.all()] == ["failed"]
 
 
 class Back:

@@ -36,7 +36,7 @@ async def refused(b: Bench, store: Store, kind: str, error: type[Exception], mat
     with pytest.raises(error, match=match):
         await measure(b.session, store, b.site, CampaignPlan("c", (small(kind),)))
     assert b.sim.motions() == []
-    assert store.campaigns() == []
+    assert store.campaigns.all() == []
 
 
 def test_what_a_campaign_needs_is_read_off_its_steps() -> None:
@@ -98,7 +98,7 @@ async def test_a_laser_that_is_not_aligned_yet_is_no_reason(place: tuple[Bench, 
     b.sim.pace(100.0)
     assert (await b.session.need_laser().peek()).status >> 4 & 1, "no reflector: nobody has mounted anything"
     (run,) = await measure(b.session, store, b.site, CampaignPlan("c", (small("Linear"),)))
-    assert store.run(run).status == "complete"
+    assert store.runs.find(run).status == "complete"
 
 
 @pytest.mark.parametrize("missing", ["ballbar", "laser", "fixture"])

@@ -118,4 +118,4 @@ async def test_a_unit_too_coarse_for_a_harmless_step_is_refused_before_anything_
     with pytest.raises(TableRefused, match="too coarse"):
         await commission(b.session, store, b.site, progress=ignore_progress)
     assert not read_entries(store, b.site.name)
-    assert not store.runs()
+    assert not store.runs.all()

@@ -344,4 +344,4 @@ async def test_broken_off_while_the_axis_moves_it_stops_and_gives_the_lease_back
     assert not b.sim.world.controller.moving
     assert (in_force(b), b.sim.world.controller.comp.active) == (before, active)
     assert b.sim.world.controller.comp.owner(b.sim.now_s()) == 0
-    assert not store.solutions()
+    assert not store.solutions.all()

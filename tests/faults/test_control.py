@@ -81,7 +81,7 @@ async def run(b: Bench, store: Store, plan: TestPlan, control: Control) -> tuple
     b.sim.pace(SPEED)
     start = len(b.sim.registers.log)
     error: BaseException | None = None
-    name = f"c{len(store.campaigns())}"
+    name = f"c{len(store.campaigns.all())}"
     try:
         async with asyncio.timeout(within(30)):
             await measure(b.session, store, b.site, CampaignPlan(name, (plan,)), manner=Manner(control))
@@ -156,7 +156,7 @@ async def test_pause_and_resume_at_every_step(place, undisturbed):
         during = await paused_at(b, control)
         lines, error = await task
         assert (during, error) == ([], None), case
-        runs = [(r.label, r.status) for r in store.runs(store.campaigns()[-1].id)]
+        runs = [(r.label, r.status) for r in store.runs.all(store.campaigns.all()[-1].id)]
         if on_path:
             assert runs == [("test", "aborted"), ("test-2", "complete")], case
             _held_and_again(lines, plain, case)
@@ -190,7 +190,7 @@ async def test_stop_and_abort_at_every_step(place, undisturbed):
         for how, status in ((Control.stop, "stopped"), (Control.abort, "aborted")):
             control = acting(b, case.step, how, moving=held_on_path(plan, case.step))
             lines, error = await run(b, store, plan, control)
-            (record,) = store.runs(store.campaigns()[-1].id)
+            (record,) = store.runs.all(store.campaigns.all()[-1].id)
             if error is None:  # asked for when the last step was as good as done
                 assert case.name == "Unmount", case
                 assert lines == plain
@@ -213,7 +213,7 @@ async def test_a_point_in_hand_is_finished_before_a_stop(place):
     control = acting(b, move, Control.stop, moving=True)
     _, error = await run(b, store, plan, control)
     assert isinstance(error, Stopped)
-    points = [c for c in store.checkpoints(store.campaigns()[-1].id) if c.kind == "point"]
+    points = [c for c in store.checkpoints.of_campaign(store.campaigns.all()[-1].id) if c.kind == "point"]
     assert points[-1].doc["step"] == move  # the reading after the move (steps there count from 0)
 
 
@@ -227,9 +227,9 @@ async def test_a_path_that_was_interrupted_never_enters_the_solution(place):
     task = asyncio.create_task(run(b, store, plan, control))
     await paused_at(b, control)
     await task
-    record = store.campaigns()[-1]
-    evidence, again = store.runs(record.id)
-    assert store.chunks(evidence.id)  # kept
+    record = store.campaigns.all()[-1]
+    evidence, again = store.runs.all(record.id)
+    assert store.chunks.of_run(evidence.id)  # kept
     assert evidence.reason.startswith("SEQ-006: paused on the path")
     used = from_store(store, record.name).runs
     assert [r["run_id"] for r in used] == ["helix-2"]
@@ -271,4 +271,4 @@ async def test_where_nobody_may_pause_a_pause_does_not_go_on(place):
         await task
     b.sim.world.controller.set_door(is_open=False)
     assert not b.sim.world.controller.moving
-    assert store.runs(store.campaigns()[-1].id)[-1].status == "failed"
+    assert store.runs.all(store.campaigns.all()[-1].id)[-1].status == "failed"

@@ -37,7 +37,7 @@ def step_of(plan: CampaignPlan, kind: type, nth: int = 0) -> int:
 
 
 def statuses(store: Store) -> list[tuple[str, str]]:
-    return [(r.label, r.status) for r in store.runs(store.campaigns()[-1].id)]
+    return [(r.label, r.status) for r in store.runs.all(store.campaigns.all()[-1].id)]
 
 
 async def yes(_: str) -> bool:
@@ -70,8 +70,8 @@ async def test_a_door_suspends_a_laser_run_which_goes_on_after_its_last_point(pl
     waited_s = await suspended_and_on(b, store, plan, step_of(plan, MoveTo, 6), lambda: door(is_open=True), lambda: door(is_open=False))
     assert waited_s > 0.3
     assert statuses(store) == [("test", "failed"), ("test-2", "complete")]
-    first, second = store.runs(store.campaigns()[-1].id)
-    points = [c.doc for c in store.checkpoints(first.campaign_id) if c.kind == "point"]
+    first, second = store.runs.all(store.campaigns.all()[-1].id)
+    points = [c.doc for c in store.checkpoints.of_campaign(first.campaign_id) if c.kind == "point"]
     kept = max(p["points"] for p in points if p["run"] == first.id)
     assert min(p["points"] for p in points if p["run"] == second.id) == kept + 1  # nothing was measured twice
 
@@ -82,9 +82,11 @@ async def test_a_door_suspends_a_helix_which_is_measured_again_in_the_same_mount
     door = b.sim.world.controller.set_door
     await suspended_and_on(b, store, plan, step_of(plan, RecordPath), lambda: door(is_open=True), lambda: door(is_open=False))
     assert statuses(store) == [("test", "failed"), ("test-2", "complete")]
-    setups = {r.start_doc["setup"]["setup_id"] for r in store.runs(store.campaigns()[-1].id)}
+    setups = {r.start_doc["setup"]["setup_id"] for r in store.runs.all(store.campaigns.all()[-1].id)}
     assert setups == {"S"}
-    asked = [c.doc["what"] for c in store.checkpoints(store.campaigns()[-1].id) if c.kind == "hand" and c.doc["phase"] == "asked"]
+    asked = [
+        c.doc["what"] for c in store.checkpoints.of_campaign(store.campaigns.all()[-1].id) if c.kind == "hand" and c.doc["phase"] == "asked"
+    ]
     assert asked == ["MountBar", "Unmount"]  # nobody was asked twice
 
 
@@ -95,8 +97,8 @@ async def test_a_broken_beam_costs_the_zero(place):
     await suspended_and_on(b, store, plan, step_of(plan, ReadLaser, 4), lambda: block(blocked=True), lambda: block(blocked=False))
     (_, failed), (_, complete) = statuses(store)
     assert (failed, complete) == ("failed", "complete")
-    run = store.runs(store.campaigns()[-1].id)[-1]
-    points = [c.doc["points"] for c in store.checkpoints(run.campaign_id) if c.kind == "point" and c.doc["run"] == run.id]
+    run = store.runs.all(store.campaigns.all()[-1].id)[-1]
+    points = [c.doc["points"] for c in store.checkpoints.of_campaign(run.campaign_id) if c.kind == "point" and c.doc["run"] == run.id]
     assert min(points) == 1  # from the zero on
 
 
@@ -108,7 +110,7 @@ async def test_what_is_not_configured_or_does_not_clear_ends_the_run(place, susp
     with pytest.raises(DoorOpen):
         await measure(b.session, store, replace(b.site, watching=Watching(None, suspending, unknown_s=5.0)), plan, manner=Manner(control))
     assert statuses(store) == [("test", "failed")]
-    assert store.runs()[-1].reason.startswith("ILK-003: the door is open")
+    assert store.runs.all()[-1].reason.startswith("ILK-003: the door is open")
 
 
 async def test_an_e_stop_never_goes_on_by_itself(place):
@@ -156,7 +158,7 @@ async def test_a_mirror_that_was_knocked_is_mounted_anew(place):
     laser = b.sim.world.laser
     laser._mount = replace(laser._mount, zero_mm=laser._mount.zero_mm + 0.05)
     await going_on(b, store, plan)
-    last = store.runs(store.campaigns()[-1].id)[-1]
+    last = store.runs.all(store.campaigns.all()[-1].id)[-1]
     assert [s for _, s in statuses(store)] == ["failed", "failed", "complete"]
     assert last.start_doc["setup"]["setup_id"] == "S-2"
 
@@ -183,7 +185,7 @@ async def test_a_machine_that_was_moved_off_the_path_has_its_bar_mounted_anew(pl
     controller.reset_alarm()
     controller.position_mm = controller.position_mm + 3.0
     await going_on(b, store, plan)
-    runs = store.runs(store.campaigns()[-1].id)
+    runs = store.runs.all(store.campaigns.all()[-1].id)
     assert [r.status for r in runs] == ["failed", "failed", "complete"]
     assert runs[1].reason.startswith("SEQ-008: the machine stands")
     assert runs[-1].start_doc["setup"]["setup_id"] == "S-2"
@@ -212,7 +214,7 @@ async def test_a_set_up_with_complete_runs_is_used_only_if_somebody_vouches_for_
 
     await going_on(b, store, plan, confirm)
     assert len(asked) == 1
-    complete = [r for r in store.runs() if r.status == "complete"]
+    complete = [r for r in store.runs.all() if r.status == "complete"]
     setups = [r.start_doc["setup"]["setup_id"] for r in complete]
     assert setups == (["S", "S"] if answer else ["S", "S-2"])
 
@@ -246,7 +248,7 @@ async def test_a_changed_world_is_refused_in_one_line(place):
 async def test_a_campaign_that_somebody_measures_is_left_alone(place):
     b, store = place
     plan = await broken_off(b, store)
-    store.start_run(store.campaigns()[-1].id, "other", "laser_linear", "identify", {})
+    store.runs.start(store.campaigns.all()[-1].id, "other", "laser_linear", "identify", {})
     with pytest.raises(UnsafeToMove, match="is being measured"):
         await resume(b.session, store, b.site, plan, "c", yes)
 

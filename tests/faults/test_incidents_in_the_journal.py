@@ -43,7 +43,7 @@ class Place:
     pulled: asyncio.Task[None] | None = None
 
     def lines(self) -> list[dict[str, Any]]:
-        return [one.doc for one in self.store.checkpoints(self.store.campaigns()[-1].id) if one.kind == INCIDENT]
+        return [one.doc for one in self.store.checkpoints.of_campaign(self.store.campaigns.all()[-1].id) if one.kind == INCIDENT]
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ async def test_a_connection_that_is_reset_is_two_lines_that_name_the_run(place: 
     assert (detected["link"], detected["device"]) == ("controller", place.proxy.url)
     assert detected["run"] == outcome["run"] == f"run {run} test"
     assert detected["at_utc"] <= outcome["at_utc"]
-    assert place.store.run(run).status == "complete"
+    assert place.store.runs.find(run).status == "complete"
 
 
 async def test_show_tells_a_campaigns_incidents_and_how_they_ended(place: Place) -> None:
@@ -109,7 +109,7 @@ async def test_a_cable_that_is_pulled_is_noted_with_its_run_and_as_not_over(plac
     control = AtStep(5, pull)
     with pytest.raises(LinkDown) as caught:
         await measure(session, place.store, place.bench.site, plan, manner=Manner(control))
-    (run,) = place.store.runs()
+    (run,) = place.store.runs.all()
     assert caught.value.run == f"run {run.id} test"
     lines = [one for one in place.lines() if one["link"] == "ball-bar"]
     assert [one["phase"] for one in lines] == ["detected", "outcome"]
@@ -120,7 +120,7 @@ async def test_a_cable_that_is_pulled_is_noted_with_its_run_and_as_not_over(plac
 async def test_a_locked_database_holds_up_no_link_and_no_end(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("abbe.service.sequences.incident_notes.LAST_LINES_S", 0.2)
     store, session = place.store, place.bench.session
-    campaign = store.add_campaign(store.add_machine("m", {}), "c", {})
+    campaign = store.campaigns.add(store.machines.add("m", {}), "c", {})
     notes = IncidentNotes(StoreJournal(store, campaign), SystemClock())
     links = links_of(session)
     assert set(links) == {"controller", "laser", "ball-bar"}
@@ -150,7 +150,7 @@ async def test_more_incidents_than_may_wait_are_counted_at_the_end_of_the_journa
     await measure(place.bench.session, place.store, place.bench.site, CampaignPlan("c", (small("Helix"),)), manner=Manner(control))
     assert control.state == State.ENDED
     assert len(place.lines()) == 3
-    (ended,) = [one for one in place.store.checkpoints(place.store.campaigns()[-1].id) if one.kind == ENDED]
+    (ended,) = [one for one in place.store.checkpoints.of_campaign(place.store.campaigns.all()[-1].id) if one.kind == ENDED]
     assert ended.doc == {"how": "complete", "incidents_not_written": 7}
-    (trouble,) = troubles(place.store.checkpoints(ended.campaign_id))
+    (trouble,) = troubles(place.store.checkpoints.of_campaign(ended.campaign_id))
     assert (trouble.times, trouble.ends) == (2, {"recovered": 1, "no outcome": 1})

@@ -81,14 +81,14 @@ def zygote(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Zygote]:
 def complete_runs(folder: Path, name: str) -> dict[str, str]:
     """Fingerprint of every complete run with all its samples, by its number."""
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        record = next((c for c in store.campaigns() if c.name == name), None)
+        record = next((c for c in store.campaigns.all() if c.name == name), None)
         if record is None:
             return {}
         found = {}
-        for run in store.runs(record.id):
+        for run in store.runs.all(record.id):
             if run.status == "complete":
                 digest = hashlib.sha256(repr((run.label, run.start_doc, run.end_doc)).encode())
-                for chunk in store.chunks(run.id):
+                for chunk in store.chunks.of_run(run.id):
                     digest.update(repr((chunk.channel, chunk.seq, chunk.n)).encode() + chunk.payload)
                 found[f"{run.id} {run.label}"] = digest.hexdigest()
         return found
@@ -97,9 +97,9 @@ def complete_runs(folder: Path, name: str) -> dict[str, str]:
 def measured_tests(folder: Path, name: str) -> list[str]:
     """Test of every complete run of a campaign, as its journal says."""
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        record = store.campaign(name)
-        complete = {r.id for r in store.runs(record.id) if r.status == "complete"}
-        return [c.doc["test"] for c in store.checkpoints(record.id) if c.kind == "run" and c.doc["run"] in complete]
+        record = store.campaigns.find(name)
+        complete = {r.id for r in store.runs.all(record.id) if r.status == "complete"}
+        return [c.doc["test"] for c in store.checkpoints.of_campaign(record.id) if c.kind == "run" and c.doc["run"] in complete]
 
 
 @pytest.mark.timeout(1200 if LONG else 150)

@@ -98,7 +98,7 @@ async def gone_on(b: Bench, store: Store, plan: CampaignPlan, confirm=yes, *, ag
 
 
 def runs(store: Store) -> list[RunRecord]:
-    return store.runs(store.campaigns()[-1].id)
+    return store.runs.all(store.campaigns.all()[-1].id)
 
 
 def about_centre(document: dict) -> tuple[np.ndarray, np.ndarray]:
@@ -224,7 +224,7 @@ async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_pa
     folder = export_folder(store, plan.name, tmp_path / "out")
     with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as other:
         again = import_folder(other, folder)
-        (record,) = other.runs(again)
+        (record,) = other.runs.all(again)
         ours, theirs = load_run(store, runs(store)[-1].id), load_run(other, record.id)
     assert theirs["columns"]["deviation_mm"] == ours["columns"]["deviation_mm"]
     assert theirs["timing"]["pieces"] == ours["timing"]["pieces"]

@@ -96,7 +96,7 @@ async def test_and_into_the_runs_account_with_an_open_gap_behind_it(tmp_path: Pa
                     await streamed(on, SlowTap(recorder.tap()))
             await close_run(store, run_id, held[0], "failed", "DRV-002: cable", held[0].doc())
             sent = [sample.seq for sample in on.box.sent[on.box.stream]]
-        chunks = store.chunks(run_id)
+        chunks = store.chunks.of_run(run_id)
         stored = [sample.seq for chunk in chunks if chunk.channel == "bar" for sample in decode_bar(chunk.payload)]
         assert stored == sent
         ledger = ledger_of(chunks)

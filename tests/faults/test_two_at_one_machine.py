@@ -93,7 +93,7 @@ async def test_a_machine_that_was_moved_before_a_bar_change_has_its_bar_mounted_
         await measure(b.session, store, b.site, plan, manner=Manner(control))
     b.sim.world.controller.position_mm = b.sim.world.controller.position_mm + 2.0
     await going_on(b, store, plan, yes)
-    last = store.runs()[-1]
+    last = store.runs.all()[-1]
     assert (last.status, last.start_doc["setup"]["setup_id"]) == ("complete", "B1-2")
     assert b.sim.world.ballbar._radius_mm == 60.0
 

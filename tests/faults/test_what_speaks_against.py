@@ -128,7 +128,7 @@ async def test_a_mirror_knocked_in_a_pause_is_found_by_reading_the_last_point_ag
     await door_in_the_pause(b, control, knock)
     await task
     assert statuses(store) == [("test", "aborted"), ("test-2", "failed"), ("test-3", "complete")]
-    assert store.runs()[-1].start_doc["setup"]["setup_id"] == "S-2"
+    assert store.runs.all()[-1].start_doc["setup"]["setup_id"] == "S-2"
 
 
 async def test_a_bar_point_by_point_begins_again_after_the_door_was_open_in_a_pause(place):
@@ -155,7 +155,7 @@ async def test_a_used_set_up_is_asked_for_after_the_door_was_open_in_a_pause_on_
     await door_in_the_pause(b, control, lambda: None)
     await task
     assert len(asked) == 1
-    assert [r.start_doc["setup"]["setup_id"] for r in store.runs()] == ["S", "S", "S-2"]
+    assert [r.start_doc["setup"]["setup_id"] for r in store.runs.all()] == ["S", "S", "S-2"]
 
 
 async def test_a_pause_with_the_door_shut_goes_on_where_it_was(place):
@@ -181,8 +181,8 @@ async def test_a_mirror_whose_count_was_lost_and_whose_axes_were_moved_is_mounte
     at = len(b.sim.registers.log)
     await resume_all(b, store, plan)
     assert [s for _, s in statuses(store)] == ["failed", "failed", "complete"]
-    assert store.runs()[1].reason.startswith("SEQ-008: the machine stands")
-    assert store.runs()[-1].start_doc["setup"]["setup_id"] == "S-2"
+    assert store.runs.all()[1].reason.startswith("SEQ-008: the machine stands")
+    assert store.runs.all()[-1].start_doc["setup"]["setup_id"] == "S-2"
     assert [c.kind for c in b.sim.registers.log[at:]][:4] == ["abort", "run", "abort", "run"]  # nothing moved before somebody was asked
 
 
@@ -199,7 +199,7 @@ async def test_a_table_that_changes_while_a_question_stands_is_found(place):
     control = InTest(store, 1, 1, lambda: control.stop())
     with pytest.raises(Stopped):
         await measure(b.session, store, b.site, plan, manner=Manner(control))
-    comp, runs = b.sim.world.controller.comp, len(store.runs())
+    comp, runs = b.sim.world.controller.comp, len(store.runs.all())
 
     async def confirm(_: str) -> bool:
         comp.crcs[comp.active] ^= 1
@@ -207,7 +207,7 @@ async def test_a_table_that_changes_while_a_question_stands_is_found(place):
 
     with pytest.raises(PreconditionsChanged, match="another compensation table is active"):
         await going_on(b, store, plan, confirm)
-    assert len(store.runs()) == runs
+    assert len(store.runs.all()) == runs
 
 
 async def test_a_window_for_the_air_needs_somebody_who_reads_it(place):
@@ -231,8 +231,8 @@ async def test_a_window_for_the_air_needs_somebody_who_reads_it(place):
 
 def test_a_campaign_whose_journal_names_no_recipe_is_one_line(tmp_path):
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        campaign = store.add_campaign(store.add_machine("m", {}), "c", {})
-        store.add_checkpoint(campaign, "begun", {"plan": "", "source": {}})
+        campaign = store.campaigns.add(store.machines.add("m", {}), "c", {})
+        store.checkpoints.add(campaign, "begun", {"plan": "", "source": {}})
         with pytest.raises(PreconditionsChanged, match="the journal of campaign 'c' does not name its recipe"):
             begun_source(store, "c")
 
@@ -240,7 +240,7 @@ def test_a_campaign_whose_journal_names_no_recipe_is_one_line(tmp_path):
 async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path):
     path = tmp_path / "abbe.sqlite3"
     with Store.open(f"sqlite:///{path}") as store:
-        campaign = store.add_campaign(store.add_machine("m", {}), "c", {})
+        campaign = store.campaigns.add(store.machines.add("m", {}), "c", {})
         locked, free = threading.Event(), threading.Event()
 
         def lock() -> None:
@@ -257,7 +257,7 @@ async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path):
         asyncio.get_running_loop().call_later(5.5, free.set)  # longer than the database itself waits
         await StoreJournal(store, campaign).add("point", n=1)
         thread.join()
-        assert [c.doc for c in store.checkpoints(campaign)] == [{"n": 1}]
+        assert [c.doc for c in store.checkpoints.of_campaign(campaign)] == [{"n": 1}]
 
 
 # ---- suspended again and again --------------------------------------------------------------------------------------------
@@ -295,13 +295,13 @@ async def test_a_test_that_is_suspended_again_and_again_ends(place, monkeypatch)
     with pytest.raises(DoorOpen, match="3 times in a row without a new point"):
         async with asyncio.timeout(within(30)):
             await measure(b.session, store, site, plan, manner=Manner(Always()))
-    assert len(store.runs()) == 3
+    assert len(store.runs.all()) == 3
 
 
 async def test_an_e_stop_is_told_although_the_journal_cannot_be_ended(place, monkeypatch):
     b, store = place
     monkeypatch.setattr("abbe.service.campaigns.measure.LAST_LINE_S", 0.0)
-    add = store.add_checkpoint
+    add = store.checkpoints.add
 
     def refuses(campaign: int, kind: str, doc: dict) -> int:
         if kind == "ended":
@@ -313,7 +313,7 @@ async def test_an_e_stop_is_told_although_the_journal_cannot_be_ended(place, mon
 
         return StoreError("database is locked")
 
-    monkeypatch.setattr(store, "add_checkpoint", refuses)
+    monkeypatch.setattr(store.checkpoints, "add", refuses)
     control = AtStep(9, lambda: b.sim.world.controller.set_estop(pressed=True))
     with pytest.raises(EstopPressed) as told:
         await measure(b.session, store, b.site, CampaignPlan("c", (small("Linear"),)), manner=Manner(control))

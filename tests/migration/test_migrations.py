@@ -71,11 +71,11 @@ def test_a_database_from_before_the_first_release_is_refused(engine: Engine) -> 
 def test_an_older_sqlite_file_is_copied_before_an_upgrade(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "abbe.sqlite3"
     with Store.open(f"sqlite:///{path}") as store:
-        store.add_machine("VMC-1", {})
+        store.machines.add("VMC-1", {})
     newest = next_revision.install(tmp_path, monkeypatch)
     with Store.open(f"sqlite:///{path}") as store:
-        assert [one.name for one in store.machines()] == ["VMC-1"]
-        assert "gauges" in inspect(store._engine).get_table_names()
+        assert [one.name for one in store.machines.all()] == ["VMC-1"]
+        assert "gauges" in inspect(store.engine).get_table_names()
     old = make_engine(f"sqlite:///{path}.before-{newest}")
     assert current_revision(old) == newest
     assert "gauges" not in inspect(old).get_table_names()

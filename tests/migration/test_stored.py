@@ -78,9 +78,9 @@ def test_nothing_is_lost_on_the_way_up_and_back(engine: Engine, kind: str, tmp_p
     assert all(stored.values())
     newest = next_revision.install(tmp_path, monkeypatch)
     with Store.open(engine.url.render_as_string(hide_password=False)) as store:  # as any command does, after an update
-        assert [one.name for one in store.machines()] == [one["name"] for one in stored["machines"]]
-        assert store.run_numbered(1) is not None
-        assert "name" in store.machine_names()
+        assert [one.name for one in store.machines.all()] == [one["name"] for one in stored["machines"]]
+        assert store.runs.numbered(1) is not None
+        assert "name" in store.machines.names()
     assert current_revision(engine) == next_revision.NEXT
     kept(stored, rows_of(engine))
     downgrade(engine, newest)

@@ -117,7 +117,7 @@ async def test_a_control_that_refuses_an_activation_and_does_it_later_is_found(m
         with pytest.raises(PushNotBegun, match="interlock"):
             await brought(b, store, Waiting(), questions)
         assert await recover(b.session.controller, store, b.site) is None
-        assert b.site.name in store.machine_names()  # as it is described now, also where nothing was pushed
+        assert b.site.name in store.machines.names()  # as it is described now, also where nothing was pushed
         return
     with pytest.raises(TableMismatch, match=r"made its table active all the same.*STILL ACTIVE"):
         await brought(b, store, Waiting(), questions)

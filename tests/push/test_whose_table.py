@@ -97,10 +97,10 @@ async def test_an_open_push_of_the_control_is_finished_before_one_under_a_new_na
 
 async def test_a_control_at_a_new_address_keeps_the_journal_of_its_name_unless_that_is_another_s_now(store: Store) -> None:
     await pushed(store, "mill", (OLD, NEW), KEPT, HERE)
-    assert store.push_chain("mill", THERE) == "mill"
+    assert store.pushes.chain("mill", THERE) == "mill"
     await pushed(store, "mill-old", (NEW, THIRD), KEPT, HERE)
-    assert store.push_chain("mill-old", HERE) == "mill"
-    assert store.push_chain("mill", THERE) == f"mill ({THERE})"
+    assert store.pushes.chain("mill-old", HERE) == "mill"
+    assert store.pushes.chain("mill", THERE) == f"mill ({THERE})"
     await pushed(store, "mill", (b"other base", b"other table"), KEPT, THERE)
     assert [e.push for e in read_entries(store, "mill", THERE)[:1]] == [1]
     assert read_entries(store, "mill") == read_entries(store, "mill", THERE)
@@ -109,20 +109,20 @@ async def test_a_control_at_a_new_address_keeps_the_journal_of_its_name_unless_t
 async def test_an_address_that_a_control_has_left_is_not_its_any_more(store: Store) -> None:
     await pushed(store, "mill", (OLD, NEW), KEPT, HERE)
     await pushed(store, "mill", (NEW, THIRD), UP_TO_ACTIVE, THERE)
-    assert store.push_chain("lathe", HERE) == "lathe"
-    assert (store.push_chain("mill", HERE), store.push_chain("lathe", THERE)) == ("mill", "mill")
+    assert store.pushes.chain("lathe", HERE) == "lathe"
+    assert (store.pushes.chain("mill", HERE), store.pushes.chain("lathe", THERE)) == ("mill", "mill")
 
 
 async def test_a_journal_that_was_begun_under_a_name_is_not_that_of_another_control_with_the_name_now(store: Store) -> None:
     await pushed(store, "mill", (OLD, NEW), KEPT, HERE)
     await pushed(store, "mill", (b"a", b"b"), KEPT, THERE)
     await pushed(store, "other", (b"c", b"d"), KEPT, HERE)
-    assert store.push_chain("other") == "other"
+    assert store.pushes.chain("other") == "other"
     await pushed(store, "mill-old", (b"e", b"f"), KEPT, THERE)
     await pushed(store, "mill", (b"g", b"h"), KEPT, HERE + "1")
     await pushed(store, "mill-old", (b"f", b"i"), KEPT, THERE)
-    assert store.push_chain("mill-old") == "mill"
-    assert store.push_chain("mill") == f"mill ({HERE}1)"  # known by its name only
+    assert store.pushes.chain("mill-old") == "mill"
+    assert store.pushes.chain("mill") == f"mill ({HERE}1)"  # known by its name only
 
 
 async def test_what_an_older_version_wrote_belongs_to_the_name(store: Store) -> None:

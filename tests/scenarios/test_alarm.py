@@ -37,12 +37,12 @@ from abbe.service.scheduler.job import Checks, Job, carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
+from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import Alarm, AlarmKind
 from abbe.service.verification.alarms import acknowledge, alarms_of
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
@@ -60,7 +60,7 @@ LIMITS = "[verify]\nbody_diagonal_um = 90\nhelix_rms_um = 7\n"
 class Shop:
     sims: Sims
     site: Site
-    store: ServiceStore
+    store: Store
     config: Any
     url: str
 
@@ -71,7 +71,7 @@ class Shop:
         return proposal_status(self.store, number, load(self.store, number), SystemClock().utc().timestamp()).word
 
     def told(self) -> list[dict[str, Any]]:
-        found = [json.loads(m.payload) for m in self.store.outbox_pending() if m.topic == TOPICS[1]]
+        found = [json.loads(m.payload) for m in self.store.outbox.pending() if m.topic == TOPICS[1]]
         return [doc for doc in found if doc["code"].startswith("ALM")]  # slots that came due during all this are told, too
 
     @asynccontextmanager
@@ -83,7 +83,7 @@ class Shop:
         duties = duties_on(AlarmSection(push="approved"), self.site, CampaignPlan("full", tests), RATE_HZ)(self.store)
         channels = AlarmChannels(TOPICS[1], lambda: None, AuditBook(self.store, self.url))
         desk = AlarmManager(self.store, clock, "sim", [OFTEN], duties, channels)
-        shelf = StoreShelf(self.store, clock, ("sim", self.store.add_machine("sim", self.site.doc)), TOPICS, lambda: None)
+        shelf = StoreShelf(self.store, clock, ("sim", self.store.machines.add("sim", self.site.doc)), TOPICS, lambda: None)
 
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:
             return await run_check(self.config, self.store, recipe, progress, control=control)
@@ -127,7 +127,7 @@ async def shop(start_sims: Callable[..., Sims]) -> AsyncIterator[Shop]:
     # As in test_correction: some tests are left out to save time, so the tables bend more than they should. Nothing was pushed before.
     wide = PushLimits(value_mm=0.3, second_mm=0.05, change_mm=0.3, walk_mm=0.3)
     site = replace(site_of(loaded.machine), limits=wide, watching=Watching(unknown_s=5.0))
-    with ServiceStore.open(loaded.database_url) as store:
+    with Store.open(loaded.database_url) as store:
         async with open_session(site.urls) as session:
             await as_if_commissioned(session.controller, store, site)
             await as_if_proved_for_nobody_there(session.controller, store, site)
@@ -137,7 +137,7 @@ async def shop(start_sims: Callable[..., Sims]) -> AsyncIterator[Shop]:
 @pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="a minute and a half: ABBE_TEST_LONG=1 runs it")
 async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Shop, capsys: pytest.CaptureFixture[str]) -> None:
     async with shop.service():
-        await until(lambda: shop.store.verifications_of("sim"))
+        await until(lambda: shop.store.verifications.of_machine("sim"))
         assert shop.alarms() == []
         shop.sims.ask("drift", axis="X", um_per_m=120.0)
         (raised,) = await until(shop.alarms)
@@ -155,7 +155,7 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         assert change is not None, proposed["text"]  # what drifted: X, by its own scale
         assert abs(float(change[1])) == pytest.approx(72.0, abs=15.0)  # 120 µm/m over 600 mm, and what X had before
         assert shop.state(number) == "proposed"
-        assert shop.store.push_entries("sim") == []  # nothing is written, nobody has approved
+        assert shop.store.pushes.entries("sim") == []  # nothing is written, nobody has approved
         assert [d["code"] for d in shop.told()] == ["ALM-001", "ALM-003"]
         (shown,) = (await shop.view.status()).alarms
         assert (shown.state, shown.proposal) == ("raised", number)
@@ -172,23 +172,23 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         assert shop.state(number) == "kept"
         assert len(shop.alarms()) == 1
 
-    latest = shop.store.verifications_of("sim")[0]
+    latest = shop.store.verifications.of_machine("sim")[0]
     assert latest.verdict == "pass"
     assert latest.doc["values"]["helix_rms_um"] < 4.0
     assert [d["code"] for d in shop.told()] == ["ALM-001", "ALM-003", "ALM-006", "ALM-002"]
-    entry = next(e.doc for e in shop.store.push_entries("sim") if e.state == "APPROVED")
+    entry = next(e.doc for e in shop.store.pushes.entries("sim") if e.state == "APPROVED")
     assert entry["approved_by"].startswith("anna; pushed by ")
     assert entry["approved_by"].endswith("by the service")
-    said = [r.outcome for r in shop.store.audit() if r.action == "abbe serve"]
+    said = [r.outcome for r in shop.store.audit.events() if r.action == "abbe serve"]
     assert said == ["raised", "begun", "measured", "discovered", "proposed", "pushing", "pushed", "cleared"]
-    reasons = [s.reason for s in shop.store.slots_of("sim/often") if s.reason and s.state == "done: fail"]
+    reasons = [s.reason for s in shop.store.slots.latest("sim/often") if s.reason and s.state == "done: fail"]
     assert any(reason.startswith("alarm 1 raised: helix rms") for reason in reasons)
 
     # the trend begins anew with the table
     capsys.readouterr()
     assert run(["trend", str(shop.sims.machine_file), "--json"]) == 0
     figures = {f["figure"]: f for f in json.loads(capsys.readouterr().out)["figures"]}
-    assert figures["helix_rms_um"]["checks"] < len([v for v in shop.store.verifications_of("sim") if v.doc.get("values")])
+    assert figures["helix_rms_um"]["checks"] < len([v for v in shop.store.verifications.of_machine("sim") if v.doc.get("values")])
     assert figures["helix_rms_um"]["latest"] < 4.0
     assert run(["alarm", "list", str(shop.sims.machine_file), "--all", "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)["alarms"]

@@ -47,7 +47,7 @@ def test_a_killed_measurement_is_taken_over_by_the_next_command(abbe, start_sims
     assert recovered.status == "interrupted"
     assert recovered.end_doc["capture"]["unaccounted"] == 0
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        chunks = store.chunks(run.id)
+        chunks = store.chunks.of_run(run.id)
     assert len([one for one in chunks if one.channel == "bar"]) >= known
     ledger = ledger_of(chunks)
     assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
@@ -62,8 +62,8 @@ def test_a_whole_measurement_accounts_for_every_sample_of_the_box(start_sims, ca
     fates = sims.ask("ledger")["fates"]
     folder = sims.machine_file.parent
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        (record,) = store.runs()
-        ledger = ledger_of(store.chunks(record.id))
+        (record,) = store.runs.all()
+        ledger = ledger_of(store.chunks.of_run(record.id))
     assert {stream for stream, *_ in fates} == {0}
     lost = {seq for _, first, last, fate in fates if fate != "sent" for seq in range(first, last + 1)}
     assert {seq for gap in ledger.gaps for seq in range(gap.first, gap.last + 1)} == lost
@@ -114,8 +114,8 @@ async def test_a_hanging_disk_stops_the_axes_before_a_sample_is_lost(start_sims,
             with pytest.raises(Backpressure, match="80% full"):
                 await measure(session, store, site, plan)
         watching.join(60)
-        (run,) = store.runs()
-        ledger = ledger_of(store.chunks(run.id))
+        (run,) = store.runs.all()
+        ledger = ledger_of(store.chunks.of_run(run.id))
     assert at_rest
     assert (run.status, run.reason[:7]) == ("failed", "DRV-009")
     assert ledger.unaccounted() == []

@@ -50,7 +50,7 @@ def table(sims: Sims) -> tuple[int, ...]:
 def verifying(sims: Sims) -> bool:
     """A new table is active and the measurement that is to prove it has begun."""
     with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
-        entries = store.push_entries("sim")
+        entries = store.pushes.entries("sim")
     return bool(entries) and entries[-1].state == "PROBED" and runs_of(sims.machine_file.parent)[-1].campaign.startswith("verify-after")
 
 
@@ -214,8 +214,8 @@ def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_comman
     if words[0] != "serve":
         assert "push 1 was not verified (interrupted before it was verified); the old table was made active again" in err
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        assert store.push_entries("sim")[-1].state == "ROLLED_BACK"
-        later = [r for r in store.runs() if store.machine(store.campaign(r.campaign).machine_id).name == "mill-A"]
+        assert store.pushes.entries("sim")[-1].state == "ROLLED_BACK"
+        later = [r for r in store.runs.all() if store.machines.get(store.campaigns.find(r.campaign).machine_id).name == "mill-A"]
     assert bool(later) == (words[0] in ("measure", "serve"))
     assert all(r.start_doc["table"]["crc"] == killed.before[1] << 16 | killed.before[2] for r in later)
 
@@ -255,7 +255,7 @@ def test_a_correction_that_makes_nothing_better_goes_back_and_ends_with_1(abbe, 
     assert process.returncode == 1, err
     assert out.startswith("rolled back: ")
     with Store.open(f"sqlite:///{identified.machine_file.parent / 'abbe.sqlite3'}") as store:
-        made = [s for s in store.solutions() if s.kind == "joint"][-1]
+        made = [s for s in store.solutions.all() if s.kind == "joint"][-1]
     assert made.doc["inputs"]["tables"] == [{"crc": before[1] << 16 | before[2], "acting": False}]
     assert not [line for line in err.splitlines() if line.startswith("error ")]
     assert table(identified) == before

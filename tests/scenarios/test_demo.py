@@ -85,9 +85,9 @@ def test_stopping_the_demo_leaves_no_simulator_and_says_which_run_was_cut(abbe, 
     assert "Traceback" not in err
     assert simulators_of(folder) == []
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        cut = [r for r in store.runs("identify") if r.status == "aborted"]
+        cut = [r for r in store.runs.all("identify") if r.status == "aborted"]
         assert len(cut) == 1
-        assert store.chunks(cut[0].id, "bar")
+        assert store.chunks.of_run(cut[0].id, "bar")
 
 
 def test_sigkill_loses_the_last_instant_only_and_damages_nothing_else(abbe, tmp_path):
@@ -99,9 +99,9 @@ def test_sigkill_loses_the_last_instant_only_and_damages_nothing_else(abbe, tmp_
     process.communicate()
     wait_for(lambda: simulators_of(folder) == [], 5, "the simulators notice that nobody is left")
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        run = next(r for r in store.runs("identify") if r.label == label)
+        run = next(r for r in store.runs.all("identify") if r.label == label)
         assert run.visible_status == "incomplete"
-        chunks = store.chunks(run.id, "bar")
+        chunks = store.chunks.of_run(run.id, "bar")
         assert killed_at - chunks[-1].last_host_s <= LOST_S
         # 1 kHz without a gap, from the first chunk to the last
         assert chunks[-1].last_device_us - chunks[0].first_device_us == (sum(c.n for c in chunks) - 1) * 1000
@@ -116,11 +116,11 @@ def test_a_folder_that_holds_a_demonstration_is_not_overwritten(abbe, tmp_path):
     (tmp_path / "kept").mkdir()
     kept = tmp_path / "kept" / "abbe.sqlite3"
     with Store.open(f"sqlite:///{kept}") as store:
-        store.add_machine("precious", {"name": "precious"})
+        store.machines.add("precious", {"name": "precious"})
     process = abbe("demo", "--keep", str(tmp_path / "kept"))
     _, err = process.communicate(timeout=within(30))
     assert process.returncode == 2
     assert len(err.strip().splitlines()) == 1
     assert "already holds a demonstration" in err
     with Store.open(f"sqlite:///{kept}") as store:
-        assert [machine.name for machine in store.machines()] == ["precious"]
+        assert [machine.name for machine in store.machines.all()] == ["precious"]

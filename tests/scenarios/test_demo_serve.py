@@ -109,7 +109,7 @@ def test_the_story_is_seen_and_approved_in_the_page(demo: Process, page: Page, t
 
 def pushes(folder: Path) -> list[str]:
     with Store.open(f"sqlite:///{folder / 'demo' / 'abbe.sqlite3'}") as store:
-        return [entry.state for entry in store.push_entries("demo-machine")]
+        return [entry.state for entry in store.pushes.entries("demo-machine")]
 
 
 def left_behind(folder: Path) -> list[str]:

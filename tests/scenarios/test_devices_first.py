@@ -119,7 +119,7 @@ def refuses(sims: Sims, tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
         assert re.fullmatch(r"error [A-Z]{3}-\d{3}: [^\n]+\n", err), err
         if (tmp_path / "abbe.sqlite3").exists():
             with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-                assert store.campaigns() == [], "a campaign that did not begin is none"
+                assert store.campaigns.all() == [], "a campaign that did not begin is none"
         return str(err)
 
     return measure

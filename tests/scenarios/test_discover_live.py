@@ -57,9 +57,9 @@ def test_the_proposed_run_is_measured_and_the_search_goes_on(run, start_sims, mo
     assert set_s <= first_s < later_set_s <= later_s
     assert "n1-feed" in (tmp_path / "live.html").read_text()
     with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
-        assert len(store.discoveries()) == 2
-        assert [c.name.split()[0] for c in store.campaigns()] == ["june", "next1"]
-        assert [s.state for s in store.discovery_steps(store.discoveries()[-1].id)][
+        assert len(store.discoveries.all()) == 2
+        assert [c.name.split()[0] for c in store.campaigns.all()] == ["june", "next1"]
+        assert [s.state for s in store.discoveries.steps(store.discoveries.all()[-1].id)][
             -1
         ] == "UNEXPLAINED"  # the played answer leaves a gap and nothing judges
 
@@ -82,7 +82,11 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
 
     def added():
         with Store.open(url) as store:
-            return [(r.label, r.visible_status, len(store.chunks(r.id)) > 0) for c in store.campaigns()[1:] for r in store.runs(c.id)]
+            return [
+                (r.label, r.visible_status, len(store.chunks.of_run(r.id)) > 0)
+                for c in store.campaigns.all()[1:]
+                for r in store.runs.all(c.id)
+            ]
 
     words = [sys.executable, "-c", LIVE, str(sims.machine_file)]
     first = subprocess.Popen(words, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, stdin=subprocess.DEVNULL)
@@ -105,11 +109,11 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
     with Store.open(url) as store:
         again = load_run(store, "n1-feed-2")
         assert again["setup"]["setup_id"] == "n1-feed-2"  # mounted anew: another cup
-        broken_off = next(r for r in store.runs(store.campaigns()[1].id) if r.label == "n1-feed")
+        broken_off = next(r for r in store.runs.all(store.campaigns.all()[1].id) if r.label == "n1-feed")
         assert broken_off.start_doc["setup"]["t_set_s"] < again["setup"]["t_set_s"] < again["columns"]["t_s"][0]
         assert set_s < first_s
-        assert [c.name.split()[0] for c in store.campaigns()] == ["june", "next1"]
-        assert [[s.state for s in store.discovery_steps(d.id)][-1] for d in store.discoveries()] == ["UNEXPLAINED"] * 2
+        assert [c.name.split()[0] for c in store.campaigns.all()] == ["june", "next1"]
+        assert [[s.state for s in store.discoveries.steps(d.id)][-1] for d in store.discoveries.all()] == ["UNEXPLAINED"] * 2
 
 
 def test_what_cannot_go_on_live_is_refused_before_anything_moves(run, tmp_path):

@@ -41,7 +41,7 @@ def labels(found):
 
 def book(folder):
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        return [[e["label"] for e in m.doc["effects"]] for m in store.models("demo-machine")]
+        return [[e["label"] for e in m.doc["effects"]] for m in store.models.all("demo-machine")]
 
 
 NAMED = {
@@ -119,8 +119,8 @@ def test_the_command_tells_the_story_and_opens_the_truth(abbe, tmp_path):
     assert "<svg" in (folder / "discovery.html").read_text()
     assert simulators_of(folder) == []
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        assert [c.name for c in store.campaigns()] == [CAMPAIGN, ANEW]
-        assert [s.state for s in store.discovery_steps(store.discoveries()[-1].id)] == ["FITTED", "EXPLAINED"]
+        assert [c.name for c in store.campaigns.all()] == [CAMPAIGN, ANEW]
+        assert [s.state for s in store.discoveries.steps(store.discoveries.all()[-1].id)] == ["FITTED", "EXPLAINED"]
 
 
 @pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="beside the same of test_demo: ABBE_TEST_LONG=1 runs it")

@@ -33,7 +33,7 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
     _, err = interrupt(process, signal.SIGINT)
     assert process.returncode == 130, err
     with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
-        (record,) = store.runs()
+        (record,) = store.runs.all()
         run = load_run(store, record.id)
         assert re.fullmatch(WHY, not_judged(run))
         assert 0.0 < covered_share(run) < 0.9
@@ -45,19 +45,19 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
         screen = run_screen(store, record, Rules())
         assert [f.symbol for f in screen.document.figures] == ["n"]
         assert any(re.search(WHY, line) for line in screen.document.not_observable)
-        campaign = stored_report(store, store.campaign("june"), Rules())
+        campaign = stored_report(store, store.campaigns.find("june"), Rules())
         assert any(re.match("run helix is stopped, it is not in the figures", line) for line in campaign.remarks)
     cli(["show", "helix", "--machine", str(sims.machine_file)])
     assert re.search(WHY, " ".join(capsys.readouterr().out.split()))
 
     assert cli(["measure", str(sims.machine_file), "--resume", "june", "--untouched"]) == 0
     with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
-        whole = next(r for r in store.runs() if r.status == "complete")
+        whole = next(r for r in store.runs.all() if r.status == "complete")
         run = load_run(store, whole.id)
         assert not_judged(run) == ""
         assert "state" not in run
         assert "helix rms" in [f.symbol for f in stored_report(store, whole, Rules()).figures]
-        campaign = stored_report(store, store.campaign("june"), Rules())
+        campaign = stored_report(store, store.campaigns.find("june"), Rules())
         pieces = (run.get("timing") or {}).get("pieces")
         said = "went on with it, its readings count there" if pieces else "it is not in the figures"
         assert any(said in line for line in campaign.remarks)

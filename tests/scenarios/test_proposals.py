@@ -70,8 +70,8 @@ class Shop:
 
     def copy(self, store: Store) -> int:
         """The same proposal once more, without any approval."""
-        one = store.proposal(1)
-        return store.add_proposal(one.machine, one.solution_id, one.doc, one.digest)
+        one = store.proposals.get(1)
+        return store.proposals.add(one.machine, one.solution_id, one.doc, one.digest)
 
 
 async def measured(site: Site, store: Store) -> None:
@@ -109,7 +109,7 @@ class Later(SystemClock):
 def try_push(shop: Shop, store: Store, number: int, *, site: Site | None = None, hours: float = 0.0) -> Correction:
     async def work() -> Correction:
         async with open_session((site or shop.site).urls) as session:
-            ids = [r.id for r in store.runs("start")]
+            ids = [r.id for r in store.runs.all("start")]
             runs = await load_runs(store, ids)
             return await push(PushContext(session, store, site or shop.site, clock=Later(hours)), number, runs)
 
@@ -146,7 +146,7 @@ def test_what_is_not_as_it_was_refuses_the_push_and_writes_nothing(shop, what):
             approve(store, number, load(store, number), "anna", 24.0, SystemClock())
         with pytest.raises(TableRefused, match=reason):
             try_push(shop, store, number, site=change(shop.site), hours=hours)
-        assert store.push_entries("sim") == []
+        assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched
 
 
@@ -177,9 +177,9 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
         ended = asyncio.run(push_approved(shop.site, store, order, clock=SystemClock()))
         assert begun == [number]
         assert (ended.word, "a person who approves has to be at the machine" in ended.text) == ("refused", True)
-        tried = store.add_alarm_entry("sim", 0, 0, "pushing", {"proposal": number, "approval": row.id})
+        tried = store.alarms.append("sim", 0, 0, "pushing", {"proposal": number, "approval": row.id})
         assert next_approved(store, "sim", [tried], SystemClock().utc().timestamp()) is None
-        assert store.push_entries("sim") == []
+        assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched
 
 
@@ -190,18 +190,18 @@ def test_an_approval_ends_and_binds_who_and_what(shop):
         with pytest.raises(TableRefused, match="APPROVAL: the approval of anna expired"):
             try_push(shop, store, number, hours=1.0)
 
-        own, good = shop.copy(store), store.approvals(number)[0]
-        store.add_approval(replace(good, proposal_id=own, name=f" {login().upper()} "))  # past the check of the command
+        own, good = shop.copy(store), store.proposals.approvals(number)[0]
+        store.proposals.approve(replace(good, proposal_id=own, name=f" {login().upper()} "))  # past the check of the command
         with pytest.raises(TableRefused, match=r"APPROVAL: .* proposed it and cannot be the one"):
             try_push(shop, store, own)
 
         other = shop.copy(store)
-        store.add_approval(
+        store.proposals.approve(
             ProposalApproval(proposal_id=other, name="anna", login="anna", digest=good.digest, expiry="2099-01-01T00:00:00.000000Z")
         )  # prolonged by hand
         with pytest.raises(TableRefused, match="APPROVAL: what anna approved is not this table"):
             try_push(shop, store, other)
-        assert store.push_entries("sim") == []
+        assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched
 
 
@@ -231,7 +231,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
             try_push(shop, store, plain)
         with pytest.raises(TableRefused, match=r"(?s)HASH.*APPROVAL: what anna approved is not this table"):
             try_push(shop, store, sealed)
-        assert store.push_entries("sim") == []
+        assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched
     capsys.readouterr()
     assert run(["comp", "push", shop.file, str(plain), "--before", "start"]) == 2
@@ -253,7 +253,7 @@ def test_a_restarted_control_with_the_same_table_and_generation_is_refused(shop,
         with pytest.raises(TableRefused, match=r"(?s)RESTART.*CHANGED"):
             try_push(shop, store, number, site=site)
         assert controller_words(restarted) == before
-        assert store.push_entries("sim") == []
+        assert store.pushes.entries("sim") == []
 
 
 def test_a_proposal_with_reasons_is_kept_to_look_at_and_goes_nowhere(shop, capsys):
@@ -311,10 +311,10 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
         assert (kept.decision.keep, kept.proposal) == (True, 1), kept.decision.text
     assert state() == "kept"
     with Store.open(shop.url) as store:
-        approved = next(e.doc for e in store.push_entries("sim") if e.state == "APPROVED")
-        assert approved["approval"] == store.approvals(1)[0].digest  # the machine of the push checked the person's own yes
+        approved = next(e.doc for e in store.pushes.entries("sim") if e.state == "APPROVED")
+        assert approved["approval"] == store.proposals.approvals(1)[0].digest  # the machine of the push checked the person's own yes
         assert approved["approved_by"].startswith("anna; pushed by ")
-        entries, docs, proposed = read_entries(store, "sim"), {t.id: t.doc for t in store.tables()}, load(store, 1)
+        entries, docs, proposed = read_entries(store, "sim"), {t.id: t.doc for t in store.tables.all()}, load(store, 1)
         now_s = SystemClock().utc().timestamp()
         assert proposal_status(store, twin, proposed, now_s).word == "superseded"  # of the same time: banks were written since
         for k, word in ((0, "proposed"), (1, "pushed"), (len(entries) - 1, "pushed"), (len(entries), "kept")):
@@ -333,14 +333,14 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
     # the base is in force again, byte for byte, but banks were written since: another generation
     before = shop.words()
     with Store.open(shop.url) as store:
-        entries = len(store.push_entries("sim"))
+        entries = len(store.pushes.entries("sim"))
         again = shop.copy(store)
-        row = store.approvals(1)[0]
-        store.add_approval(replace(row, proposal_id=again))
+        row = store.proposals.approvals(1)[0]
+        store.proposals.approve(replace(row, proposal_id=again))
         with pytest.raises(TableRefused, match="GENERATION") as refused:
             try_push(shop, store, again)
         assert "BASE" not in str(refused.value)
-        assert len(store.push_entries("sim")) == entries
+        assert len(store.pushes.entries("sim")) == entries
     assert shop.words() == before
     code, out = abbe("approve", "1", "--as", "anna", "--machine", shop.file)
     assert (code, "rolled back" in out) == (1, True)

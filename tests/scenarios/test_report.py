@@ -118,10 +118,12 @@ async def pushed(machine_file: Path) -> None:
 def verified(folder: Path) -> None:
     """What a correction stores of its verification."""
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        campaign = store.campaign("small")
-        runs = [r for r in (load_run(store, one.id) for one in store.runs(campaign.id)) if r["test"] in {"laser_diagonal", "ballbar_helix"}]
+        campaign = store.campaigns.find("small")
+        runs = [
+            r for r in (load_run(store, one.id) for one in store.runs.all(campaign.id)) if r["test"] in {"laser_diagonal", "ballbar_helix"}
+        ]
         rows = {k: {"value": v, "u": u} for k, (v, u) in figure_rows(figures(runs)).items()}
-        store.add_verification(campaign.machine_id, campaign.id, "pass", {"text": "better than before", "push": 1, "figures": rows})
+        store.verifications.add(campaign.machine_id, campaign.id, "pass", {"text": "better than before", "push": 1, "figures": rows})
 
 
 @pytest.fixture(scope="module")
@@ -301,8 +303,8 @@ def test_a_scheduled_check_is_reported_with_the_limits_it_was_judged_by(stored, 
     copied = tmp_path / "other.sqlite3"
     shutil.copy(stored / "abbe.sqlite3", copied)
     with Store.open(f"sqlite:///{copied}") as store:
-        campaign = store.campaign("small")
-        number = store.add_verification(campaign.machine_id, campaign.id, doc["verdict"], doc)
+        campaign = store.campaigns.find("small")
+        number = store.verifications.add(campaign.machine_id, campaign.id, doc["verdict"], doc)
     command(
         "report", "verification", number, "--db", f"sqlite:///{copied}", "--machine", stored / "machine.toml", "--out", tmp_path / "a.json"
     )

@@ -172,8 +172,8 @@ def test_a_stored_campaign_is_solved_twice_and_recognised(abbe, small, tmp_path)
     assert code == 0
     assert f"the same readings and model as solution {first['solution_id']}" in out
     with Store.open("sqlite:///a.sqlite3") as store:
-        kept = store.solutions(store.campaign("c1").id)
-        runs = {r.id for r in store.runs("c1")}
+        kept = store.solutions.all(store.campaigns.find("c1").id)
+        runs = {r.id for r in store.runs.all("c1")}
     assert [s.id for s in kept] == [1, 2]
     for solution in kept:
         assert set(solution.run_ids) == set(solution.doc["run_ids"]) == runs
@@ -219,7 +219,7 @@ def test_a_bad_run_in_the_store_stores_no_solution(abbe, tmp_path):
     assert (code, out) == (2, "")
     assert f"run twin: its readings are those of run {runs[1]['run_id']}" in err
     with Store.open("sqlite:///c.sqlite3") as store:
-        assert store.solutions() == []
+        assert store.solutions.all() == []
 
 
 def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(abbe, small, tmp_path):

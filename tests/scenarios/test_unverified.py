@@ -84,5 +84,5 @@ def test_the_check_of_an_accepted_table_is_its_check_and_an_ended_certificate_ma
     line = fleet(url, capsys)
     assert (line["verified"]["why"], line["verified"]["number"], line["verdict"]) == ("check", 1, "cannot tell")
     with Store.open(url) as store:
-        (check,) = store.verifications_of("sim", 5)
+        (check,) = store.verifications.of_machine("sim", 5)
         assert check.doc["comparable"] is False

@@ -59,7 +59,7 @@ def last_state(folder: Path) -> str:
     if not database.exists():
         return ""
     with Store.open(f"sqlite:///{database}") as store:
-        entries = store.push_entries("sim")
+        entries = store.pushes.entries("sim")
     return entries[-1].state if entries else ""
 
 

@@ -89,7 +89,7 @@ def _later(status: tuple[int, ...], clock_us: int) -> tuple[int, ...] | None:
 def runs_of(folder: Path) -> list[RunRecord]:
     """All runs in the folder's database."""
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        return store.runs()
+        return store.runs.all()
 
 
 def bar_chunks(folder: Path) -> int:

@@ -43,7 +43,7 @@ def file_store(tmp_path: Path) -> Iterator[Store]:
 @pytest.fixture
 def campaign_id(store: Store) -> int:
     """A campaign of a machine."""
-    return store.add_campaign(store.add_machine("VMC-1", {"name": "VMC-1"}), "c1", {})
+    return store.campaigns.add(store.machines.add("VMC-1", {"name": "VMC-1"}), "c1", {})
 
 
 @pytest.fixture

@@ -29,11 +29,11 @@ from abbe.service.logs import configure_logs
 from abbe.service.mqtt.topics import Topics
 from abbe.service.push.operations import Verdict
 from abbe.service.scheduler import alarm_manager
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
 from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from tests.scenarios.test_push import linear_tables
 
@@ -45,7 +45,7 @@ def say(word: str) -> None:
     sys.stdout.flush()
 
 
-async def probing(session: Session, store: ServiceStore, site: Site, order: PushOrder, last: str) -> Verdict:
+async def probing(session: Session, store: Store, site: Site, order: PushOrder, last: str) -> Verdict:
     """Axes on their way for as long as nobody stops them. ``last``: what the fixture is asked for when that happens."""
     told: list[Progress] = []
 
@@ -70,7 +70,7 @@ async def probing(session: Session, store: ServiceStore, site: Site, order: Push
 
 
 def duties_on(site: Site, last: str) -> Any:
-    def duties(store: ServiceStore) -> alarm_manager.Duties:
+    def duties(store: Store) -> alarm_manager.Duties:
         async def push(order: PushOrder) -> JobOutcome:
             with lock_machine(site.urls.cnc):
                 async with open_session(site.urls) as session:

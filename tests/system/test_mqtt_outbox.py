@@ -18,7 +18,7 @@ from abbe.service.mqtt.broker import parse
 from abbe.service.mqtt.outbox import StoreOutbox
 from abbe.service.mqtt.publisher import Publisher
 from abbe.service.mqtt.topics import Topics
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.certificates import authority, issued
 from tests.patience import within
 from tests.system.serve_bench import Broker, Process, free_port, payload, service
@@ -35,19 +35,19 @@ def ending() -> Iterator[ExitStack]:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[ServiceStore]:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
         yield opened
 
 
 class Sender:
     """A publisher with what it said: how often it was connected, lost, and dropped something."""
 
-    def __init__(self, url: str, store: ServiceStore, most: int = 10_000, down_to: int = 9_000, **broker: str) -> None:
+    def __init__(self, url: str, store: Store, most: int = 10_000, down_to: int = 9_000, **broker: str) -> None:
         clock = SystemClock()
         self.changes: asyncio.Queue[bool] = asyncio.Queue()
         self.dropped: asyncio.Queue[int] = asyncio.Queue()
-        outbox = StoreOutbox(store, TOPICS, clock, KEPT, most, down_to)
+        outbox = StoreOutbox(store.outbox, TOPICS, clock, KEPT, most, down_to)
         self.publisher = Publisher(replace(parse(url), **broker), TOPICS, outbox, clock, self.changes.put_nowait, self.dropped.put_nowait)
 
     async def until(self, connected: bool) -> None:
@@ -66,11 +66,11 @@ async def running(sender: Sender) -> AsyncIterator[None]:
         await task
 
 
-def put(store: ServiceStore, count: int, start: int = 0) -> int:
+def put(store: Store, count: int, start: int = 0) -> int:
     """Queue results, each third one an alarm; return the number after the last."""
     for n in range(start, start + count):
         topic = TOPICS.alarm if n % 3 == 2 else TOPICS.verification
-        store.put_message(topic, {"schema": 1, "machine": "mill-7", "n": n})
+        store.outbox.add_document(topic, {"schema": 1, "machine": "mill-7", "n": n})
     return start + count
 
 
@@ -80,7 +80,7 @@ def numbers(receiver: Process) -> list[int]:
     return [message["n"] for message in found if "n" in message]
 
 
-async def test_mosquitto_killed_and_everything_comes_afterwards_in_order(tmp_path: Path, store: ServiceStore, ending: ExitStack) -> None:
+async def test_mosquitto_killed_and_everything_comes_afterwards_in_order(tmp_path: Path, store: Store, ending: ExitStack) -> None:
     broker = Broker(tmp_path)
     ending.callback(lambda: broker.process.close())
     receiver = ending.enter_context(closing(broker.subscriber()))
@@ -91,7 +91,7 @@ async def test_mosquitto_killed_and_everything_comes_afterwards_in_order(tmp_pat
         await sender.until(True)
         await asyncio.to_thread(receiver.expect, '"n":29')
         async with asyncio.timeout(within(40)):
-            while store.waiting_messages():  # noqa: ASYNC110 - until the last acknowledgement has come, too
+            while store.outbox.count():  # noqa: ASYNC110 - until the last acknowledgement has come, too
                 await asyncio.sleep(0.02)
         # Nothing under way in the broker's file either: what it keeps as not acknowledged it would rightly deliver a second time.
         await asyncio.to_thread(broker.wait_for_file, lambda kept: b'"n":' not in kept)
@@ -103,20 +103,20 @@ async def test_mosquitto_killed_and_everything_comes_afterwards_in_order(tmp_pat
             total = put(store, 1, total)
             sender.publisher.wake()
             await asyncio.sleep(0.05)  # the pace of the load
-        waited = store.waiting_messages()
+        waited = store.outbox.count()
         await asyncio.to_thread(broker.start)
         await asyncio.to_thread(receiver.expect, f'"n":{total - 1}')
     # All of them were delivered, none twice, none before another: the broker was killed in a moment of quiet.
     assert numbers(receiver) == list(range(total))
     assert waited == total - 30 > 30
-    assert store.waiting_messages() == 0
+    assert store.outbox.count() == 0
     print(f"broker away for {OUTAGE_S:.0f} s: {waited} waited, {total} delivered in order, none twice")  # noqa: T201 - the figure of the test
     late = ending.enter_context(closing(broker.subscriber("late")))
     assert payload(late.expect("mill-7/state"))["state"] == "offline", "the state is retained, and we said goodbye"
 
 
 async def test_the_table_does_not_grow_with_what_was_delivered(
-    tmp_path: Path, store: ServiceStore, ending: ExitStack, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, store: Store, ending: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("abbe.service.mqtt.publisher.TIDY_EVERY", 50)
     broker = Broker(tmp_path)
@@ -127,7 +127,7 @@ async def test_the_table_does_not_grow_with_what_was_delivered(
     async with running(sender):
         await asyncio.to_thread(receiver.expect, '"n":199')
     assert numbers(receiver) == list(range(200))
-    with store._engine.connect() as connection:
+    with store.engine.connect() as connection:
         kept = connection.exec_driver_sql("SELECT count(*) FROM outbox").scalar_one()
     assert kept <= KEPT + 100, "after each batch of a hundred, what is older than the newest twenty goes"
     second = Sender(broker.url, store)
@@ -135,12 +135,12 @@ async def test_the_table_does_not_grow_with_what_was_delivered(
         put(store, 1, 200)
         second.publisher.wake()
         await asyncio.to_thread(receiver.expect, '"n":200')
-    with store._engine.connect() as connection:
+    with store.engine.connect() as connection:
         kept = connection.exec_driver_sql("SELECT count(*) FROM outbox").scalar_one()
     assert kept <= KEPT + 1
 
 
-async def test_a_broker_away_for_weeks_costs_old_alarms_and_no_result(tmp_path: Path, store: ServiceStore, ending: ExitStack) -> None:
+async def test_a_broker_away_for_weeks_costs_old_alarms_and_no_result(tmp_path: Path, store: Store, ending: ExitStack) -> None:
     broker = Broker(tmp_path)
     ending.callback(lambda: broker.process.close())
     receiver = ending.enter_context(closing(broker.subscriber()))
@@ -173,7 +173,7 @@ async def test_a_broker_away_for_weeks_costs_old_alarms_and_no_result(tmp_path: 
         ("no certificate of ours", ""),
     ],
 )
-async def test_tls_checks_authority_and_host_name(tmp_path: Path, store: ServiceStore, ending: ExitStack, case: str, reason: str) -> None:
+async def test_tls_checks_authority_and_host_name(tmp_path: Path, store: Store, ending: ExitStack, case: str, reason: str) -> None:
     ours, foreign = authority(tmp_path, "plant-ca"), authority(tmp_path, "foreign-ca")
     host = "another.test" if case == "another host's name" else "127.0.0.1"
     of_broker = issued(tmp_path, "broker", ours, addresses=(host,))
@@ -199,7 +199,7 @@ async def test_tls_checks_authority_and_host_name(tmp_path: Path, store: Service
     else:
         assert len(warned) == 1
         assert reason in warned[0]
-        assert store.waiting_messages() == 5, "nothing was said to a broker that is not ours"
+        assert store.outbox.count() == 5, "nothing was said to a broker that is not ours"
 
 
 async def test_nothing_is_subscribed_to_and_nothing_ever_sent_to_us(tmp_path: Path, ending: ExitStack) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from abbe.drivers.registry import open_controller
 from abbe.service.config import load_machine
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.system.serve_bench import Broker, Machine, abbe, free_port, payload
 from tests.system.test_serve_page import browser, only_us, open_page, shot
 
@@ -65,9 +65,9 @@ def test_two_scheduled_checks_and_a_broker_that_dies(tmp_path: Path, ending: Exi
     assert took_s < 180.0
     receiver.expect('"state":"offline"')
     got = [payload(line) for line in receiver.lines if "/verification " in line]
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        kept = store.verifications_of("mill-7")
-        waiting = [json.loads(row.payload)["verification"] for row in store.outbox_pending()]
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        kept = store.verifications.of_machine("mill-7")
+        waiting = [json.loads(row.payload)["verification"] for row in store.outbox.pending()]
     assert all(check.campaign_id is not None for check in kept)
     assert sorted({message["verification"] for message in got} | set(waiting)) == sorted(check.id for check in kept)
     assert {"body_diagonal_um", "helix_rms_um"} <= got[0]["values"].keys()

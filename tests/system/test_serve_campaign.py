@@ -23,7 +23,7 @@ from abbe.service.campaigns.resume import begun_source
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import proposal_status
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from tests.scenarios.conftest import Sims, simulated
@@ -42,7 +42,7 @@ SET_UPS = 19
 
 
 def tokens(url: str) -> dict[str, dict[str, str]]:
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         people = People(store, SystemClock(), Passwords(memory_kib=64, passes=1))
         found = {}
         for name, role, scopes in (("mia", "metrologist", ["read", "measure", "propose"]), ("vera", "viewer", ["read"])):
@@ -159,15 +159,15 @@ def test_somebody_at_the_page_is_led_to_a_proposal(tmp_path: Path) -> None:
         assert f"/proposal?id={done['proposal']}" in http.get("/live", headers=who["mia"]).text
         assert http.get(f"/proposal?id={done['proposal']}", headers=who["mia"]).status_code == 200
         assert running.terminate()[0] == 0
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         assert begun_source(store, first)["recipe"] == "identification"
         proposed = load(store, done["proposal"])
         assert (proposed.by, proposed.solution_id) == ("mia", done["solution"])
         assert proposal_status(store, done["proposal"], proposed, SystemClock().utc().timestamp()).word == "proposed"
-        assert (store.approvals(done["proposal"]), store.push_entries("sim")) == ([], [])
-        told = [(r.who, r.outcome) for r in store.audit(1000) if r.action == "campaign"]
+        assert (store.proposals.approvals(done["proposal"]), store.pushes.entries("sim")) == ([], [])
+        told = [(r.who, r.outcome) for r in store.audit.events(1000) if r.action == "campaign"]
         assert told == [("token:mia/test", word) for word in ("begun", "stopped", "begun", "proposed")]
-        started = [(r.who, r.outcome) for r in store.audit(1000) if r.action == "POST /api/v1/jobs"]
+        started = [(r.who, r.outcome) for r in store.audit.events(1000) if r.action == "POST /api/v1/jobs"]
         assert ("token:vera/test", "refused 403") in started
         assert AuditBook(store, url).verify() == []
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.cli import run
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.system.serve_bench import Machine, Process
 
 pytestmark = [
@@ -39,7 +39,7 @@ def test_two_services_check_at_once_into_one_database(
     (tmp_path / "audit").mkdir()
     with ExitStack() as stack:
         files = [_machine(tmp_path, name, url, stack) for name in NAMES]
-        ServiceStore.open(url).close()
+        Store.open(url).close()
         services = [
             stack.enter_context(
                 closing(Process(sys.executable, "-c", "from abbe.service.cli import main; main()", "serve", f, "--once", "--port", "0"))
@@ -47,15 +47,15 @@ def test_two_services_check_at_once_into_one_database(
             for f in files
         ]
         assert [service.wait() for service in services] == [1, 1]  # the simulated machines are out of limits
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         for name in NAMES:
-            (check,) = store.verifications_of(name)
+            (check,) = store.verifications.of_machine(name)
             assert (check.verdict, check.doc["machine"], check.doc["cause"]) == ("fail", name, None)
-            campaign = store.campaign(check.doc["campaign"])
-            assert (campaign.id, store.machine(campaign.machine_id).name) == (check.campaign_id, name)
-            assert [r.label for r in store.runs(campaign.id)] == check.doc["runs"]
-            assert {r.visible_status for r in store.runs(campaign.id)} == {"complete"}
-        assert [one.outcome for one in store.audit()].count("begun") == 2
+            campaign = store.campaigns.find(check.doc["campaign"])
+            assert (campaign.id, store.machines.get(campaign.machine_id).name) == (check.campaign_id, name)
+            assert [r.label for r in store.runs.all(campaign.id)] == check.doc["runs"]
+            assert {r.visible_status for r in store.runs.all(campaign.id)} == {"complete"}
+        assert [one.outcome for one in store.audit.events()].count("begun") == 2
     assert run(["audit", "verify", "--db", url]) == 0
     capsys.readouterr()
     assert run(["fleet", "--store", url, "--json"]) == 0

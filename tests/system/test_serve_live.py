@@ -26,7 +26,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from abbe.service.clock import SystemClock
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.people import People
 from tests.system.serve_bench import Machine, Process, abbe, free_port
 from tests.system.test_serve_page import Seen, browser, only_us, shot
@@ -76,7 +76,7 @@ class Serving:
 @contextmanager
 def serving(folder: Path, speed: float) -> Iterator[Serving]:
     url, port = f"sqlite:///{folder / 'abbe.sqlite3'}", free_port()
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         people = People(store, SystemClock())
         people.add("olga", "operator", PHRASE)
         token = people.add_token("olga", "test", ["read"], 5.0)
@@ -119,8 +119,8 @@ def until_drawn(page: Page, count: int) -> None:
 
 
 def states(serving: Serving) -> list[str]:
-    with ServiceStore.open(serving.url) as store:
-        return [run.status for run in store.runs()]
+    with Store.open(serving.url) as store:
+        return [run.status for run in store.runs.all()]
 
 
 def refused(serving: Serving) -> None:

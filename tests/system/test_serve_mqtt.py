@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.system.serve_bench import Broker, Process, free_port, payload, service
 
 EVERY_SECOND = ["fast", "* * * * * *", "quick"]
@@ -50,9 +50,9 @@ def test_broker_killed_and_restarted_nothing_lost_nothing_out_of_order(tmp_path:
     assert payload(receiver.expect('"state":"offline"'))["machine"] == "mill-7"
     receiver.terminate()
 
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        kept = sorted(check.id for check in store.verifications_of("mill-7"))
-        waiting = [row.id for row in store.outbox_pending()]
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        kept = sorted(check.id for check in store.verifications.of_machine("mill-7"))
+        waiting = [row.id for row in store.outbox.pending()]
     assert len(kept) >= 8
     numbers = received(receiver)
     assert numbers == sorted(numbers)

@@ -17,7 +17,7 @@ from playwright.sync_api import Page, sync_playwright
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.system.serve_bench import free_port, require, service
 from tests.system.serve_check import Result
 from tests.system.test_serve_users import PHRASE, add_user
@@ -64,8 +64,8 @@ def browser(**context: Any) -> Iterator[Seen]:
 def fill(folder: Path, weeks: int) -> None:
     """Store a history that ends in a failure, with one check that could not be completed."""
     now = datetime.now(UTC)
-    with ServiceStore.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        machine = store.add_machine("mill-7", {"name": "mill-7"})
+    with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
+        machine = store.machines.add("mill-7", {"name": "mill-7"})
         for week in range(weeks):
             at = now - timedelta(days=7 * (weeks - 1 - week), hours=3)
             occasion = record.Occasion("mill-7", WEEKLY, at)
@@ -87,7 +87,7 @@ def fill(folder: Path, weeks: int) -> None:
                     verdict, values, text=text, started_utc=at, duration_s=312.0, campaign=f"quick-check {at:%Y-%m-%d %H:%M:%S}"
                 )
                 doc = record.found(occasion, result)
-            store.keep_verification(machine, doc, [])
+            store.verifications.add_with_messages(machine, doc, [])
 
 
 def shot(page: Page, name: str, *, full: bool = False) -> None:

@@ -21,7 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 from abbe.service.audit.book import AuditBook
 from abbe.service.capture.ledger import ledger_of, streams_told
 from abbe.service.clock import SystemClock
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.people import People
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.system.serve_bench import Machine, Process, abbe, free_port, service
@@ -38,7 +38,7 @@ def url_of(folder: Path) -> str:
 def tokens(folder: Path) -> dict[str, dict[str, str]]:
     """A user of each role, and the header with his token."""
     made = {}
-    with ServiceStore.open(url_of(folder)) as store:
+    with Store.open(url_of(folder)) as store:
         people = People(store, SystemClock())
         for role in Role:
             people.add(f"a-{role}", role, PHRASE)
@@ -138,13 +138,13 @@ def test_the_page_is_killed_during_a_check_and_no_sample_is_missing(tmp_path: Pa
         abbe_serve.http.close()
         code, took_s = abbe_serve.process.terminate()
         assert (code, took_s < 5.0) == (0, True)
-    with ServiceStore.open(url_of(tmp_path)) as store:
-        (check,) = store.verifications_of("mill-7")
+    with Store.open(url_of(tmp_path)) as store:
+        (check,) = store.verifications.of_machine("mill-7")
         assert (check.id, check.doc["cause"], check.doc["schedule"]) == (done["verification"], None, "by hand")
-        runs = store.runs()
+        runs = store.runs.all()
         assert len(runs) == len(check.doc["runs"]) > 2
         assert {run.status for run in runs} == {"complete"}
-        ledgers = [ledger_of(store.chunks(run.id), streams_told(run.end_doc)) for run in runs]
+        ledgers = [ledger_of(store.chunks.of_run(run.id), streams_told(run.end_doc)) for run in runs]
         assert [(ledger.unaccounted(), ledger.twice()) for ledger in ledgers] == [([], 0)] * len(runs)
         assert sum(ledger.stored for ledger in ledgers) > 1000
         assert AuditBook(store, url_of(tmp_path)).verify() == []
@@ -229,8 +229,8 @@ def test_jobs_by_everybody(tmp_path: Path) -> None:
                 assert answer.headers["location"] == f"/api/v1/jobs/{answer.json()['id']}"
                 assert made.until(answer.json()["id"], "done: pass")["verification"] is not None
         made.process.terminate()
-    with ServiceStore.open(url_of(tmp_path)) as store:
-        records = [record for record in store.audit() if record.action == "POST /api/v1/jobs"]
+    with Store.open(url_of(tmp_path)) as store:
+        records = [record for record in store.audit.events() if record.action == "POST /api/v1/jobs"]
         assert [record.who for record in records if record.outcome == "done 202"] == [
             f"token:a-{role}/test" for role in Role if Permission.MEASURE in ALLOWED[role]
         ]
@@ -260,7 +260,7 @@ def test_a_job_is_started_once_steered_and_refused_where_it_has_to_be(tmp_path: 
         status = made.http.get("/api/v1/status", headers=made.who["viewer"]).json()
         assert status["job"] is None
         assert status["last"][0]["cause"]["code"] == "SEQ-004"
-        with ServiceStore.open(url_of(tmp_path)) as store:  # whoever is shut out meanwhile: the next word of his is refused
+        with Store.open(url_of(tmp_path)) as store:  # whoever is shut out meanwhile: the next word of his is refused
             People(store, SystemClock()).disable("a-operator")
         assert made.start("quick").status_code == 401
 

@@ -13,7 +13,7 @@ import pytest
 
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import check_chain
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import axes_at_rest, registers, wait_for
 from tests.system.serve_bench import Process
@@ -43,10 +43,10 @@ def in_force(sims: Sims) -> tuple[int, ...]:
 
 def told(folder: Path) -> tuple[str, list[str], list[str]]:
     """The push's last state, and the words and sentences that the alarm desk wrote of it."""
-    with ServiceStore.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
+    with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
         entries = read_entries(store, "sim")
         check_chain(entries)
-        lines = [e.doc for e in store.alarm_entries("sim") if e.kind == "pushed"]
+        lines = [e.doc for e in store.alarms.entries("sim") if e.kind == "pushed"]
         return str(entries[-1].state), [d["word"] for d in lines], [d["text"] for d in lines]
 
 

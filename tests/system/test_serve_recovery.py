@@ -16,7 +16,7 @@ import pytest
 
 from abbe.drivers.registry import open_controller
 from abbe.drivers.tables import crc32, encode
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
 from tests.push.pushing_child import tables
 from tests.scenarios.world import wait_for
@@ -72,7 +72,7 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
         good = machine.file.read_text()
         cnc = next(json.loads(line.split("=", 1)[1]) for line in good.splitlines() if line.startswith("cnc ="))
         before = asyncio.run(table_in_force(cnc))
-        ServiceStore.open(url).close()
+        Store.open(url).close()
         words = json.dumps({"do": "push", "store": url, "cnc": cnc, "height": 5, "owner": 7})
         killed = subprocess.run([sys.executable, "-c", KILLED, words], check=False, capture_output=True, text=True)
         assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -89,8 +89,8 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
                 assert "abbe_attention 1.0" in http.get("/metrics").text
             code, took_s = away.terminate()
             assert (code, took_s < 5.0) == (0, True)
-        with ServiceStore.open(url) as store:
-            (alarm,) = [json.loads(row.payload) for row in store.outbox_pending() if row.topic.endswith("/alarm")]
+        with Store.open(url) as store:
+            (alarm,) = [json.loads(row.payload) for row in store.outbox.pending() if row.topic.endswith("/alarm")]
         assert alarm["code"].startswith("DRV-")
         assert alarm["machine"] == "mill-7"
 

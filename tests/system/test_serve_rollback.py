@@ -16,7 +16,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.push.book import read_entries
 from abbe.service.push.entries import check_chain
 from abbe.service.push.states import PushState
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.web.api.once import REPLAYED
@@ -41,7 +41,7 @@ async def pushed(sims: Sims, folder: Path) -> tuple[int, int]:
 
 
 def tokens(url: str) -> dict[str, dict[str, str]]:
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         people = People(store, SystemClock(), Passwords(memory_kib=64, passes=1))
         found = {}
         for name, role, scopes in (("ann", "approver", ["read", "approve"]), ("bob", "operator", ["read", "measure"])):
@@ -95,14 +95,14 @@ def test_an_approver_orders_the_table_back_and_an_operator_does_not(tmp_path: Pa
             assert (again.status_code, again.headers["Location"], again.headers[REPLAYED]) == (202, sent.headers["Location"], "true")
             assert "was a rollback itself" in order("ann", old, 2, "k2").json()["detail"]
             assert running.terminate()[0] == 0
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         entries = read_entries(store, "sim")
         check_chain(entries)
         assert (entries[-1].push, entries[-1].state) == (2, PushState.KEEP)
         assert next(e for e in entries if e.push == 2 and e.state is PushState.APPROVED).doc["approved_by"] == "token:ann/test: rollback"
-        told = [(r.who, r.outcome, r.doc["reason"]) for r in store.audit() if r.action == "rollback"]
+        told = [(r.who, r.outcome, r.doc["reason"]) for r in store.audit.events() if r.action == "rollback"]
         assert told == [("token:ann/test", "begun", REASON), ("token:ann/test", "kept", REASON)]
-        asked = [(r.who, r.outcome) for r in store.audit() if r.action == "POST /api/v1/tables/rollback"]
+        asked = [(r.who, r.outcome) for r in store.audit.events() if r.action == "POST /api/v1/tables/rollback"]
         assert asked == [
             ("token:bob/test", "refused 403"), ("token:ann/test", "refused 409"), ("token:ann/test", "done 202"),
             ("token:ann/test", "replayed 202"), ("token:ann/test", "refused 409"),

@@ -159,7 +159,7 @@ def test_nothing_from_a_store_is_run(chromium, tmp_path) -> None:
     hits: list[int] = []
     with served(filled) as one, context(chromium) as made:
         one.auth.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={"note": EVIL}))
-        one.board.job_started(filled.schedules[0], one.auth.store._utcnow())
+        one.board.job_started(filled.schedules[0], one.auth.store.utcnow())
         page = made.new_page()
         page.expose_function("hit", lambda: hits.append(1))
         watch = Watch(page, one.base)
@@ -196,9 +196,9 @@ def test_a_proposal_is_approved_by_another_person_than_its_proposer(chromium, ru
         assert page.inner_text(".verdict").endswith("approved")
         assert "Approved by anna" in page.inner_text("main")
         assert watch.errors == []
-        told = running.store.approvals(number)
+        told = running.store.proposals.approvals(number)
         assert [(a.name, a.login) for a in told] == [("anna", "user:anna")]
-        record = running.store.audit(1)[0]
+        record = running.store.audit.events(1)[0]
         assert (record.who, record.action, record.target) == ("user:anna", "POST /proposal/approve", f"proposal {number}")
         # One that has reasons against it says why on the screen; nothing is stored.
         page.goto(f"{running.base}/proposal?id={number}")
@@ -206,7 +206,7 @@ def test_a_proposal_is_approved_by_another_person_than_its_proposer(chromium, ru
         page.click("form[action='/proposal/approve'] button")
         page.wait_for_selector("form [role=alert]:not(:empty)")
         assert "has reasons against it" in page.inner_text("form .fail")
-        assert running.store.approvals(running.filled.proposals[0]) == []
+        assert running.store.proposals.approvals(running.filled.proposals[0]) == []
 
 
 def test_a_table_is_ordered_back_after_a_reason_and_a_confirmation(chromium, running, axe) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.system.serve_bench import Process, free_port, service
 
 YEARLY = ["yearly", "0 0 1 1 *", "quick"]
@@ -45,8 +45,8 @@ def test_during_a_check_the_motion_is_held_and_the_slot_says_interrupted(tmp_pat
     assert (code, took_s < 5.0) == (0, True)
     assert "held" in running.lines
     assert slots_of(tmp_path) == {"interrupted", "skipped: busy"}
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        assert store.verifications_of("mill-7") == []
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        assert store.verifications.of_machine("mill-7") == []
 
 
 def test_while_the_broker_is_a_black_hole(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import NameOID
 
 from abbe.service.clock import SystemClock
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.people import People
 from tests.system.serve_bench import Process, free_port
 
@@ -30,7 +30,7 @@ def abbe(*words: str | Path) -> Process:
 
 
 def add_user(folder: Path) -> None:
-    with ServiceStore.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
+    with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
         People(store, SystemClock()).add("ana", "admin", PHRASE)
 
 
@@ -99,8 +99,8 @@ def test_a_login_over_tls(tmp_path: Path) -> None:
             assert client.post("/logout", headers={"Origin": base, "X-CSRF-Token": token}).status_code == 303
             assert client.get("/api/v1/status").status_code == 401
         assert running.terminate()[0] == 0
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        told = [(r.action, r.outcome) for r in store.audit()]
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        told = [(r.action, r.outcome) for r in store.audit.events()]
     assert told[0] == ("abbe serve", "begun")
     assert [outcome for action, outcome in told if action == "POST /login"] == ["refused 403", "refused 403", "done 303"]
     assert [outcome for action, outcome in told if action == "POST /logout"] == ["refused 403", "done 303"]

@@ -24,7 +24,7 @@ def show_audit(
     from abbe.service.secrets import visible
 
     with open_store(database_url(db, machine)) as store:
-        found = store.audit(last)
+        found = store.audit.events(last)
     if as_json:
         print_json([asdict(record) for record in found])
         return
@@ -43,7 +43,7 @@ def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: Js
     with open_store(url) as store:
         warn_of_readers(url)
         faults = AuditBook(store, url).verify()
-        last = store.audit(1)
+        last = store.audit.events(1)
     head = f"{last[0].id} {last[0].digest}" if last else ""
     if as_json:
         print_json({"records": last[0].id if last else 0, "head": head, "faults": faults})

@@ -21,11 +21,11 @@ def fleet(
     from abbe.service.clock import SystemClock
     from abbe.service.scheduler.fleet import HEADINGS, as_doc, row
     from abbe.service.scheduler.fleet import fleet as lines_of
-    from abbe.service.scheduler.store import ServiceStore
+    from abbe.service.storage.store import Store
 
     url = database_url(db, machine)
     open_store(url).close()  # a missing file is one line, and none is made
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         lines = lines_of(store, SystemClock().utc())
     if as_json:
         print_json(as_doc(lines))

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from abbe.service.mqtt.broker import Broker
     from abbe.service.scheduler.alarm_manager import Duties
     from abbe.service.scheduler.ports import Check, CheckResult
-    from abbe.service.scheduler.store import ServiceStore
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
+    from abbe.service.storage.store import Store
     from abbe.service.verification.alarm_states import Alarm
 
 
@@ -89,7 +89,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     check_unattended(config, loaded.path.resolve().parent)
     site, live = site_of(config), LiveFeed()
 
-    def check_on(store: ServiceStore) -> Check:
+    def check_on(store: Store) -> Check:
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:
             return await run_check(config, store, recipe, progress, control=control, live=live)
 
@@ -171,7 +171,7 @@ def _opcua(loaded: LoadedMachine) -> OpcUa | None:
 
 def duties_on(
     alarm: AlarmSection, site: Site, plan: CampaignPlan, rate_hz: int = 100, live: LiveFeed | None = None
-) -> Callable[[ServiceStore], Duties]:
+) -> Callable[[Store], Duties]:
     """Return what the service does about alarms, given its store.
 
     ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: is shown what the campaign's paths read.
@@ -181,7 +181,7 @@ def duties_on(
     from abbe.service.jobs.investigate import InvestigationContext, investigate
     from abbe.service.scheduler.alarm_manager import Duties
 
-    def duties(store: ServiceStore) -> Duties:
+    def duties(store: Store) -> Duties:
         clock = SystemClock()
 
         async def look_into(one: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
@@ -195,14 +195,14 @@ def duties_on(
     return duties
 
 
-def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore], OrderActions]:
+def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
     """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.ordered_rollback import ordered_rollback
     from abbe.service.compensation.push_approved import push_approved
     from abbe.service.core.orders import OrderActions
 
-    def on(store: ServiceStore) -> OrderActions:
+    def on(store: Store) -> OrderActions:
         async def back(order: BackOrder) -> JobOutcome:
             return await ordered_rollback(site, store, order, clock=SystemClock())
 
@@ -214,14 +214,14 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[ServiceStore]
     return on
 
 
-def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[ServiceStore], MeasureCampaign]:
+def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[Store], MeasureCampaign]:
     """Return how a full campaign is measured that a person starts, given the service's store."""
     from abbe.service.campaigns.builtin_recipes import campaign_source
     from abbe.service.clock import SystemClock
     from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext
 
-    def on(store: ServiceStore) -> MeasureCampaign:
+    def on(store: Store) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> JobOutcome:
             source = campaign_source(order.recipe, folder)
             plan = source.plan(site.machine)

@@ -36,7 +36,7 @@ def add_user(name: Name, role: RoleArgument, db: DbOption = None, machine: Machi
 def list_users(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """List users with their roles."""
     with _people(db, machine) as (_, store):
-        found = store.users()
+        found = store.people.all()
     if as_json:
         print_json([{"name": u.name, "role": u.role, "disabled_utc": u.disabled_utc, "created_utc": u.created_utc} for u in found])
         return
@@ -96,8 +96,8 @@ def new_token(
 def list_tokens(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """List tokens: whose, what they may, until when."""
     with _people(db, machine) as (_, store):
-        found = store.tokens()
-    rows = [(owner, t.name, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t, owner in found]
+        found = store.people.tokens()
+    rows = [(owner.name, t.name, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t, owner in found]
     headings = ("user", "token", "begins with", "scopes", "until (UTC)", "revoked (UTC)")
     if as_json:
         print_json([dict(zip(("user", "token", "prefix", "scopes", "expires_utc", "revoked_utc"), row, strict=True)) for row in rows])

@@ -21,7 +21,7 @@ def export_campaign(
 
     with open_store(database_url(db, machine)) as store:
         written = export_folder(store, campaign, folder)
-        count = len(store.runs(store.campaign(campaign).id))
+        count = len(store.runs.all(store.campaigns.find(campaign).id))
     typer.echo(f"exported campaign {campaign!r} with {count} runs to {written}")
 
 
@@ -35,5 +35,5 @@ def import_campaign(
 
     read_folder(folder)  # before a database is made
     with open_store(database_url(db, machine), must_exist=False) as store:
-        record = store.campaign(import_folder(store, folder))
-        typer.echo(f"imported campaign {record.name!r} with {len(store.runs(record.id))} runs into {store.url}")
+        record = store.campaigns.find(import_folder(store, folder))
+        typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")

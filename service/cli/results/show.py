@@ -54,8 +54,8 @@ def show(
         if not isinstance(record, RunRecord):
             show_campaign(store, record, as_json=as_json)
             return
-        chunks = store.chunks(record.id)
-        facts = json_value(run_summary(record, store.machine(store.campaign(record.campaign_id).machine_id).name))
+        chunks = store.chunks.of_run(record.id)
+        facts = json_value(run_summary(record, store.machines.get(store.campaigns.find(record.campaign_id).machine_id).name))
         document = (
             whole_document(store, record) if record.visible_status == "complete" else with_state(run_document(record, chunks), record)
         )

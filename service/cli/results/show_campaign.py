@@ -18,9 +18,9 @@ def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> N
     """Print a campaign: one line for each run, one for each kind of trouble on a link and how it ended."""
     from abbe.service.sequences.incident_account import not_written, troubles
 
-    runs, journal = store.runs(campaign.id), store.checkpoints(campaign.id)
+    runs, journal = store.runs.all(campaign.id), store.checkpoints.of_campaign(campaign.id)
     found, lost = troubles(journal), not_written(journal)
-    who = {"number": campaign.id, "campaign": campaign.name, "machine": store.machine(campaign.machine_id).name}
+    who = {"number": campaign.id, "campaign": campaign.name, "machine": store.machines.get(campaign.machine_id).name}
     who |= {"created_utc": campaign.created_utc}
     if as_json:
         states = [{"number": one.id, "run_id": one.label, "test": one.test, "status": one.visible_status} for one in runs]

@@ -141,7 +141,7 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 
     def stored(number: int) -> dict[str, Any]:
         with open_store(database_url(db, machine)) as store:
-            return dict(store.solution(number).doc)
+            return dict(store.solutions.get(number).doc)
 
     return solution_document(source, stored)
 

@@ -39,7 +39,7 @@ def propose(
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> Made:
-        store.campaign(campaign)
+        store.campaigns.find(campaign)
         with display() as sink:
             async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
                 return await make(store, site, await gather(session.controller, store, site, campaign), progress=sink)
@@ -162,7 +162,7 @@ def approve(
         except TableRefused as error:
             typer.echo(f"not approved: {error}")
             raise typer.Exit(1) from None
-        owner = store.proposal(proposal).machine
+        owner = store.proposals.get(proposal).machine
         left_open = open_pushes(store, owner, _control(machine, owner))
     typer.echo(f"proposal {proposal} is approved by {done.name} until {done.expiry}")
     for line in left_open:

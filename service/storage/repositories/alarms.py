@@ -1,28 +1,29 @@
-"""Store methods for alarms: lines that are only ever appended, each together with the message that tells of it."""
+"""Alarms: lines that are only ever appended, each together with the messages about it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
+from dataclasses import replace
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, func, select
 from sqlalchemy.exc import IntegrityError
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import StoreError
-from abbe.service.storage.base import StoreBase
-from abbe.service.storage.repositories.campaigns import new_id
-from abbe.service.storage.tables import alarm_entries, outbox
+from abbe.service.storage.mappings import ALARM_ENTRY
+from abbe.service.storage.repositories.outbox import queue_message
+from abbe.service.storage.repository import Repository, insert_row
+from abbe.service.storage.tables import alarm_entries
 
 
-class AlarmStore(StoreBase):
+class Alarms(Repository):
     """Alarms of machines."""
 
-    def add_alarm_entry(
+    def append(
         self, machine: str, alarm: int | None, seq: int, kind: str, doc: Doc, messages: Sequence[tuple[str, Doc]] = ()
     ) -> AlarmEntryRecord:
-        """Append a line to an alarm, with the messages that the broker is to be told: both or neither survive a power cut.
+        """Append a line to an alarm, with the messages for the broker: both or neither survive a power cut.
 
         Parameters
         ----------
@@ -31,7 +32,7 @@ class AlarmStore(StoreBase):
         alarm : int or None
             Which; None: the next one of this machine. 0 gathers what belongs to none.
         seq : int
-            Number of the line: one more than the last that was read, so that whoever decided on old knowledge is refused.
+            Number of the line: one more than the last that was read, so that a decision on old knowledge is refused.
         kind : str
             What happened (`abbe.service.verification.alarm_states`).
         doc : dict
@@ -46,27 +47,21 @@ class AlarmStore(StoreBase):
         """
 
         def work(connection: Connection) -> AlarmEntryRecord:
-            number = alarm if alarm is not None else _last(connection, machine) + 1
-            values = {"machine": machine, "alarm": number, "seq": seq, "kind": kind, "doc": doc, "utc": self._now()}
+            last = select(func.coalesce(func.max(alarm_entries.c.alarm), 0)).where(alarm_entries.c.machine == machine)
+            number = alarm if alarm is not None else int(connection.execute(last).scalar_one()) + 1
+            entry = AlarmEntryRecord(0, machine, number, seq, kind, doc, self._db.now())
             try:
-                entry_id = new_id(connection, insert(alarm_entries).values(values))
+                entry_id = insert_row(connection, alarm_entries, **ALARM_ENTRY.values(entry, "id"))
             except IntegrityError:
                 raise StoreError(
                     f"alarm {number} of {machine} was changed by somebody else meanwhile", "look at it, then try again"
                 ) from None
             for topic, message in messages:
-                payload = json.dumps({"alarm": number, **message}, ensure_ascii=False, allow_nan=False).encode()
-                connection.execute(insert(outbox).values(topic=topic, payload=payload, created_utc=self._now()))
-            return AlarmEntryRecord(entry_id, machine, number, seq, kind, doc, str(values["utc"]))
+                queue_message(connection, topic, {"alarm": number, **message}, self._db.now())
+            return replace(entry, id=entry_id)
 
-        return self._write(work)
+        return self._db.commit(work)
 
-    def alarm_entries(self, machine: str) -> list[AlarmEntryRecord]:
+    def entries(self, machine: str) -> list[AlarmEntryRecord]:
         """Read everything about a machine's alarms, in the order in which it was written."""
-        query = select(alarm_entries).where(alarm_entries.c.machine == machine).order_by(alarm_entries.c.id)
-        return [AlarmEntryRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
-
-
-def _last(connection: Connection, machine: str) -> int:
-    found = connection.execute(select(func.max(alarm_entries.c.alarm)).where(alarm_entries.c.machine == machine)).scalar()
-    return 0 if found is None else int(found)
+        return self._all(ALARM_ENTRY, alarm_entries.c.machine == machine)

@@ -1,56 +1,33 @@
-"""Store methods for the audit: only ever appended, each record made on the one before it within one transaction."""
+"""The audit: only ever appended, each event made on the one before it within one transaction."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from sqlalchemy import Connection, insert, text
+from sqlalchemy import Connection, text
 
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.errors import StoreError
-from abbe.service.storage.base import StoreBase
-from abbe.service.storage.mapping import RecordMapping
-from abbe.service.storage.tables_people import audit
-
-AUDIT = RecordMapping(AuditEvent, audit)
+from abbe.service.storage.mappings import AUDIT
+from abbe.service.storage.repository import Repository, insert_row
+from abbe.service.storage.tables import audit
 
 
-class AuditStore(StoreBase):
+class Audit(Repository):
     """The audit of this database."""
 
-    def append_audit(self, make: Callable[[AuditEvent | None, str], AuditEvent]) -> AuditEvent:
-        """Append the record that ``make(last record, present UTC)`` makes. Two processes wait for each other: the chain never forks."""
+    def append(self, make: Callable[[AuditEvent | None, str], AuditEvent]) -> AuditEvent:
+        """Append the event that ``make(last event, present UTC)`` makes. Two processes wait for each other: the chain never forks."""
 
         def work(connection: Connection) -> AuditEvent:
-            if self._engine.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE has shut out the others already
+            if self._db.is_postgresql:  # SQLite's BEGIN IMMEDIATE has shut out the others already
                 connection.execute(text("LOCK TABLE audit IN EXCLUSIVE MODE"))
-            row = connection.execute(AUDIT.select().order_by(audit.c.id.desc()).limit(1)).first()
-            record = make(None if row is None else AUDIT.read(row), self._now())
-            connection.execute(insert(audit).values(AUDIT.values(record)))
-            return record
+            last = connection.execute(AUDIT.select().order_by(audit.c.id.desc()).limit(1)).first()
+            event = make(None if last is None else AUDIT.read(last), self._db.now())
+            insert_row(connection, audit, **AUDIT.values(event))
+            return event
 
-        return self._write(work)
+        return self._db.commit(work)
 
-    def can_write(self) -> None:
-        """Make sure that something can be written now; writes nothing.
-
-        Raises
-        ------
-        StoreError
-            It cannot: read-only, locked by another process, gone.
-        """
-        # Of SQLite BEGIN IMMEDIATE asks for all that a write needs; a server says itself whether it takes writes.
-        read_only = text("SELECT current_setting('transaction_read_only')")
-
-        def work(connection: Connection) -> None:
-            if self._engine.dialect.name == "postgresql" and connection.execute(read_only).scalar_one() == "on":
-                raise StoreError(f"database {self.url} takes no writes", "use the server that does")
-
-        self._write(work)
-
-    def audit(self, last: int | None = None) -> list[AuditEvent]:
-        """Read the audit, oldest first; only the ``last`` records if given."""
-        query = AUDIT.select().order_by(audit.c.id.desc())
-        query = query if last is None else query.limit(last)
-        rows = self._read(lambda connection: connection.execute(query).all())
-        return [AUDIT.read(row) for row in reversed(rows)]
+    def events(self, last: int | None = None) -> list[AuditEvent]:
+        """Read the audit, oldest first; only the ``last`` events if given."""
+        return self._all(AUDIT, newest=True, limit=last)[::-1]

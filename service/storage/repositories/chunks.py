@@ -1,30 +1,75 @@
-"""Store method for chunks that may come twice: from the capture, and again from a segment after a crash."""
+"""Chunks of samples. The capture may give one twice: as it arrived, and again from a segment after a crash."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, func, insert, select
 from sqlalchemy.exc import IntegrityError
 
-from abbe.service.domain.measured import RUNNING, ChunkRecord
-from abbe.service.errors import CaptureConflict, StoreError
-from abbe.service.storage.repositories.campaigns import CampaignStore
-from abbe.service.storage.tables import chunks, runs
+from abbe.service.domain.measured import RUNNING, ChannelRecord, ChunkRecord
+from abbe.service.errors import CaptureConflict, NotStored, StoreError
+from abbe.service.storage.mappings import CHUNK
+from abbe.service.storage.repository import Repository, given
+from abbe.service.storage.tables import campaigns, chunks, runs
 
-_FIELDS = tuple(ChunkRecord.__dataclass_fields__)
 
+class Chunks(Repository):
+    """Samples of runs."""
 
-class ChunkStore(CampaignStore):
-    """Idempotent ingest."""
-
-    def ingest_chunks(self, given: Sequence[ChunkRecord]) -> int:
-        """Add chunks of one running run; one that is there already is accepted when it is equal. All of them, or after an error none.
+    def append(  # noqa: PLR0913 - one argument for each field of a chunk
+        self,
+        run_id: int,
+        channel: str,
+        seq: int,
+        n: int,
+        codec: str,
+        payload: bytes,
+        first_host_s: float,
+        last_host_s: float,
+        first_device_us: int,
+        last_device_us: int,
+    ) -> None:
+        """Add samples to a running run. On return they are on disk.
 
         Parameters
         ----------
-        given : sequence of ChunkRecord
-            In any order.
+        run_id : int
+            The run.
+        channel : str
+            ``"bar"``, ``"laser"``, ...
+        seq : int
+            Number of the chunk in its channel, from 0.
+        n : int
+            Samples in it.
+        codec : str
+            How they are packed (`abbe.service.runs.codec`).
+        payload : bytes
+            The packed samples.
+        first_host_s, last_host_s : float
+            Monotonic host time of the first and last arrival.
+        first_device_us, last_device_us : int
+            Device time of the first and last sample.
+
+        Raises
+        ------
+        StoreError
+            The run is closed, or there is such a chunk.
+        """
+        chunk = ChunkRecord(
+            run_id, channel, seq, n, codec, zlib.crc32(payload), payload, first_host_s, last_host_s, first_device_us, last_device_us
+        )
+
+        def work(connection: Connection) -> None:
+            require_running(connection, run_id)
+            insert_chunk(connection, chunk)
+
+        self._db.commit(work)
+
+    def ingest(self, chunks_given: Sequence[ChunkRecord]) -> int:
+        """Add chunks of one running run, in any order: all of them, or after an error none. One that is stored already is accepted
+        when it is equal.
 
         Returns
         -------
@@ -36,47 +81,104 @@ class ChunkStore(CampaignStore):
         CaptureConflict
             The database holds another chunk under the same run, channel and number.
         StoreError
-            The run is closed or does not exist, or the database does not take it now.
+            The run is closed or does not exist, or the database cannot take it now.
         """
 
         def work(connection: Connection) -> int:
-            if connection.execute(select(runs.c.status).where(runs.c.id == given[0].run_id)).scalar() != RUNNING:
-                raise StoreError(f"run {given[0].run_id} is closed or does not exist: nothing can be added to it")
-            present = _present(connection, given)
-            new = [one for one in given if not _is_there(present, one)]
+            run_id = chunks_given[0].run_id
+            if connection.execute(select(runs.c.status).where(runs.c.id == run_id)).scalar() != RUNNING:
+                raise StoreError(f"run {run_id} is closed or does not exist: nothing can be added to it")
+            stored = _stored(connection, chunks_given)
+            new = [one for one in chunks_given if not _is_stored(stored, one)]
             if new:
-                connection.execute(insert(chunks), [{name: getattr(one, name) for name in _FIELDS} for one in new])
+                connection.execute(insert(chunks), [CHUNK.values(one) for one in new])
             return len(new)
 
-        if not given:
+        if not chunks_given:
             return 0
         try:
-            return self._write(work)
+            return self._db.commit(work)
         except StoreError as error:
             if not isinstance(error.__cause__, IntegrityError):
                 raise
-            return self._write(work)  # somebody put the same in between our look and our insert (PostgreSQL): look again
+            return self._db.commit(work)  # somebody put the same in between our look and our insert (PostgreSQL): look again
 
-    def chunk_keys(self, run_id: int) -> dict[tuple[str, int], int]:
+    def of_run(self, run_id: int, channel: str | None = None) -> list[ChunkRecord]:
+        """Read a run's samples (of one channel), in order of channel and seq, and check that they are as they were written.
+
+        Raises
+        ------
+        StoreError
+            Naming run and chunk, if the stored bytes have changed.
+        """
+        query = CHUNK.select().where(chunks.c.run_id == run_id, *given(chunks.c.channel, channel)).order_by(chunks.c.channel, chunks.c.seq)
+        found = [CHUNK.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]
+        for chunk in found:
+            if zlib.crc32(chunk.payload) != chunk.crc32:
+                raise StoreError(
+                    f"run {self._name(run_id)}, chunk {chunk.seq} of channel {chunk.channel!r}: stored bytes do not match their CRC",
+                    "the disk or the file is damaged: restore a backup",
+                )
+        return found
+
+    def between(self, run_id: int, channel: str, first: int, last: int) -> list[ChunkRecord]:
+        """Chunks ``first`` to ``last`` of a channel, with their payloads, in order."""
+        where = (chunks.c.run_id == run_id, chunks.c.channel == channel, chunks.c.seq.between(first, last))
+        return self._all(CHUNK, *where, order=chunks.c.seq)
+
+    def crcs(self, run_id: int) -> dict[tuple[str, int], int]:
         """CRC of every chunk of a run by channel and number; payloads are not read."""
         query = select(chunks.c.channel, chunks.c.seq, chunks.c.crc32).where(chunks.c.run_id == run_id)
-        return {(channel, seq): crc for channel, seq, crc in self._read(lambda connection: connection.execute(query).all())}
+        return {(row.channel, row.seq): row.crc32 for row in self._db.read(lambda connection: connection.execute(query).all())}
+
+    def channels(self, run_id: int) -> list[ChannelRecord]:
+        """What a run holds, channel by channel."""
+        columns = (chunks.c.channel, func.min(chunks.c.codec), func.count(), func.sum(chunks.c.n))
+        query = select(*columns).where(chunks.c.run_id == run_id).group_by(chunks.c.channel).order_by(chunks.c.channel)
+        rows = self._db.read(lambda connection: connection.execute(query).all())
+        return [ChannelRecord(channel, codec, int(count), int(n)) for channel, codec, count, n in rows]
+
+    def sizes(self, run_id: int, channel: str) -> list[tuple[int, int]]:
+        """Number and samples of every chunk of a channel, in order; payloads are not read."""
+        query = select(chunks.c.seq, chunks.c.n).where(chunks.c.run_id == run_id, chunks.c.channel == channel).order_by(chunks.c.seq)
+        return [(int(seq), int(n)) for seq, n in self._db.read(lambda connection: connection.execute(query).all())]
+
+    def _name(self, run_id: int) -> str:
+        query = select(campaigns.c.name + "/" + runs.c.label).select_from(runs.join(campaigns)).where(runs.c.id == run_id)
+        return str(self._db.read(lambda connection: connection.execute(query).scalar()))
 
 
-def _present(connection: Connection, given: Sequence[ChunkRecord]) -> dict[tuple[str, int], ChunkRecord]:
+def insert_chunk(connection: Connection, chunk: ChunkRecord) -> None:
+    """Add a chunk that is not stored yet."""
+    try:
+        connection.execute(insert(chunks).values(CHUNK.values(chunk)))
+    except IntegrityError:
+        raise StoreError(f"run {chunk.run_id}: chunk {chunk.seq} of channel {chunk.channel!r} exists and is never overwritten") from None
+
+
+def require_running(connection: Connection, run_id: int) -> None:
+    """Raise NotStored or StoreError unless samples may be added to a run."""
+    status = connection.execute(select(runs.c.status).where(runs.c.id == run_id)).scalar()
+    if status is None:
+        raise NotStored(f"no run {run_id} in the database")
+    if status != RUNNING:
+        raise StoreError(f"run {run_id} is closed ({status}): nothing can be added to it")
+
+
+def _stored(connection: Connection, wanted: Sequence[ChunkRecord]) -> dict[tuple[str, int], ChunkRecord]:
+    """What the database holds in the stretches of these chunks."""
     found: dict[tuple[str, int], ChunkRecord] = {}
-    for channel in {one.channel for one in given}:
-        numbers = [one.seq for one in given if one.channel == channel]
-        columns = [chunks.c[name] for name in _FIELDS]
-        query = select(*columns).where(
-            chunks.c.run_id == given[0].run_id, chunks.c.channel == channel, chunks.c.seq.between(min(numbers), max(numbers))
+    for channel in {one.channel for one in wanted}:
+        numbers = [one.seq for one in wanted if one.channel == channel]
+        query = CHUNK.select().where(
+            chunks.c.run_id == wanted[0].run_id, chunks.c.channel == channel, chunks.c.seq.between(min(numbers), max(numbers))
         )
-        found |= {(channel, row.seq): ChunkRecord(*row) for row in connection.execute(query)}
+        found |= {(channel, one.seq): one for one in map(CHUNK.read, connection.execute(query))}
     return found
 
 
-def _is_there(present: dict[tuple[str, int], ChunkRecord], one: ChunkRecord) -> bool:
-    known = present.get((one.channel, one.seq))
+def _is_stored(stored: dict[tuple[str, int], ChunkRecord], one: ChunkRecord) -> bool:
+    known = stored.get((one.channel, one.seq))
     if known is not None and known != one:
         raise CaptureConflict(
             f"run {one.run_id}: chunk {one.seq} of channel {one.channel!r} is in the database with other content",

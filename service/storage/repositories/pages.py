@@ -1,4 +1,4 @@
-"""Store methods that read lists a page at a time, newest first, without their heavy documents: histories grow for years."""
+"""Lists a page at a time, newest first, without their heavy documents: histories grow for years."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, FromClause, Select, func, select
+from sqlalchemy import ColumnElement, FromClause, Select, select
 
+from abbe.service.domain import measured
 from abbe.service.domain.document import Doc
-from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord
 from abbe.service.domain.owner import Owner
-from abbe.service.storage.base import StoreBase
+from abbe.service.storage.repository import Repository
 from abbe.service.storage.tables import (
     campaigns,
-    chunks,
     comp_tables,
     discoveries,
     machines,
@@ -87,31 +86,28 @@ _DOCUMENTS: dict[str, Any] = {
 }
 
 
-class PageStore(StoreBase):
+class Pages(Repository):
     """Lists a page at a time."""
 
-    def page(self, kind: str, given: Mapping[str, object], before: int | None, limit: int) -> list[Doc]:
+    def page(self, kind: str, filters: Mapping[str, object], before: int | None, limit: int) -> list[Doc]:
         """Read the newest rows of a list.
 
         Parameters
         ----------
         kind : str
             One of `LISTINGS`.
-        given : mapping
-            Columns and what they have to be; None is not asked for.
+        filters : mapping
+            Columns and the values they must have; None: any.
         before : int, optional
             Only rows with a smaller number: the last number of the page before.
         limit : int
             At most so many.
         """
         listing = LISTINGS[kind]
-        query = listing.query().order_by(listing.columns["id"].desc()).limit(limit)
-        for name in listing.filters:
-            if given.get(name) is not None:
-                query = query.where(listing.columns[name] == given[name])
-        if before is not None:
-            query = query.where(listing.columns["id"] < before)
-        return [dict(row._mapping) for row in self._read(lambda connection: connection.execute(query).all())]  # noqa: SLF001 - public name
+        where = [listing.columns[name] == filters[name] for name in listing.filters if filters.get(name) is not None]
+        where += [] if before is None else [listing.columns["id"] < before]
+        query = listing.query().where(*where).order_by(listing.columns["id"].desc()).limit(limit)
+        return [dict(row) for row in self._db.read(lambda connection: connection.execute(query).mappings().all())]
 
     def row(self, kind: str, number: int) -> Doc | None:
         """One row of a list with its document as ``doc``, where it has one; None: there is none."""
@@ -119,30 +115,10 @@ class PageStore(StoreBase):
         query = listing.query().where(listing.columns["id"] == number)
         if kind in _DOCUMENTS:
             query = query.add_columns(_DOCUMENTS[kind].c.doc.label("doc"))
-        found = self._read(lambda connection: connection.execute(query).first())
-        return None if found is None else dict(found._mapping)  # noqa: SLF001 - public name
-
-    def channels(self, run_id: int) -> list[ChannelRecord]:
-        """What a run holds, channel by channel."""
-        columns = (chunks.c.channel, func.min(chunks.c.codec), func.count(), func.sum(chunks.c.n))
-        query = select(*columns).where(chunks.c.run_id == run_id).group_by(chunks.c.channel).order_by(chunks.c.channel)
-        rows = self._read(lambda connection: connection.execute(query).all())
-        return [ChannelRecord(channel, codec, int(count), int(n)) for channel, codec, count, n in rows]
-
-    def chunk_sizes(self, run_id: int, channel: str) -> list[tuple[int, int]]:
-        """Number and samples of every chunk of a channel, in order; payloads are not read."""
-        query = select(chunks.c.seq, chunks.c.n).where(chunks.c.run_id == run_id, chunks.c.channel == channel).order_by(chunks.c.seq)
-        return [(int(seq), int(n)) for seq, n in self._read(lambda connection: connection.execute(query).all())]
-
-    def chunk_range(self, run_id: int, channel: str, first: int, last: int) -> list[ChunkRecord]:
-        """Chunks ``first`` to ``last`` of a channel, with their payloads, in order."""
-        columns = [chunks.c[name] for name in ChunkRecord.__dataclass_fields__]
-        query = select(*columns).where(chunks.c.run_id == run_id, chunks.c.channel == channel, chunks.c.seq.between(first, last))
-        rows = self._read(lambda connection: connection.execute(query.order_by(chunks.c.seq)).all())
-        return [ChunkRecord(*row) for row in rows]
+        found = self._db.read(lambda connection: connection.execute(query).mappings().first())
+        return None if found is None else dict(found)
 
 
 def visible_status(row: Doc) -> str:
-    """What a person should be told of a run's state: as `RunRecord.visible_status`."""
-    owner = Owner(row["owner_host"], row["owner_pid"], row["owner_start"])
-    return INCOMPLETE if row["status"] == RUNNING and owner.is_gone() else str(row["status"])
+    """State of the run of a row, as `RunRecord.visible_status`."""
+    return measured.visible_status(row["status"], Owner(row["owner_host"], row["owner_pid"], row["owner_start"]))

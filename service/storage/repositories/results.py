@@ -1,158 +1,116 @@
-"""Store methods for what was computed and done: solutions, compensation tables, verifications."""
+"""What was computed from runs, and what was done with it: solutions, compensation tables, checks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import insert, select
-from sqlalchemy.sql import Select
+from sqlalchemy import Connection, func, select
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import SolutionRecord, TableRecord, VerificationRecord
-from abbe.service.errors import NotStored
-from abbe.service.storage.base import StoreBase
-from abbe.service.storage.repositories.campaigns import new_id
-from abbe.service.storage.tables import comp_tables, machines, solutions, verifications
+from abbe.service.storage.mappings import SOLUTION, TABLE, VERIFICATION
+from abbe.service.storage.repositories.outbox import queue_message
+from abbe.service.storage.repository import Repository, given, insert_row
+from abbe.service.storage.tables import campaigns, comp_tables, machines, solutions, verifications
 
 
-class ResultStore(StoreBase):
-    """What was computed from runs, and what was done with it."""
+class Solutions(Repository):
+    """Results of solvers."""
 
-    def add_solution(self, campaign_id: int, kind: str, run_ids: Sequence[int], doc: Doc) -> int:
-        """Store a solver's result.
+    def add(self, campaign_id: int, kind: str, run_ids: Sequence[int], doc: Doc) -> int:
+        """Store what a solver (``kind``) found from some runs of a campaign."""
+        return self._add(solutions, campaign_id=campaign_id, kind=kind, run_ids=list(run_ids), doc=doc, created_utc=self._db.now())
 
-        Parameters
-        ----------
-        campaign_id : int
-            Campaign.
-        kind : str
-            Which solver.
-        run_ids : sequence of int
-            Runs that went in.
-        doc : dict
-            The result.
+    def get(self, solution_id: int) -> SolutionRecord:
+        """Read one solution. Raises NotStored."""
+        return self._get(SOLUTION, solution_id, "solution")
 
-        Returns
-        -------
-        int
-            Id.
-        """
-        values = {"campaign_id": campaign_id, "kind": kind, "run_ids": list(run_ids), "doc": doc, "created_utc": self._now()}
-        return self._write(lambda connection: new_id(connection, insert(solutions).values(values)))
-
-    def solution(self, solution_id: int) -> SolutionRecord:
-        """Read one solution; StoreError if there is none."""
-        return SolutionRecord(*self._one(select(solutions).where(solutions.c.id == solution_id), f"solution {solution_id}"))
-
-    def solutions(self, campaign_id: int | None = None) -> list[SolutionRecord]:
+    def all(self, campaign_id: int | None = None) -> list[SolutionRecord]:
         """List solutions (of one campaign), oldest first."""
-        query = select(solutions).order_by(solutions.c.id)
-        if campaign_id is not None:
-            query = query.where(solutions.c.campaign_id == campaign_id)
-        return [SolutionRecord(*row) for row in self._all(query)]
+        return self._all(SOLUTION, *given(solutions.c.campaign_id, campaign_id))
 
-    def latest_solutions(self, kind: str, limit: int) -> list[SolutionRecord]:
+    def latest(self, kind: str, limit: int) -> list[SolutionRecord]:
         """List the newest solutions of a kind, newest first: each may be half a megabyte."""
-        query = select(solutions).where(solutions.c.kind == kind).order_by(solutions.c.id.desc()).limit(limit)
-        return [SolutionRecord(*row) for row in self._all(query)]
+        return self._all(SOLUTION, solutions.c.kind == kind, newest=True, limit=limit)
 
-    def add_table(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:
-        """Store a compensation table.
+
+class Tables(Repository):
+    """Compensation tables."""
+
+    def add(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:
+        """Store a table.
 
         Parameters
         ----------
         machine_id : int
-            For which machine.
+            Its machine.
         solution_id : int or None
-            From which solution; None for a table read back from the controller.
+            Its solution; None for a table that was read back from the controller.
         image : bytes
             As the controller holds it.
         crc : int
-            Its CRC-32.
+            CRC-32 of the image.
         doc : dict
             Grid and prediction.
-
-        Returns
-        -------
-        int
-            Id.
         """
-        values = {"machine_id": machine_id, "solution_id": solution_id, "image": image, "crc": crc, "doc": doc, "created_utc": self._now()}
-        return self._write(lambda connection: new_id(connection, insert(comp_tables).values(values)))
+        values = {"machine_id": machine_id, "solution_id": solution_id, "image": image, "crc": crc, "doc": doc}
+        return self._add(comp_tables, **values, created_utc=self._db.now())
 
-    def table(self, table_id: int) -> TableRecord:
-        """Read one compensation table; StoreError if there is none."""
-        return TableRecord(*self._one(select(comp_tables).where(comp_tables.c.id == table_id), f"compensation table {table_id}"))
+    def get(self, table_id: int) -> TableRecord:
+        """Read one table. Raises NotStored."""
+        return self._get(TABLE, table_id, "compensation table")
 
-    def tables(self, machine_id: int | None = None) -> list[TableRecord]:
-        """List compensation tables (of one machine), oldest first."""
-        query = select(comp_tables).order_by(comp_tables.c.id)
-        if machine_id is not None:
-            query = query.where(comp_tables.c.machine_id == machine_id)
-        return [TableRecord(*row) for row in self._all(query)]
+    def all(self, machine_id: int | None = None) -> list[TableRecord]:
+        """List tables (of one machine), oldest first."""
+        return self._all(TABLE, *given(comp_tables.c.machine_id, machine_id))
 
-    def add_verification(self, machine_id: int, campaign_id: int | None, verdict: str, doc: Doc) -> int:
-        """Store the result of a check.
+
+class Verifications(Repository):
+    """Checks of machines."""
+
+    def add(self, machine_id: int, campaign_id: int | None, verdict: str, doc: Doc) -> int:
+        """Store the result of a check, with the campaign that was measured for it: figures, limits and verdict."""
+        return self._add(verifications, machine_id=machine_id, campaign_id=campaign_id, verdict=verdict, doc=doc, utc=self._db.now())
+
+    def add_with_messages(self, machine_id: int, doc: Doc, messages: Sequence[tuple[str, Doc]]) -> int:
+        """Store the result of a check together with the messages about it: both or neither survive a power cut.
 
         Parameters
         ----------
         machine_id : int
-            Which machine.
-        campaign_id : int or None
-            The campaign measured for it.
-        verdict : str
-            E.g. ``"pass"``.
+            The machine, for checks that failed before they had a campaign.
         doc : dict
-            Figures and limits.
-
-        Returns
-        -------
-        int
-            Id.
+            As made by `abbe.service.scheduler.record`.
+        messages : sequence of (topic, document)
+            For the broker; each is given the number of the verification.
         """
-        values = {"machine_id": machine_id, "campaign_id": campaign_id, "verdict": verdict, "doc": doc, "utc": self._now()}
-        return self._write(lambda connection: new_id(connection, insert(verifications).values(values)))
 
-    def verifications(self, machine_id: int | None = None, limit: int = 100) -> list[VerificationRecord]:
-        """List checks, newest first.
+        def work(connection: Connection) -> int:
+            found = connection.execute(select(campaigns.c.id, campaigns.c.machine_id).where(campaigns.c.name == doc["campaign"])).first()
+            campaign_id, of_machine = (None, machine_id) if found is None else (int(found.id), int(found.machine_id))
+            values = {"machine_id": of_machine, "campaign_id": campaign_id, "verdict": doc["verdict"], "doc": doc}
+            number = insert_row(connection, verifications, **values, utc=self._db.now())
+            for topic, message in messages:
+                queue_message(connection, topic, {"verification": number, **message}, self._db.now())
+            return number
 
-        Parameters
-        ----------
-        machine_id : int, optional
-            Only this machine's.
-        limit : int
-            At most so many.
+        return self._db.commit(work)
 
-        Returns
-        -------
-        list of VerificationRecord
-            The records.
-        """
-        query = select(verifications).order_by(verifications.c.id.desc()).limit(limit)
-        if machine_id is not None:
-            query = query.where(verifications.c.machine_id == machine_id)
-        return [VerificationRecord(*row) for row in self._all(query)]
+    def latest(self, machine_id: int | None = None, limit: int = 100) -> list[VerificationRecord]:
+        """List checks (of one description of a machine), newest first."""
+        return self._all(VERIFICATION, *given(verifications.c.machine_id, machine_id), newest=True, limit=limit)
 
-    def verifications_of(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
-        """Return the latest checks of a machine, newest first, whatever descriptions it has had.
+    def of_machine(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
+        """List the latest checks of a machine by name, newest first, whatever descriptions it has had."""
+        return self._all(VERIFICATION, verifications.c.machine_id.in_(_descriptions(machine)), newest=True, limit=limit)
 
-        Parameters
-        ----------
-        machine : str
-            Name of the machine.
-        limit : int
-            At most so many.
-        """
-        query = select(verifications).join(machines, machines.c.id == verifications.c.machine_id).where(machines.c.name == machine)
-        query = query.order_by(verifications.c.id.desc()).limit(limit)
-        return [VerificationRecord(*row) for row in self._read(lambda connection: connection.execute(query).all())]
+    def counts(self, machine: str) -> dict[str, int]:
+        """How many checks of a machine ended with each verdict, over its whole history."""
+        query = select(verifications.c.verdict, func.count()).where(verifications.c.machine_id.in_(_descriptions(machine)))
+        rows = self._db.read(lambda connection: connection.execute(query.group_by(verifications.c.verdict)).all())
+        return {str(verdict): int(count) for verdict, count in rows}
 
-    def _all(self, query: Select[Any]) -> Sequence[Any]:
-        return self._read(lambda connection: connection.execute(query).all())
 
-    def _one(self, query: Select[Any], what: str) -> Any:
-        found = self._read(lambda connection: connection.execute(query).first())
-        if found is None:
-            raise NotStored(f"no {what} in {self.url}")
-        return found
+def _descriptions(machine: str) -> Any:
+    return select(machines.c.id).where(machines.c.name == machine)

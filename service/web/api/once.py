@@ -40,7 +40,7 @@ async def once(store: Store, request: Request, key: str, body: BaseModel, work: 
     visit: Visit = request.state.visit
     who = visit.principal.name
     digest = hashlib.sha256(canonical([request.method, request.url.path, body.model_dump(mode="json")])).hexdigest()
-    known = await store.write(store.claim_reply, who, key, digest)
+    known = await store.write(store.replies.claim, who, key, digest)
     if known is not None:
         answer = _again(known.digest == digest, known.status, known.body)
         visit.replayed = True  # for the audit: a decision stands in it once, and that somebody asked again as what it is
@@ -48,9 +48,9 @@ async def once(store: Store, request: Request, key: str, body: BaseModel, work: 
     try:
         status, text = await asyncio.to_thread(_answer, work)
     except BaseException:
-        await store.write(store.drop_reply, who, key)
+        await store.write(store.replies.drop, who, key)
         raise
-    await store.write(store.keep_reply, who, key, status, text)
+    await store.write(store.replies.keep, who, key, status, text)
     return _response(status, text)
 
 

@@ -83,10 +83,10 @@ def _written(sources: Sources, kind: ReportKind, number: int, form: ReportForm, 
 def _document(sources: Sources, kind: ReportKind, number: int, machine: str | None) -> Document:
     reader, store = sources.reader, sources.reader.store
     if kind is ReportKind.PUSH:
-        if machine is not None and (not storable(machine) or not store.push_entries(machine, reader.control_of(machine))):
+        if machine is not None and (not storable(machine) or not store.pushes.entries(machine, reader.control_of(machine))):
             raise NotStored("this machine has no push")
-        found = store.page(
-            "pushes", {"push": number, "machine": machine and store.push_chain(machine, reader.control_of(machine))}, None, 1
+        found = store.pages.page(
+            "pushes", {"push": number, "machine": machine and store.pushes.chain(machine, reader.control_of(machine))}, None, 1
         )
         if not found:
             raise NotStored(f"there is no push {number}")
@@ -99,7 +99,7 @@ def _document(sources: Sources, kind: ReportKind, number: int, machine: str | No
     }[kind]
     row = reader.row(listing, number, kind)
     if kind is ReportKind.RUN:
-        return stored_report(store, store.run(f"{row['campaign']}/{row['label']}"), sources.rules)
+        return stored_report(store, store.runs.find(f"{row['campaign']}/{row['label']}"), sources.rules)
     if kind is ReportKind.CAMPAIGN:
-        return stored_report(store, store.campaign(row["name"]), sources.rules)
+        return stored_report(store, store.campaigns.find(row["name"]), sources.rules)
     return numbered_report(store, kind, number, sources.rules)

@@ -70,7 +70,7 @@ class BudgetScreen:
 def budget_screen(store: Store, record: SolutionRecord, say: Say) -> BudgetScreen:
     """The budget as the store has it; nothing is computed anew but the ends of intervals."""
     doc = record.doc
-    campaign = store.campaign(record.campaign_id).name
+    campaign = store.campaigns.find(record.campaign_id).name
     known: Mapping[str, Any] = doc.get("uncertainty") or {}
     lines = known.get("budget") or []
     if not lines:

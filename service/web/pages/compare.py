@@ -65,7 +65,7 @@ class CompareScreen:
 def compare_screen(store: Store, numbers: Sequence[int], say: Say, rules: Rules) -> CompareScreen:
     """Compare runs of the store; fewer than two: what can be chosen."""
     numbers = list(dict.fromkeys(numbers))
-    records = [found(store.run, n) for n in numbers]
+    records = [found(store.runs.find, n) for n in numbers]
     lost = [str(n) for n, record in zip(numbers, records, strict=True) if record is None]
     there = [record for record in records if record is not None]
     choices = _choices(store, there)
@@ -93,14 +93,14 @@ def compare_screen(store: Store, numbers: Sequence[int], say: Say, rules: Rules)
 
 def _choices(store: Store, there: Sequence[RunRecord]) -> list[RunRecord]:
     """The newest runs that could go with the first, or any; those that were chosen come first."""
-    newest = store.latest_runs(LISTED, test=there[0].test if there else "", status="complete")
+    newest = store.runs.latest(LISTED, test=there[0].test if there else "", status="complete")
     kept = {record.id for record in there}
     return [*there, *(run for run in newest if run.id not in kept)]
 
 
 def _load(store: Store, record: RunRecord, rules: Rules) -> LoadedRun:
     run, document = run_document(store, record, rules)
-    name = store.machine(store.campaign(record.campaign_id).machine_id).name
+    name = store.machines.get(store.campaigns.find(record.campaign_id).machine_id).name
     return LoadedRun(f"{record.campaign}/{record.label}", name, run, run_data(run), document.figures)
 
 

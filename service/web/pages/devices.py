@@ -59,11 +59,11 @@ def device_screen(
     store: Store, machine: str, devices: Sequence[DeviceStatus], until: Mapping[str, date] | None, today: date
 ) -> DeviceScreen:
     """The devices of a machine file, and what its latest campaigns noted of their links."""
-    own = {record.id for record in store.machines() if record.name == machine}
+    own = {record.id for record in store.machines.all() if record.name == machine}
     campaigns = latest_of(store, own)
     latest, numbers = campaigns[-CAMPAIGNS:], {c.id for c in campaigns}
-    journal = [entry for campaign in latest for entry in store.checkpoints(campaign.id)]
-    proof = next((one.doc for one in store.latest_solutions(KIND, PROOFS) if one.campaign_id in numbers), {})
+    journal = [entry for campaign in latest for entry in store.checkpoints.of_campaign(campaign.id)]
+    proof = next((one.doc for one in store.solutions.latest(KIND, PROOFS) if one.campaign_id in numbers), {})
     known = proof.get("identity") or {}
     told = " ".join(str(known[k]) for k in ("model", "firmware") if known.get(k))
     lines = [
@@ -74,7 +74,7 @@ def device_screen(
 
 def latest_of(store: Store, machines: Collection[int]) -> list[CampaignRecord]:
     """Campaigns of these descriptions of a machine, oldest first."""
-    return [c for c in store.campaigns() if c.machine_id in machines]
+    return [c for c in store.campaigns.all() if c.machine_id in machines]
 
 
 def _certificate(role: str, until: Mapping[str, date], today: date) -> Certificate | None:

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
+from abbe.service.domain.utc import utc_text
 from abbe.service.scheduler.fleet import FleetFigure, MachineStatus, stands
-from abbe.service.scheduler.store import ServiceStore
-from abbe.service.storage.base import utc_text
+from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import folded, is_open
 
 SORTS = ("worst", "machine", "due")
@@ -59,7 +59,7 @@ class FleetQuery:
     sort: str = SORTS[0]
 
 
-def fleet_lines(store: ServiceStore, now: datetime, asked: FleetQuery) -> list[FleetLine]:
+def fleet_lines(store: Store, now: datetime, asked: FleetQuery) -> list[FleetLine]:
     """The machines that fit, in the order that was asked for."""
     lines = [_line(store, one) for one in stands(store, now) if _fits(one, asked)]
     if asked.sort == "machine":
@@ -77,10 +77,10 @@ def _fits(one: MachineStatus, asked: FleetQuery) -> bool:
     return asked.name.casefold() in one.machine.casefold() and asked.verdict in {"", one.verdict}
 
 
-def _line(store: ServiceStore, one: MachineStatus) -> FleetLine:
+def _line(store: Store, one: MachineStatus) -> FleetLine:
     judged = [figure for figure in one.figures if figure.limit]
     worst = max(judged, key=lambda f: (f.value + (f.expanded or 0.0)) / (f.limit or 1.0), default=None)
-    return FleetLine(one, worst, sum(is_open(alarm) for alarm in folded(store.alarm_entries(one.machine))))
+    return FleetLine(one, worst, sum(is_open(alarm) for alarm in folded(store.alarms.entries(one.machine))))
 
 
 def fleet_csv(lines: Sequence[FleetLine]) -> str:

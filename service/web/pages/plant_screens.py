@@ -84,7 +84,7 @@ def _add_settings(app: FastAPI, context: PageContext, sources: Sources) -> None:
     @app.get("/settings", include_in_schema=False)
     @needs(Permission.READ)
     async def settings() -> HTMLResponse:
-        users = await context.read(sources.reader.store.users) if current().may(Permission.USERS) else []
+        users = await context.read(sources.reader.store.people.all) if current().may(Permission.USERS) else []
         return await context.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, users=users)
 
     @app.get("/diagnostics", include_in_schema=False)

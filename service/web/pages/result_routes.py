@@ -40,7 +40,7 @@ async def _solution(context: PageContext, number: int | None) -> SolutionRecord 
         if not newest:
             return None
         number = newest[0].id
-    record = await context.read(found, context.store.solution, number)
+    record = await context.read(found, context.store.solutions.get, number)
     return record if record is not None else await context.missing("solution", number)
 
 

@@ -152,8 +152,8 @@ class DiscoveryScreen:
 
 def solution_lines(store: Store, limit: int = MOST_SOLUTIONS) -> list[SolutionLine]:
     """Solutions of campaigns, newest first."""
-    names = {c.id: c.name for c in store.campaigns()}
-    newest = store.latest_solutions("joint", limit)
+    names = {c.id: c.name for c in store.campaigns.all()}
+    newest = store.solutions.latest("joint", limit)
     return [_line(s, names.get(s.campaign_id, "")) for s in newest if "mean_over_volume" in s.doc]
 
 
@@ -165,8 +165,8 @@ def _line(record: SolutionRecord, campaign: str) -> SolutionLine:
 
 def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
     """A solution with what contributes most to the machine's error."""
-    doc, campaign = record.doc, store.campaign(record.campaign_id)
-    ranked = _ranked(doc, store.machine(campaign.machine_id).doc)
+    doc, campaign = record.doc, store.campaigns.find(record.campaign_id)
+    ranked = _ranked(doc, store.machines.get(campaign.machine_id).doc)
     shown = [r.contribution for r in ranked if not r.hidden]
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
     picture = Markup(contribution_bars(shown, unit=current().drawn())) if shown else Markup("")  # noqa: S704

@@ -86,7 +86,7 @@ def _add_runs(app: FastAPI, context: PageContext) -> None:
         if id is None:
             newest, _ = await context.read(measured.runs, context.reader, {}, None, 1)
             id = newest[0].number if newest else None
-        record = None if id is None else await context.read(found, context.store.run, id)
+        record = None if id is None else await context.read(found, context.store.runs.find, id)
         if record is None and id is not None:
             return await context.missing("run", id)
         screen = None if record is None else await context.read(run_screen, context.store, record, context.rules)
@@ -105,7 +105,7 @@ def _add_results(app: FastAPI, context: PageContext) -> None:
     async def result(id: Number = None) -> HTMLResponse:
         newest = await context.read(solution_lines, context.store, 1) if id is None else []
         number = newest[0].id if newest else id
-        record = None if number is None else await context.read(found, context.store.solution, number)
+        record = None if number is None else await context.read(found, context.store.solutions.get, number)
         if record is None and number is not None:
             return await context.missing("solution", number)
         screen = None if record is None else await context.read(result_screen, context.store, record)
@@ -200,5 +200,5 @@ def _add_times(app: FastAPI, context: PageContext) -> None:
     @app.get("/audit", include_in_schema=False)
     @needs(Permission.AUDIT)
     async def audit() -> HTMLResponse:
-        records = await context.read(context.store.audit, times.AUDIT_ROWS)
+        records = await context.read(context.store.audit.events, times.AUDIT_ROWS)
         return await context.show("audit.html", records=list(reversed(records)))

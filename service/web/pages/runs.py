@@ -71,8 +71,8 @@ def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
 
 def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[dict[str, Any], Document]:
     """A run as an ``abbe-run/1`` object, and its report; errors of both."""
-    owner = store.campaign(record.campaign_id)
-    machine: dict[str, Any] = store.machine(owner.machine_id).doc
+    owner = store.campaigns.find(record.campaign_id)
+    machine: dict[str, Any] = store.machines.get(owner.machine_id).doc
     run = set_once([load_run(store, record.id)])[0]
     site = Site(str(machine.get("name") or record.campaign), machine_from_doc(machine), machine, DeviceUrls())
     known = owner.doc.get("imported") or owner.doc

@@ -77,7 +77,7 @@ class VolumeScreen:
 
 def volume_screen(store: Store, record: SolutionRecord, asked: VolumeQuery, say: Say) -> VolumeScreen:
     """The map of a stored solution; what cannot be shown says why."""
-    campaign = store.campaign(record.campaign_id).name
+    campaign = store.campaigns.find(record.campaign_id).name
     try:
         stored = stored_field(store, record)
     except (AbbeError, ValueError, KeyError, TypeError) as error:

@@ -80,7 +80,7 @@ class WhatIfScreen:
 
 def whatif_screen(store: Store, record: SolutionRecord, take: Sequence[str], everything: bool, say: Say) -> WhatIfScreen:
     """Ask a stored solution; what it cannot answer says why."""
-    campaign = store.campaign(record.campaign_id).name
+    campaign = store.campaigns.find(record.campaign_id).name
     try:
         stored = stored_field(store, record)
     except (AbbeError, ValueError, KeyError, TypeError) as error:

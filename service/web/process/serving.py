@@ -21,7 +21,7 @@ from abbe.service.plant.gather import Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.report.report_parts import Rules
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
@@ -117,7 +117,7 @@ async def serve_pages(channel: socket.socket, listening: socket.socket) -> int:
         begin = await _begin(wire)
         if begin is None:
             return 0
-        store = await asyncio.to_thread(ServiceStore.open, begin.store_url)
+        store = await asyncio.to_thread(Store.open, begin.store_url)
         try:
             return await _serve(wire, begin, store, listening)
         finally:
@@ -140,7 +140,7 @@ async def _begin(wire: Wire) -> Begin | None:
     return first
 
 
-async def _serve(wire: Wire, begin: Begin, store: ServiceStore, listening: socket.socket) -> int:
+async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socket) -> int:
     clock = SystemClock()
     people = People(store, clock)
     people.passwords.prepare()

@@ -56,8 +56,8 @@ async def _ours(path: str, folder: Path, count: int) -> tuple[tuple[float, float
     driver._BUFFER_S = 3600.0  # the box sends faster than any consumer takes: that is what is measured, not a reason to stop
     bar = SerialBallBar(ByteLink(parse_url(f"serial://{path}?baud=460800")), ring_s=3600.0)
     with Store.open(f"sqlite:///{folder / 'ours.sqlite3'}") as store:
-        campaign = store.add_campaign(store.add_machine("M", {}), "c", {})
-        run_id = store.start_run(campaign, "r", "ballbar_helix", "identify", {})
+        campaign = store.campaigns.add(store.machines.add("M", {}), "c", {})
+        run_id = store.runs.start(campaign, "r", "ballbar_helix", "identify", {})
         await bar.identify()
         cpu_s, wall_s = time.process_time(), time.perf_counter()
         async with (
@@ -70,7 +70,7 @@ async def _ours(path: str, folder: Path, count: int) -> tuple[tuple[float, float
                     break
         times = time.process_time() - cpu_s, time.perf_counter() - wall_s
         await bar.close()
-        chunks = store.chunks(run_id, "bar")
+        chunks = store.chunks.of_run(run_id, "bar")
     return times, [(s.seq, s.device_us, s.reading_nm, s.status) for chunk in chunks for s in decode_bar(chunk.payload)]
 
 

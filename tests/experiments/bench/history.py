@@ -15,7 +15,7 @@ from pathlib import Path
 from sqlalchemy import func, select
 
 from abbe.service.scheduler.fleet import fleet
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.storage.tables import chunks, runs
 from abbe.service.verification.trend_table import trends
 from tests.experiments.bench.history_case import MONTH, START, History, build
@@ -85,8 +85,8 @@ def _asked(folder: Path, history: History) -> dict:
         times = {key: [_get(port, path)[0] for _ in range(ASKED)] for key, path in PATHS.items()}
         checks = json.loads(_get(port, PATHS["checks"])[1])["verifications"]
         page = _get(port, "/")[1].decode()
-    with ServiceStore.open(url) as store:
-        times["trend"] = [_timed(lambda: trends(store.verifications_of(name, limit=100_000))) for _ in range(ASKED)]
+    with Store.open(url) as store:
+        times["trend"] = [_timed(lambda: trends(store.verifications.of_machine(name, limit=100_000))) for _ in range(ASKED)]
         now = START + timedelta(days=history.days)
         times["fleet"] = [_timed(lambda: fleet(store, now)) for _ in range(3)]
     right = {one["machine"] for one in checks} == {name} and len(checks) == history.days * history.checks_a_day and "</html>" in page
@@ -110,10 +110,10 @@ def _done(*words: str | Path) -> None:
 
 
 def _told(url: str, history: History) -> tuple:
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         names = [history.name(k) for k in range(history.machines)]
-        counts = store._read(lambda c: [c.execute(select(func.count()).select_from(table)).scalar() for table in (runs, chunks)])
-        return counts, [trends(store.verifications_of(name, limit=100_000)) for name in names]
+        counts = store.read(lambda c: [c.execute(select(func.count()).select_from(table)).scalar() for table in (runs, chunks)])
+        return counts, [trends(store.verifications.of_machine(name, limit=100_000)) for name in names]
 
 
 @contextmanager

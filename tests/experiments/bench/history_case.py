@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 
 from sqlalchemy import Connection, insert
 
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.storage.tables import campaigns, chunks, machines, runs, slots, verifications
 
 START = datetime(2026, 10, 1, tzinfo=UTC)
@@ -49,9 +49,9 @@ def build(url: str, history: History, seed: int = 7) -> None:
     """Write a history into an empty database, a day a transaction."""
     rng = random.Random(seed)
     payloads = (rng.randbytes(HELIX_BYTES), rng.randbytes(LASER_BYTES))
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         names = [history.name(k) for k in range(history.machines)]
-        store._write(
+        store.commit(
             lambda c: c.execute(
                 insert(machines),
                 [{"name": n, "doc": {"name": n}, "doc_hash": n, "created_utc": _utc(START)} for n in names],
@@ -59,7 +59,7 @@ def build(url: str, history: History, seed: int = 7) -> None:
         )
         state = _Numbers()
         for day in range(history.days):
-            store._write(lambda c, day=day: _a_day(c, history, day, rng, state, payloads))
+            store.commit(lambda c, day=day: _a_day(c, history, day, rng, state, payloads))
 
 
 @dataclass

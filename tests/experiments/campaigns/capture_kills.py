@@ -63,7 +63,7 @@ def run_kills(folder: Path, kills: int, seed: int, progress: Callable[[str], Non
 
 def _prepare(url: str) -> None:
     with Store.open(url) as store:
-        store.add_campaign(store.add_machine("M", {"name": "M"}), "kills", {})
+        store.campaigns.add(store.machines.add("M", {"name": "M"}), "kills", {})
 
 
 def _kill_early(url: str, number: int, rng: random.Random) -> int:
@@ -117,7 +117,7 @@ def _wait(read: int) -> None:
 async def _record(url: str, number: int, write: int) -> None:
     """One run that never ends: 5 kHz in batches, with gaps."""
     with Store.open(url) as store:
-        run_id = store.start_run(store.campaign("kills").id, f"r{number}", "ballbar_helix", "identify", {})
+        run_id = store.runs.start(store.campaigns.find("kills").id, f"r{number}", "ballbar_helix", "identify", {})
 
         def published(channel: str, stream: int, seq: int) -> None:
             os.write(write, _WORD.pack(seq))
@@ -138,7 +138,7 @@ def _judge(url: str, number: int, durable: int) -> dict[str, object]:
     wrong: list[str] = []
     nothing = {"violations": wrong, "with_durable": 0, "durable": 0, "stored": 0, "beyond_durable": 0, "new_chunks": 0, "torn_tails": 0}
     with Store.open(url) as store:
-        runs = [one for one in store.runs() if one.label == f"r{number}"]
+        runs = [one for one in store.runs.all() if one.label == f"r{number}"]
         path = segment_path(segment_folder(url, SETTINGS), runs[0].id) if runs else Path("none")
         if not path.exists():  # killed before there was anything to lose
             if durable >= 0 or (runs and runs[0].visible_status != "incomplete"):
@@ -146,12 +146,12 @@ def _judge(url: str, number: int, durable: int) -> dict[str, object]:
             return nothing
         run = runs[0]
         before = read_segment(path)
-        in_database = len(store.chunks(run.id, "bar"))
+        in_database = len(store.chunks.of_run(run.id, "bar"))
         if run.visible_status != "incomplete":
             wrong.append(f"before the recovery the run looked {run.visible_status}")
         done = [one for one in recover_segments(store, SETTINGS) if one.run == run.id]
         held = read_segment(path)
-        run, chunks = store.run(str(run.id)), store.chunks(run.id)
+        run, chunks = store.runs.find(str(run.id)), store.chunks.of_run(run.id)
         samples = [sample for chunk in chunks if chunk.channel == "bar" for sample in decode_bar(chunk.payload)]
         ledger, last = ledger_of(chunks), samples[-1].seq if samples else -1
         wrong += [text for bad, text in (

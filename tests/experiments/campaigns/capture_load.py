@@ -100,8 +100,8 @@ async def _run(folder: Path, load: Load, progress: Callable[[str], None]) -> dic
     url = f"sqlite:///{folder / 'abbe.sqlite3'}"
     ledger = folder / "ledger.json"
     with Store.open(url) as store, ExitStack() as stack:
-        campaign = store.add_campaign(store.add_machine("M", {"name": "M"}), "load", {})
-        run_id = store.start_run(campaign, "r01", "ballbar_helix", "identify", {})
+        campaign = store.campaigns.add(store.machines.add("M", {"name": "M"}), "load", {})
+        run_id = store.runs.start(campaign, "r01", "ballbar_helix", "identify", {})
         box = _child(stack, "-m", "abbe.simulators.box_alone", "--link", str(folder / "box"), "--ledger", str(ledger), "--speed",
                      str(load.speed), "--spoil-every", str(load.spoil_every),
                      "--buffer-kib", str(int(64 * max(1.0, load.speed))))  # fmt: skip
@@ -183,7 +183,7 @@ def _child(stack: ExitStack, *words: str) -> subprocess.Popen[str]:
 
 def _compare(box: list[list[int | str]], store: Store, run_id: int) -> dict[str, float]:
     """Sets of sequence numbers: the box's against ours."""
-    ours = ledger_of(store.chunks(run_id))
+    ours = ledger_of(store.chunks.of_run(run_id))
     sent, lost = bytearray(), set()
     fates = {"sent": 0, "suppressed": 0, "corrupted": 0}
     for _, first, last, fate in box:

@@ -182,7 +182,7 @@ async def measured(store: Store, out: Outside, plan: CampaignPlan, tally: Tally,
         try:
             async with asyncio.timeout(600), open_session(out.site().urls) as session:
                 await recover(session.controller, store, out.site())
-                begun = any(c.name == plan.name and store.checkpoints(c.id) for c in store.campaigns())
+                begun = any(c.name == plan.name and store.checkpoints.of_campaign(c.id) for c in store.campaigns.all())
                 found = await resume(session, store, out.site(), plan, plan.name, untouched) if begun else None
                 out.control = Control()
                 manner = Manner(out.control, untouched, {}, found)
@@ -240,7 +240,7 @@ async def both(
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
         solved = []
         for name in ("peace", "disturbed"):
-            tries = [replace(plan, name=c.name) for c in store.campaigns() if c.name.partition(" ")[0] == name]
+            tries = [replace(plan, name=c.name) for c in store.campaigns.all() if c.name.partition(" ")[0] == name]
             ids = next((found for one in tries if (found := complete(store, one)) is not None), None)
             named = replace(plan, name=name if not tries else f"{name} {len(tries) + 1}")
             if ids is None:
@@ -272,11 +272,15 @@ async def both(
 
 def complete(store: Store, plan: CampaignPlan) -> list[int] | None:
     """Runs of a campaign that was measured to its end before."""
-    record = next((c for c in store.campaigns() if c.name == plan.name), None)
+    record = next((c for c in store.campaigns.all() if c.name == plan.name), None)
     if record is None:
         return None
-    status = {r.id: r.status for r in store.runs(record.id)}
-    done = {c.doc["test"]: c.doc["run"] for c in store.checkpoints(record.id) if c.kind == "done" and status[c.doc["run"]] == "complete"}
+    status = {r.id: r.status for r in store.runs.all(record.id)}
+    done = {
+        c.doc["test"]: c.doc["run"]
+        for c in store.checkpoints.of_campaign(record.id)
+        if c.kind == "done" and status[c.doc["run"]] == "complete"
+    }
     return [done[t.label] for t in plan.tests] if all(t.label in done for t in plan.tests) else None
 
 

@@ -18,7 +18,7 @@ from abbe.service.capture.settings import segment_path
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import abandon, batch, new_run, segment_bytes
 from tests.service.core.fakes import Result
 
@@ -80,20 +80,20 @@ def _shop(folder: Path) -> Shop:
     new_machine_file(folder)
     url = f"sqlite:///{folder / 'abbe.sqlite3'}"
     rng = np.random.default_rng(7)
-    with ServiceStore.open(url) as store:
-        machine_id = store.add_machine("VMC-1", {})
+    with Store.open(url) as store:
+        machine_id = store.machines.add("VMC-1", {})
         schedule = Schedule("daily", "0 5 * * *", "UTC", "quick-check")
         for day in range(40):
             at = START + timedelta(days=day)
             values = {"body_diagonal_um": 9.0 + 0.3 * max(day - 20, 0) + 0.5 * rng.normal()}
             result = Result(values=values, uncertainties={"body_diagonal_um": 1.0}, limits={"body_diagonal_um": 20.0}, started_utc=at)
-            store.keep_verification(machine_id, record.found(record.Occasion("VMC-1", schedule, at), result), [])
+            store.verifications.add_with_messages(machine_id, record.found(record.Occasion("VMC-1", schedule, at), result), [])
         book = AuditBook(store, url)
         for k in range(5):
             book.write(AuditEvent(who="user:ana", action=f"POST /thing/{k}", target="x", outcome="done 200", doc={"n": k, "why": "µm"}))
         run_id = new_run(store)
         whole = segment_bytes(run_id, [[batch(first, 25)] for first in range(0, SAMPLES, 25)])
-        store.ingest_chunks([chunk_of(one) for one in scan(whole).records if one.kind == CHUNK][:4])
+        store.chunks.ingest([chunk_of(one) for one in scan(whole).records if one.kind == CHUNK][:4])
         abandon(store, run_id)
     capture = folder / "abbe.sqlite3-capture"
     capture.mkdir()

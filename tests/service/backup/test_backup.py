@@ -81,10 +81,10 @@ def test_what_the_database_does_not_have_yet_is_in_it(shop: Shop, tmp_path: Path
     elsewhere = new_machine_file(tmp_path / "elsewhere")
     assert run(["restore", str(elsewhere), str(tmp_path / "backup")]) == 0
     with Store.open(f"sqlite:///{elsewhere.parent / 'abbe.sqlite3'}") as store:
-        assert len(store.chunks(shop.run_id, "bar")) == 4
+        assert len(store.chunks.of_run(shop.run_id, "bar")) == 4
         (done,) = recover_segments(store, CaptureSettings())
         assert done.new_chunks == 8
-        found = [sample for chunk in store.chunks(shop.run_id, "bar") for sample in decode_bar(chunk.payload)]
+        found = [sample for chunk in store.chunks.of_run(shop.run_id, "bar") for sample in decode_bar(chunk.payload)]
         assert_true(found)
         assert [one.seq for one in found] == list(range(SAMPLES))
 
@@ -102,7 +102,7 @@ def test_only_its_owner_can_read_it_and_nothing_is_overwritten(shop: Shop, tmp_p
     assert "error STO-004" in capsys.readouterr().err
     assert (target / "backup.json").read_bytes() == before
     with Store.open(shop.url) as store:
-        assert store.audit(1)[0].action == "abbe backup"
+        assert store.audit.events(1)[0].action == "abbe backup"
 
 
 def test_killed_at_any_moment_it_is_whole_or_not_there(shop: Shop, tmp_path: Path) -> None:

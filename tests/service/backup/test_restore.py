@@ -71,7 +71,10 @@ def test_a_restored_database_gives_identical_answers(
     assert "records, all there and as written" in capsys.readouterr().out
     assert answers(elsewhere, capsys) == answers(shop.machine, capsys)
     with Store.open(f"sqlite:///{elsewhere.parent / 'abbe.sqlite3'}") as store:
-        assert [one.action for one in store.audit()][5:] == ["abbe restore", "abbe solve"]  # the copy has not the record of its making
+        assert [one.action for one in store.audit.events()][5:] == [
+            "abbe restore",
+            "abbe solve",
+        ]  # the copy has not the record of its making
 
 
 def test_a_database_in_use_is_left_alone_even_when_it_may_be_replaced(shop: Shop, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -93,16 +96,16 @@ def test_a_database_in_use_is_left_alone_even_when_it_may_be_replaced(shop: Shop
 
 def test_an_existing_database_is_only_put_aside_when_asked(shop: Shop, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Store.open(shop.url) as store:
-        store.add_verification(1, None, "pass", {"late": True})
+        store.verifications.add(1, None, "pass", {"late": True})
     assert run(["restore", str(shop.machine), str(made)]) == 2
     assert "exists - give --replace" in capsys.readouterr().err
     assert run(["restore", str(shop.machine), str(made), "--replace", "--json"]) == 0
     aside = [Path(name) for name in json.loads(capsys.readouterr().out)["aside"]]
     old = next(path for path in aside if path.name.startswith("abbe.sqlite3.replaced-") and not path.name.endswith("-journal"))
     with Store.open(f"sqlite:///{old}") as store:
-        assert store.verifications(limit=1)[0].doc == {"late": True}
+        assert store.verifications.latest(limit=1)[0].doc == {"late": True}
     with Store.open(shop.url) as store:
-        assert len(store.verifications()) == 40
+        assert len(store.verifications.latest()) == 40
     assert (shop.folder / "abbe.sqlite3-capture" / "run-00000001.seg").exists()
     assert run(["audit", "verify", "--machine", str(shop.machine)]) == 0
 

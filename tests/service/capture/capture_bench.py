@@ -39,10 +39,10 @@ def assert_true(found: Iterable[BarSample]) -> None:
 
 
 def new_run(store: Store, label: str = "r01") -> int:
-    machine = store.add_machine("VMC-1", {"name": "VMC-1"})
-    names = {one.name: one.id for one in store.campaigns()}
-    campaign = names.get("c1") or store.add_campaign(machine, "c1", {})
-    return store.start_run(campaign, label, "ballbar_helix", "identify", {})
+    machine = store.machines.add("VMC-1", {"name": "VMC-1"})
+    names = {one.name: one.id for one in store.campaigns.all()}
+    campaign = names.get("c1") or store.campaigns.add(machine, "c1", {})
+    return store.runs.start(campaign, label, "ballbar_helix", "identify", {})
 
 
 class JumpingClock:
@@ -126,7 +126,7 @@ class BrokenDisk(RealFileIO):
 
 def abandon(store: Store, run_id: int) -> None:
     """As if the process that writes this run had been killed."""
-    store._write(lambda connection: connection.execute(update(runs).where(runs.c.id == run_id).values(owner_start="killed")))
+    store.commit(lambda connection: connection.execute(update(runs).where(runs.c.id == run_id).values(owner_start="killed")))
 
 
 class Tape(RealFileIO):

@@ -31,9 +31,9 @@ async def main(folder: Path) -> dict[str, object]:
                     await recorder.flush()
         except DiskFull as error:
             told = str(error)
-        store.finish_run(run_id, "disk_full", told, recorder.doc())
+        store.runs.finish(run_id, "disk_full", told, recorder.doc())
         held = read_segment(recorder.log.segment.path)
-        chunks = store.chunks(run_id)
+        chunks = store.chunks.of_run(run_id)
         found = [sample for chunk in chunks if chunk.channel == "bar" for sample in decode_bar(chunk.payload)]
         assert_true(found)
         return {
@@ -43,7 +43,7 @@ async def main(folder: Path) -> dict[str, object]:
             "unaccounted": ledger_of(chunks).unaccounted(),
             "whole": held.whole,
             "closed": held.closed,
-            "status": store.run(str(run_id)).status,
+            "status": store.runs.find(str(run_id)).status,
         }
 
 

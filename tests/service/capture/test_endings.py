@@ -55,7 +55,7 @@ async def measured(store: Store, run_id: int, feed: Callable[[CaptureRecorder], 
 
 
 def seqs(store: Store, run_id: int) -> list[int]:
-    return [sample.seq for chunk in store.chunks(run_id, "bar") for sample in decode_bar(chunk.payload)]
+    return [sample.seq for chunk in store.chunks.of_run(run_id, "bar") for sample in decode_bar(chunk.payload)]
 
 
 def give(recorder: CaptureRecorder) -> None:
@@ -71,7 +71,7 @@ class FailingClose(RealFileIO):
 async def test_an_error_at_the_close_fails_the_run_and_loses_nothing(store: Store) -> None:
     failure = await measured(store, run_id := new_run(store), give, io=FailingClose())
     assert isinstance(failure, CaptureFault)
-    assert store.run(str(run_id)).status == "failed"
+    assert store.runs.find(str(run_id)).status == "failed"
     assert seqs(store, run_id) == list(range(50))
 
 
@@ -81,7 +81,7 @@ async def test_a_defect_at_the_end_never_closes_a_run_that_the_database_lacks(st
     monkeypatch.setattr(log_module.CaptureLog, "close", lambda self, doc, cause: 1 / 0)
     failure = await measured(store, run_id := new_run(store), give)
     assert isinstance(failure, ZeroDivisionError)
-    assert store.run(str(run_id)).status == "running"
+    assert store.runs.find(str(run_id)).status == "running"
     assert segment_path(segment_folder(store.url, SETTINGS), run_id).exists()
 
 
@@ -95,9 +95,9 @@ async def test_numbers_that_went_back_while_the_disk_was_full_are_gaps_of_their_
 
     failure = await measured(store, run_id := new_run(store), feed)
     assert isinstance(failure, DiskFull)
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert [(gap.stream, gap.first, gap.last) for gap in ledger.gaps] == [(1, 0, 19)]
-    assert store.run(str(run_id)).status == "failed"
+    assert store.runs.find(str(run_id)).status == "failed"
 
 
 def test_a_gap_never_has_a_negative_count() -> None:
@@ -132,17 +132,17 @@ async def test_a_disk_that_hangs_at_the_close_leaves_run_and_file_to_the_next_st
     try:
         assert isinstance(failure, CaptureFault)
         assert "has not answered" in str(failure)
-        assert (store.run(str(run_id)).status, path.exists(), is_active(path)) == ("running", True, False)
+        assert (store.runs.find(str(run_id)).status, path.exists(), is_active(path)) == ("running", True, False)
         (told,) = recover_segments(store, SETTINGS)  # its thread may still write: the lock says so
         assert "still open" in told.text
-        assert store.run(str(run_id)).status == "running"
+        assert store.runs.find(str(run_id)).status == "running"
     finally:
         disk.again.set()
         seen[0].log._thread.join(10)
     seen[0].log.segment.close()
     recover_segments(store, SETTINGS)
     assert seqs(store, run_id) == list(range(100))
-    assert store.run(str(run_id)).status == "interrupted"
+    assert store.runs.find(str(run_id)).status == "interrupted"
 
 
 async def test_a_disk_that_hangs_does_not_hold_the_tap_for_ever(store: Store, monkeypatch) -> None:
@@ -161,7 +161,7 @@ async def test_a_disk_that_hangs_does_not_hold_the_tap_for_ever(store: Store, mo
 
     failure = await measured(store, run_id := new_run(store), feed, io=disk)
     assert "has not answered" in str(failure)
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert (ledger.unaccounted(), ledger.stored + sum(gap.missing for gap in ledger.gaps)) == ([], 300)
 
 
@@ -177,9 +177,9 @@ async def test_a_run_is_registered_from_before_its_file_until_it_is_closed(store
     async with recording(store, run_id, SETTINGS, SystemClock(), io=Watching()) as recorder:
         pass
     assert recover_segments(store, SETTINGS) == []  # between the end of the recording and the end of the run
-    assert store.run(str(run_id)).status == "running"
+    assert store.runs.find(str(run_id)).status == "running"
     await close_run(store, run_id, recorder, "complete", "", recorder.doc())
-    assert (seen, is_active(path), path.exists(), store.run(str(run_id)).status) == ([True], False, False, "complete")
+    assert (seen, is_active(path), path.exists(), store.runs.find(str(run_id)).status) == ([True], False, False, "complete")
 
 
 async def test_a_segment_that_somebody_writes_is_left_alone_although_its_run_looks_abandoned(store: Store) -> None:
@@ -190,7 +190,7 @@ async def test_a_segment_that_somebody_writes_is_left_alone_although_its_run_loo
         recorder.release()  # as another process sees it
         (told,) = recover_segments(store, SETTINGS)
         assert "still open" in told.text
-        assert store.run(str(run_id)).status == "running"
+        assert store.runs.find(str(run_id)).status == "running"
 
 
 async def test_cancelled_while_opening_closes_what_comes_back(store: Store) -> None:
@@ -267,15 +267,15 @@ def test_a_full_postgresql_is_full() -> None:
 def test_equal_inserts_of_two_are_looked_at_again(store: Store, monkeypatch) -> None:
     run_id = new_run(store)
     one = ChunkRecord(run_id, "bar", 0, 3, "bar/1", 1, b"abc", 1.0, 2.0, 3, 4)
-    assert store.ingest_chunks([one]) == 1
-    look, looks = store_chunks._present, []
+    assert store.chunks.ingest([one]) == 1
+    look, looks = store_chunks._stored, []
 
     def too_early(connection, given):  # as PostgreSQL: the other's row is not visible at the first look
         looks.append(1)
         return {} if len(looks) == 1 else look(connection, given)
 
-    monkeypatch.setattr(store_chunks, "_present", too_early)
-    assert store.ingest_chunks([one]) == 0
+    monkeypatch.setattr(store_chunks, "_stored", too_early)
+    assert store.chunks.ingest([one]) == 0
     assert len(looks) == 2
 
 
@@ -289,7 +289,7 @@ async def test_a_database_that_never_comes_back_is_not_waited_for(store: Store, 
     assert time.monotonic() - began_s < 10
     go.set()
     assert isinstance(failure, StoreError)
-    assert store.run(str(run_id)).status == "running"
+    assert store.runs.find(str(run_id)).status == "running"
 
 
 async def test_a_segment_of_another_database_with_the_same_run_and_label_is_not_taken_over(tmp_path: Path) -> None:
@@ -305,4 +305,4 @@ async def test_a_segment_of_another_database_with_the_same_run_and_label_is_not_
         abandon(store, first)
         (told,) = recover_segments(store, settings)
         assert "belongs to no run" in told.text
-        assert store.chunks(first) == []
+        assert store.chunks.of_run(first) == []

@@ -60,7 +60,7 @@ async def test_what_one_address_left_is_taken_over_by_another(tmp_path: Path, mo
     with Store.open(written[-1]) as store:
         (told,) = recover_segments(store, SMALL)
         assert told.name == "c1/r01"
-        assert store.run("r01").status == "interrupted"
+        assert store.runs.find("r01").status == "interrupted"
 
 
 @pytest.mark.parametrize("spool", ["", "spool"])

@@ -117,20 +117,20 @@ def test_every_state_after_a_power_cut_is_readable_and_loses_less_than_100_ms(tm
 
 def _recovered(store: Store, run_id: int, settings: CaptureSettings, state: bytes, durable: int, rng: random.Random) -> int:
     """Recover one state, check it, and give the last sample that is left."""
-    store._write(lambda connection: connection.exec_driver_sql("DELETE FROM chunks"))
-    store._write(lambda connection: connection.exec_driver_sql("UPDATE runs SET status = 'running'"))
+    store.commit(lambda connection: connection.exec_driver_sql("DELETE FROM chunks"))
+    store.commit(lambda connection: connection.exec_driver_sql("UPDATE runs SET status = 'running'"))
     abandon(store, run_id)
     held = scan(state)
     assert not held.broken_links
     # the database may already have had any part of what was durable
     chunks = [chunk_of(one) for one in held.records if one.kind == CHUNK and one.first_seq + one.count - 1 <= durable]
-    store.ingest_chunks(chunks[: rng.randint(0, len(chunks))])
+    store.chunks.ingest(chunks[: rng.randint(0, len(chunks))])
     (done,) = recover_segments(store, settings)
     assert done.run == run_id
-    assert store.run(str(run_id)).status == "interrupted"
-    found = [sample for chunk in store.chunks(run_id, "bar") for sample in decode_bar(chunk.payload)]
+    assert store.runs.find(str(run_id)).status == "interrupted"
+    found = [sample for chunk in store.chunks.of_run(run_id, "bar") for sample in decode_bar(chunk.payload)]
     assert_true(found)
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert ledger.unaccounted() == []
     assert ledger.twice() == 0
     last = found[-1].seq if found else -1

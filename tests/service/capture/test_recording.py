@@ -50,7 +50,7 @@ async def many(recorder: CaptureRecorder, total: int, *, until_refused: bool = F
 
 
 def stored(store: Store, run_id: int):
-    return [sample for chunk in store.chunks(run_id, "bar") for sample in decode_bar(chunk.payload)]
+    return [sample for chunk in store.chunks.of_run(run_id, "bar") for sample in decode_bar(chunk.payload)]
 
 
 async def test_every_sample_is_in_the_segment_and_in_the_database_and_the_ledger_says_so(store: Store) -> None:
@@ -83,9 +83,9 @@ async def test_every_sample_is_in_the_segment_and_in_the_database_and_the_ledger
     assert held.closed
     assert [record.kind for record in held.records][0 :: len(held.records) - 1] == [OPEN, CLOSE]
     assert held.head.hex() == doc["capture"]["head_sha256"]
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert (ledger.stored, ledger.unaccounted(), ledger.twice(), len(ledger.gaps)) == (140, [], 0, 1)
-    assert decode_json(store.chunks(run_id, "laser")[0].payload) == [{"host_s": 1.0, "ctrl_us": 7, "displacement_tenth_nm": 5}]
+    assert decode_json(store.chunks.of_run(run_id, "laser")[0].payload) == [{"host_s": 1.0, "ctrl_us": 7, "displacement_tenth_nm": 5}]
 
 
 async def test_a_segment_is_deleted_when_the_database_has_everything(store: Store) -> None:
@@ -103,7 +103,7 @@ async def test_two_streams_of_a_run_are_two_streams_of_its_ledger(store: Store) 
     async with recording(store, run_id, KEEP, SystemClock()) as recorder:
         recorder.tap().take(batch(0, 30))
         recorder.tap().take(batch(5, 30, missing=5))
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert ledger.stored_spans(0) == [(0, 29)]
     assert ledger.stored_spans(1) == [(5, 34)]
     assert [(gap.stream, gap.first, gap.last, gap.before_us) for gap in ledger.gaps] == [(1, 0, 4, None)]
@@ -143,7 +143,7 @@ async def test_the_database_gets_many_chunks_in_one_transaction_and_the_end_wait
     monkeypatch.setattr(ingest_module, "TOGETHER_S", 3600.0)
     monkeypatch.setattr(ingest_module, "BATCH", 8)
     given = []
-    monkeypatch.setattr(store, "ingest_chunks", lambda chunks, give=store.ingest_chunks: (given.append(len(chunks)), give(chunks)))
+    monkeypatch.setattr(store.chunks, "ingest", lambda chunks, give=store.chunks.ingest: (given.append(len(chunks)), give(chunks)))
     run_id = new_run(store)
     async with asyncio.timeout(within(60)), recording(store, run_id, KEEP, SystemClock()) as recorder:
         tap = recorder.tap()
@@ -158,13 +158,13 @@ async def test_the_database_gets_many_chunks_in_one_transaction_and_the_end_wait
 def test_the_same_chunk_again_is_accepted_and_another_one_refused(store: Store) -> None:
     run_id = new_run(store)
     one = ChunkRecord(run_id, "bar", 0, 3, "bar/1", 1, b"abc", 1.0, 2.0, 3, 4)
-    assert store.ingest_chunks([one]) == 1
-    assert store.ingest_chunks([one]) == 0
+    assert store.chunks.ingest([one]) == 1
+    assert store.chunks.ingest([one]) == 0
     other = ChunkRecord(run_id, "bar", 0, 3, "bar/1", 1, b"abd", 1.0, 2.0, 3, 4)
     new = ChunkRecord(run_id, "bar", 1, 3, "bar/1", 1, b"abd", 1.0, 2.0, 3, 4)
     with pytest.raises(CaptureConflict, match="other content"):
-        store.ingest_chunks([new, other])
-    assert store.chunk_keys(run_id) == {("bar", 0): 1}
+        store.chunks.ingest([new, other])
+    assert store.chunks.crcs(run_id) == {("bar", 0): 1}
 
 
 async def test_utc_jumps_of_a_year_change_no_sample(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ async def test_utc_jumps_of_a_year_change_no_sample(tmp_path: Path) -> None:
                 for first in range(0, 400, 40):
                     tap.take(batch(first, 40))
                     await recorder.flush()
-            payloads.append([(c.first_device_us, c.last_device_us, c.first_host_s, c.payload) for c in store.chunks(run_id, "bar")])
+            payloads.append([(c.first_device_us, c.last_device_us, c.first_host_s, c.payload) for c in store.chunks.of_run(run_id, "bar")])
             records = read_segment(recorder.log.segment.path).records
             offsets.append({round(record.utc_offset_s) for record in records if record.kind == CHUNK})
     assert payloads[0] == payloads[1]
@@ -206,7 +206,7 @@ async def test_what_comes_after_the_disk_is_full_is_an_explicit_gap(store: Store
     run_id = new_run(store)
     with pytest.raises(DiskFull):
         await record(store, run_id, lambda r: many(r, 5000), [], io=SmallDisk(67_000))
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert ledger.unaccounted() == []
     assert ledger.stored + sum(gap.missing for gap in ledger.gaps) == 5000
     assert "no space" in ledger.gaps[-1].cause
@@ -244,7 +244,7 @@ async def test_an_error_of_the_disk_is_fatal_for_the_file_and_never_tried_again(
 
 async def test_a_chunk_that_contradicts_the_database_stops_the_run(store: Store) -> None:
     run_id = new_run(store)
-    store.ingest_chunks([ChunkRecord(run_id, "bar", 0, 1, "bar/1", 1, b"other", 0.0, 0.0, 0, 0)])
+    store.chunks.ingest([ChunkRecord(run_id, "bar", 0, 1, "bar/1", 1, b"other", 0.0, 0.0, 0, 0)])
     with pytest.raises(CaptureConflict):
         async with recording(store, run_id, KEEP, SystemClock()) as recorder:
             recorder.tap().take(batch(0, 50))
@@ -313,7 +313,7 @@ async def test_postgresql_gets_the_same(postgres: Callable[[], str], tmp_path: P
             for first in range(0, 1000, 50):
                 tap.take(batch(first, 50))
         assert [one.seq for one in stored(store, run_id)] == list(range(1000))
-        assert store.ingest_chunks(store.chunks(run_id)) == 0
+        assert store.chunks.ingest(store.chunks.of_run(run_id)) == 0
 
 
 async def test_a_defect_in_the_capture_ends_the_run_and_blocks_nobody(store: Store) -> None:
@@ -330,7 +330,7 @@ async def test_a_defect_in_the_capture_ends_the_run_and_blocks_nobody(store: Sto
     with pytest.raises(CaptureFault, match="could not go on"):
         await record(store, run_id := new_run(store), feed, seen)
     assert [one.seq for one in stored(store, run_id)] == list(range(50))
-    assert ledger_of(store.chunks(run_id)).unaccounted() == []
+    assert ledger_of(store.chunks.of_run(run_id)).unaccounted() == []
     assert read_segment(seen[0].log.segment.path).closed
 
 
@@ -351,6 +351,6 @@ async def test_no_space_at_any_write_of_a_run(store: Store, at: int) -> None:
     if seen:
         held = read_segment(seen[0].log.segment.path)
         assert (held.whole, held.closed) == (True, True)
-        ledger = ledger_of(store.chunks(run_id))
+        ledger = ledger_of(store.chunks.of_run(run_id))
         assert ledger.stored + sum(gap.missing for gap in ledger.gaps) == 500
         assert ledger.unaccounted() == []

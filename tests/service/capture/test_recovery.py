@@ -36,14 +36,14 @@ def crashed(store: Store, folder: Path, data: bytes | None = None, *, in_databas
     """A run whose process is gone, with a segment, and the first chunks of it in the database."""
     run_id = new_run(store, label)
     whole = segment_bytes(run_id, GROUPS, label=label)
-    store.ingest_chunks([chunk_of(record) for record in scan(whole).records if record.kind == CHUNK][:in_database])
+    store.chunks.ingest([chunk_of(record) for record in scan(whole).records if record.kind == CHUNK][:in_database])
     segment_path(folder, run_id).write_bytes(whole if data is None else data)
     abandon(store, run_id)
     return run_id
 
 
 def seqs(store: Store, run_id: int) -> list[int]:
-    found = [sample for chunk in store.chunks(run_id, "bar") for sample in decode_bar(chunk.payload)]
+    found = [sample for chunk in store.chunks.of_run(run_id, "bar") for sample in decode_bar(chunk.payload)]
     assert_true(found)
     return [one.seq for one in found]
 
@@ -51,10 +51,10 @@ def seqs(store: Store, run_id: int) -> list[int]:
 @pytest.mark.parametrize("in_database", [0, 5, 12])
 def test_what_the_database_lacks_is_taken_over_and_the_run_is_marked(store: Store, folder: Path, in_database: int) -> None:
     run_id = crashed(store, folder, in_database=in_database)
-    assert store.run(str(run_id)).visible_status == "incomplete"
+    assert store.runs.find(str(run_id)).visible_status == "incomplete"
     (done,) = recover_segments(store, CaptureSettings())
     assert (done.run, done.new_chunks, done.cut_bytes) == (run_id, 12 - in_database, 0)
-    run: RunRecord = store.run("r01")
+    run: RunRecord = store.runs.find("r01")
     assert run.visible_status == "interrupted"
     assert "the process ended before the run was closed" in run.reason
     assert run.end_doc is not None
@@ -84,10 +84,10 @@ def test_damage_is_a_gap_unless_the_database_has_the_chunk(store: Store, folder:
     run_id = crashed(store, folder, bytes(whole), in_database=0)
     recover_segments(store, CaptureSettings())
     assert seqs(store, run_id) == [*range(100), *range(125, 300)]
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert [(gap.first, gap.last, gap.cause) for gap in ledger.gaps] == [(100, 124, DAMAGED)]
     assert ledger.unaccounted() == []
-    end = store.run("r01").end_doc
+    end = store.runs.find("r01").end_doc
     assert end is not None
     assert end["gaps"][0]["cause"] == DAMAGED
 
@@ -98,7 +98,7 @@ def test_damage_costs_nothing_where_the_database_was_ahead(store: Store, folder:
     run_id = crashed(store, folder, bytes(whole), in_database=6)
     recover_segments(store, CaptureSettings())
     assert seqs(store, run_id) == list(range(300))
-    assert ledger_of(store.chunks(run_id)).gaps == []
+    assert ledger_of(store.chunks.of_run(run_id)).gaps == []
 
 
 def test_every_flipped_byte_is_found_and_costs_one_record_at_the_most() -> None:
@@ -130,26 +130,26 @@ def test_exchanged_and_missing_records_break_the_chain() -> None:
 def test_a_recorded_end_that_the_database_never_heard_of(store: Store, folder: Path) -> None:
     run_id = crashed(store, folder, segment_bytes(1, GROUPS, closed=True))
     recover_segments(store, CaptureSettings())
-    assert "recorded to its end (complete)" in store.run("r01").reason
+    assert "recorded to its end (complete)" in store.runs.find("r01").reason
     assert seqs(store, run_id) == list(range(300))
 
 
 def test_a_segment_that_was_only_just_made(store: Store, folder: Path) -> None:
     run_id = crashed(store, folder, b"")
     recover_segments(store, CaptureSettings())
-    assert store.run(str(run_id)).visible_status == "interrupted"
+    assert store.runs.find(str(run_id)).visible_status == "interrupted"
 
 
 def test_runs_of_others_and_living_runs_are_left_alone(store: Store, folder: Path) -> None:
     living = new_run(store, "living")
-    store._write(lambda c: c.exec_driver_sql(f"UPDATE runs SET owner_pid = 1, owner_host = 'elsewhere' WHERE id = {living}"))
+    store.commit(lambda c: c.exec_driver_sql(f"UPDATE runs SET owner_pid = 1, owner_host = 'elsewhere' WHERE id = {living}"))
     segment_path(folder, living).write_bytes(segment_bytes(living, GROUPS))
     stranger = segment_path(folder, 99)
     stranger.write_bytes(segment_bytes(99, GROUPS))
     (said,) = recover_segments(store, CaptureSettings())
     assert "belongs to no run" in said.text
     assert segment_path(folder, living).exists()
-    assert store.run("living").status == "running"
+    assert store.runs.find("living").status == "running"
     assert stranger.with_suffix(".orphan").exists()
 
 
@@ -158,8 +158,8 @@ def test_another_database_with_the_same_numbers(store: Store, folder: Path) -> N
     segment_path(folder, run_id).write_bytes(segment_bytes(run_id, GROUPS))  # it says that it is r01
     abandon(store, run_id)
     recover_segments(store, CaptureSettings())
-    assert store.chunks(run_id) == []
-    assert store.run("other").status == "running"
+    assert store.chunks.of_run(run_id) == []
+    assert store.runs.find("other").status == "running"
 
 
 def test_a_contradiction_is_set_aside_and_stops_nobody_else(store: Store, folder: Path, tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_contradiction_is_set_aside_and_stops_nobody_else(store: Store, folder
     next_id = crashed(store, folder, label="r02")
     bad, good = recover_segments(store, CaptureSettings())
     assert "CAP-003" in bad.text
-    assert "chunk 1 of channel 'bar'" in store.run(str(run_id)).reason
-    assert (store.run(str(run_id)).status, (good.run, good.new_chunks)) == ("interrupted", (next_id, 12))
+    assert "chunk 1 of channel 'bar'" in store.runs.find(str(run_id)).reason
+    assert (store.runs.find(str(run_id)).status, (good.run, good.new_chunks)) == ("interrupted", (next_id, 12))
     assert segment_path(folder, run_id).with_suffix(".conflict").exists()
     assert recover_segments(store, CaptureSettings()) == []

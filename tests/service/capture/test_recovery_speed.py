@@ -38,9 +38,9 @@ def test_ready_within_two_seconds_of_work(tmp_path: Path) -> None:
         for number in range(RUNS):
             run_id = new_run(store, f"r{number}")
             for at in range(0, count, 4000):
-                store.ingest_chunks([chunk_of(one) for one in chunks(run_id, at, min(at + 4000, count))])
+                store.chunks.ingest([chunk_of(one) for one in chunks(run_id, at, min(at + 4000, count))])
             if number < RUNS - 1:
-                store.finish_run(run_id, "complete", "", {})
+                store.runs.finish(run_id, "complete", "", {})
         abandon(store, run_id)
     tape = Tape()
     segment, drafter = Segment(tape, Path("x")), Drafter(run_id, lambda: 0.0)
@@ -53,7 +53,7 @@ def test_ready_within_two_seconds_of_work(tmp_path: Path) -> None:
     with Store.open(url) as store:
         (done,) = recover_segments(store, CaptureSettings())
         cpu_s, wall_s = time.process_time() - cpu_s, time.perf_counter() - wall_s
-        assert store.run(str(run_id)).end_doc["capture"]["stored_valid"] == (count + BEHIND) * PER_CHUNK
+        assert store.runs.find(str(run_id)).end_doc["capture"]["stored_valid"] == (count + BEHIND) * PER_CHUNK
     print(f"{SAMPLES} samples, {SAMPLES // RUNS} of them in the open run: {cpu_s:.2f} s of CPU, {wall_s:.2f} s")  # noqa: T201
     assert done.new_chunks == BEHIND
     assert cpu_s < 2.0 * SAMPLES / 10_000_000 + 0.2

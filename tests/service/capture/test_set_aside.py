@@ -44,7 +44,7 @@ def spoiled(piece: bytes) -> bytes:
 @pytest.mark.parametrize("in_database", [11, 12])
 def test_a_closed_runs_segment_is_deleted_only_if_the_database_has_all_of_it(store: Store, folder: Path, in_database: int) -> None:  # noqa: F811
     run_id = crashed(store, folder, in_database=in_database)
-    store.finish_run(run_id, "failed", "somebody closed it", {})
+    store.runs.finish(run_id, "failed", "somebody closed it", {})
     told = recover_segments(store, PLAIN)
     kept = segment_path(folder, run_id).with_suffix(".orphan")
     assert kept.exists() == (in_database == 11)
@@ -76,8 +76,8 @@ def test_a_segment_of_a_newer_version_is_neither_cut_nor_closed(store: Store, fo
     (told,) = recover_segments(store, PLAIN)
     assert "made by a newer version" in told.text
     assert path.read_bytes() == b"".join(parts)
-    assert store.run(str(run_id)).status == "running"
-    assert store.chunks(run_id) == []
+    assert store.runs.find(str(run_id)).status == "running"
+    assert store.chunks.of_run(run_id) == []
 
 
 def test_a_tail_is_copied_before_it_is_cut(store: Store, folder: Path) -> None:  # noqa: F811
@@ -85,7 +85,7 @@ def test_a_tail_is_copied_before_it_is_cut(store: Store, folder: Path) -> None: 
     run_id = crashed(store, folder, whole + b"half a record")
     recover_segments(store, PLAIN)
     assert segment_path(folder, run_id).with_suffix(".tail").read_bytes() == b"half a record"
-    (gap,) = ledger_of(store.chunks(run_id)).gaps
+    (gap,) = ledger_of(store.chunks.of_run(run_id)).gaps
     assert (gap.first, gap.last, gap.cause) == (300, None, TORN)
 
 
@@ -100,7 +100,7 @@ def test_an_acknowledged_last_chunk_that_is_damaged_is_known_from_the_end_of_the
     parts[12] = spoiled(parts[12])
     run_id = crashed(store, folder, b"".join(parts))
     recover_segments(store, PLAIN)
-    (gap,) = ledger_of(store.chunks(run_id)).gaps
+    (gap,) = ledger_of(store.chunks.of_run(run_id)).gaps
     assert (gap.first, gap.last, gap.cause) == (275, 299, DAMAGED)
     assert segment_path(folder, run_id).with_suffix(".damaged").read_bytes() == b"".join(parts)
 
@@ -111,17 +111,17 @@ def test_gaps_of_the_recovery_get_numbers_that_neither_segment_nor_database_has(
     records = scan(b"".join(parts)).records
     gaps = [k for k, one in enumerate(records) if one.channel == "gaps"]
     run_id = crashed(store, folder, b"".join([*parts[: gaps[1]], spoiled(parts[gaps[1]]), *parts[gaps[1] + 1 :]]))
-    store.ingest_chunks([chunk_of(records[gaps[1]])])  # the database has the gap that is damaged here
+    store.chunks.ingest([chunk_of(records[gaps[1]])])  # the database has the gap that is damaged here
     lost = next(k for k, one in enumerate(records) if one.first_seq == 55 and one.kind == CHUNK)
     path = segment_path(folder, run_id)
     data = bytearray(path.read_bytes())
     data[sum(len(one) for one in parts[:lost]) + 150] ^= 1
     path.write_bytes(data)
     recover_segments(store, PLAIN)
-    ledger = ledger_of(store.chunks(run_id))
+    ledger = ledger_of(store.chunks.of_run(run_id))
     assert sorted((gap.first, gap.last) for gap in ledger.gaps) == [(25, 29), (55, 79), (80, 84)]
     assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
-    end = store.run(str(run_id)).end_doc
+    end = store.runs.find(str(run_id)).end_doc
     assert end is not None
     assert (end["capture"]["unaccounted"], end["capture"]["in_gaps"]) == (0, 35)
 
@@ -135,7 +135,7 @@ def test_a_damaged_beginning_of_a_second_stream_is_a_gap_of_that_stream(store: S
     parts = pieces(b"".join(data for operation, data in tape.operations if operation == "append"))
     run_id = crashed(store, folder, b"".join([*parts[:2], spoiled(parts[2]), parts[3]]))
     recover_segments(store, PLAIN)
-    end = store.run(str(run_id)).end_doc
+    end = store.runs.find(str(run_id)).end_doc
     assert end is not None
     assert [(gap["stream"], gap["first"], gap["last"]) for gap in end["gaps"]] == [(1, 0, 39)]
     assert end["capture"]["unaccounted"] == 0
@@ -159,8 +159,8 @@ def test_bad_segments_stop_neither_the_others_nor_the_machine(store: Store, fold
     told = {one.run: one for one in recover_segments(store, PLAIN)}
     assert "the name of no segment" in told[0].text
     assert (folder / "notes.conflict").exists()
-    assert "Input/output error" in store.run(str(unreadable)).reason
-    assert {store.run(str(one)).status for one in (unreadable, senseless, good)} == {"interrupted"}
+    assert "Input/output error" in store.runs.find(str(unreadable)).reason
+    assert {store.runs.find(str(one)).status for one in (unreadable, senseless, good)} == {"interrupted"}
     assert segment_path(folder, unreadable).with_suffix(".conflict").exists()
     assert segment_path(folder, senseless).with_suffix(".conflict").exists()
     assert seqs(store, good) == list(range(300))
@@ -175,9 +175,9 @@ def test_only_one_recovers_at_a_time(store: Store, folder: Path, monkeypatch) ->
     (told,) = recover_segments(store, PLAIN)
     os.close(other)
     assert "another process" in told.text
-    assert store.run(str(run_id)).status == "running"
+    assert store.runs.find(str(run_id)).status == "running"
     recover_segments(store, PLAIN)
-    assert store.run(str(run_id)).status == "interrupted"
+    assert store.runs.find(str(run_id)).status == "interrupted"
 
 
 CUT = """

@@ -40,14 +40,14 @@ def tell(*words: str) -> str:
 
 async def recorded(url: str, *, finish: bool) -> None:
     with Store.open(url) as store:
-        campaign = store.add_campaign(store.add_machine("VMC-1", {"name": "VMC-1"}), "c1", {})
-        run_id = store.start_run(campaign, "r01", "ballbar_helix", "identify", START)
+        campaign = store.campaigns.add(store.machines.add("VMC-1", {"name": "VMC-1"}), "c1", {})
+        run_id = store.runs.start(campaign, "r01", "ballbar_helix", "identify", START)
         async with recording(store, run_id, SMALL, SystemClock(), {"label": "r01"}) as recorder:
             tap = recorder.tap()
             tap.take(batch(0, 50))
             tap.take(batch(60, 40, missing=10, status=8 | 1))
         if finish:
-            store.finish_run(run_id, "complete", "", recorder.doc())
+            store.runs.finish(run_id, "complete", "", recorder.doc())
             recorder.discard()
         else:
             recorder.release()
@@ -79,8 +79,8 @@ async def test_a_run_that_was_cut_off_before_and_after_the_recovery(url: str) ->
 async def two_streams(url: str, *, finish: bool, told: bool) -> None:
     """Two streams of which the second begins behind the first one's end, since its beginning was damaged: no number goes back."""
     with Store.open(url) as store:
-        campaign = store.add_campaign(store.add_machine("VMC-1", {"name": "VMC-1"}), "c1", {})
-        run_id = store.start_run(campaign, "r01", "ballbar_helix", "identify", START)
+        campaign = store.campaigns.add(store.machines.add("VMC-1", {"name": "VMC-1"}), "c1", {})
+        run_id = store.runs.start(campaign, "r01", "ballbar_helix", "identify", START)
         async with recording(store, run_id, SMALL, SystemClock(), {"label": "r01"}) as recorder:
             recorder.tap().take(batch(0, 50))
             recorder.tap().take(batch(60, 40, missing=60))
@@ -92,7 +92,7 @@ async def two_streams(url: str, *, finish: bool, told: bool) -> None:
         doc = recorder.doc()
         if not told:
             del doc["capture"]["streams"]
-        store.finish_run(run_id, "complete", "", doc)
+        store.runs.finish(run_id, "complete", "", doc)
         recorder.discard()
 
 
@@ -100,7 +100,7 @@ async def two_streams(url: str, *, finish: bool, told: bool) -> None:
 async def test_which_streams_a_run_has_it_says_itself(url: str, finish: bool) -> None:
     await two_streams(url, finish=finish, told=True)
     with Store.open(url) as store:
-        assert store.run("r01").end_doc["capture"]["streams"] == [[0, 0, 0], [1, 1, 1]]
+        assert store.runs.find("r01").end_doc["capture"]["streams"] == [[0, 0, 0], [1, 1, 1]]
     shown = tell("show", "r01", "--db", url)
     assert re.search(r"streams +2 *\n", shown)
     assert "60 in 1 gaps" in shown

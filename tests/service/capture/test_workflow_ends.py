@@ -61,7 +61,7 @@ async def test_a_listened_run_whose_samples_the_database_lacks_stays_open(store:
     monkeypatch.setattr(ingest_module.Ingest, "_give", lambda self, records: go.wait(within(20)))
 
     async def begin(*words: object) -> tuple[int, int]:
-        return store.add_campaign(store.add_machine("VMC-1", {}), "c", {}), 0
+        return store.campaigns.add(store.machines.add("VMC-1", {}), "c", {}), 0
 
     async def document(*words: object) -> dict[str, object]:
         return {}
@@ -78,6 +78,6 @@ async def test_a_listened_run_whose_samples_the_database_lacks_stays_open(store:
     with pytest.raises(StoreError, match="did not take all samples"):
         await listen_campaign.listen(None, store, SITE, SimpleNamespace(name="c", tests=(test,)), print)  # type: ignore[arg-type]
     go.set()
-    (run,) = store.runs()
+    (run,) = store.runs.all()
     assert run.status == "running"
     assert segment_path(Path(f"{store.url.removeprefix('sqlite:///')}-capture"), run.id).exists()

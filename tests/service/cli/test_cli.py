@@ -171,13 +171,13 @@ def test_incomplete_run_is_listed_as_such(abbe: Abbe) -> None:
     program = (
         "from abbe.service.storage.store import Store\n"
         "s = Store.open()\n"
-        "s.start_run(s.add_campaign(s.add_machine('m', {}), 'c1', {}), 'r01', 'ballbar_helix', 'identify', {})\n"
+        "s.runs.start(s.campaigns.add(s.machines.add('m', {}), 'c1', {}), 'r01', 'ballbar_helix', 'identify', {})\n"
         "import os; os._exit(9)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 9
     assert json.loads(abbe("runs", "--json").out)[0]["status"] == "incomplete"
     with Store.open() as store:
-        assert store.run("r01").status == "running"
+        assert store.runs.find("r01").status == "running"
 
 
 def test_schema_writes_where_it_is_told(abbe: Abbe, tmp_path: Path) -> None:

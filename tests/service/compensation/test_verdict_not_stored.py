@@ -30,7 +30,7 @@ WORDS = {True: "the table is kept and in force: as decided", False: "the table i
 async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool) -> None:
     path = tmp_path / "abbe.sqlite3"
     with Store.open(f"sqlite:///{path}") as store:
-        store.add_campaign(store.add_machine("sim", {}), "verify-after-push-1", {})
+        store.campaigns.add(store.machines.add("sim", {}), "verify-after-push-1", {})
         site = SimpleNamespace(name="sim", doc={})
         bench = SimpleNamespace(
             session=SimpleNamespace(controller=None), store=store, site=site, clock=None, attended=True, control=Control()
@@ -53,7 +53,7 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
         work = Work(cast("Any", bench), cast("Any", held), None, None, AFTER)
         monkeypatch.setattr(correct, "Pushing", Decided)
         await correct._push_and_verify(work, cast("Any", None))
-        (stored,) = store.verifications()
+        (stored,) = store.verifications.latest()
         assert stored.verdict == ("pass" if kept else "fail")
         with closing(sqlite3.connect(path)) as raw:
             raw.execute("ALTER TABLE verifications RENAME TO away")

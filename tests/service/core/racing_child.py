@@ -6,17 +6,17 @@ import json
 import sys
 from datetime import UTC, datetime, timedelta
 
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 
 FIRST = datetime(2026, 6, 1, tzinfo=UTC)
 
 
 def main() -> None:
-    with ServiceStore.open(sys.argv[1]) as store:
+    with Store.open(sys.argv[1]) as store:
         sys.stdout.write("ready\n")
         sys.stdout.flush()
         sys.stdin.readline()
-        won = [n for n in range(int(sys.argv[2])) if store.claim_slot("mill-7/weekly", FIRST + timedelta(minutes=n))]
+        won = [n for n in range(int(sys.argv[2])) if store.slots.claim("mill-7/weekly", FIRST + timedelta(minutes=n))]
         sys.stdout.write(json.dumps(won) + "\n")
         sys.stdout.flush()
         sys.stdin.readline()  # the parent looks at the open slots while this process lives, and once it is gone

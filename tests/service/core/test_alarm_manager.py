@@ -35,9 +35,9 @@ from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Du
 from abbe.service.scheduler.job import carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import SlotState
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.storage.store import Store
 from abbe.service.tables.push_outcome import by_journal, open_push
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of
@@ -68,14 +68,14 @@ Investigate = Callable[[Alarm, Note, ProgressSink, Control], Awaitable[None]]
 class Bench:
     """A real scheduler, book of jobs, desk and database; what an follow_up does is told by each test."""
 
-    store: ServiceStore
+    store: Store
     url: str
     clock: FakeClock = field(default_factory=lambda: FakeClock(NOON))
     investigate: Investigate | None = None
     push: Callable[[PushOrder], Awaitable[JobOutcome]] | None = None
 
     def __post_init__(self) -> None:
-        self.machine = self.store.add_machine("mill-7", {"name": "mill-7"})
+        self.machine = self.store.machines.add("mill-7", {"name": "mill-7"})
         duties = Duties(0.0, "identification", self._investigate, self._push)
         self.desk = AlarmManager(
             self.store, self.clock, "mill-7", [YEARLY], duties, AlarmChannels(None, lambda: None, AuditBook(self.store, self.url))
@@ -119,11 +119,11 @@ class Bench:
         return alarms_of(self.store, "mill-7")[0]
 
     def lines(self) -> list[AlarmEntryRecord]:
-        return self.store.alarm_entries("mill-7")
+        return self.store.alarms.entries("mill-7")
 
     async def journal(self, *states: Push, push: int = 1, **more: Any) -> None:
         """What the push machine writes on its way, by its own book: the rules of the order and of the chain hold."""
-        table = self.store.add_table(self.machine, None, b"image", 7, {"proposal": 4})
+        table = self.store.tables.add(self.machine, None, b"image", 7, {"proposal": 4})
         book = await StoreBook.new(self.store, "mill-7", self.clock)
         entries: tuple[Any, ...] = ()
         for state in states:
@@ -142,13 +142,13 @@ class Bench:
 @pytest.fixture
 async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         yield Bench(store, url)
 
 
 @pytest.fixture
 async def running(bench: Bench) -> AsyncIterator[Bench]:
-    bench.store.add_alarm_entry("mill-7", None, 0, "raised", RAISED, [])
+    bench.store.alarms.append("mill-7", None, 0, "raised", RAISED, [])
     async with asyncio.TaskGroup() as tasks:
         timetable = tasks.create_task(bench.scheduler.run())
         yield bench
@@ -209,7 +209,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
             raise
 
     running.investigate = deaf
-    running.store.add_alarm_entry("mill-7", 1, running.alarm().last_seq + 1, "held", RAISED, [])
+    running.store.alarms.append("mill-7", 1, running.alarm().last_seq + 1, "held", RAISED, [])
     await running.until(lambda: running.alarm().work[-1].kind is AlarmKind.BEGUN)
     assert (await running.steer("abort"))[0] == "done"  # at once: nothing of the work looks at the control
     await running.until(lambda: len(running.jobs("done: failed")) == 2)
@@ -473,7 +473,7 @@ async def test_what_is_open_by_the_journal(bench: Bench) -> None:
 
 async def test_after_a_kill_the_next_start_says_it_by_the_journal(bench: Bench) -> None:
     doc = {"proposal": 4, "approval": 9, "text": "proposal 4 is being pushed"}  # as releases before this one wrote it
-    bench.store.add_alarm_entry("mill-7", NO_ALARM, 0, "pushing", doc, [])
+    bench.store.alarms.append("mill-7", NO_ALARM, 0, "pushing", doc, [])
     await bench.journal(*KEPT)
     await bench.desk.due()
     last = bench.lines()[-1].doc

@@ -18,6 +18,7 @@ from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
@@ -25,9 +26,8 @@ from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import Checks, carry_out
 from abbe.service.scheduler.retrying_store import StoreShelf
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
-from abbe.service.storage.base import utc_text
+from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, open_alarms, series_begins
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
@@ -107,9 +107,9 @@ def test_other_recipes_and_checks_that_cannot_be_judged_say_nothing() -> None:
 class Bench:
     """Job, shelf and desk on a store, with a check that gives what the test wants."""
 
-    def __init__(self, store: ServiceStore, url: str, push: bool = False) -> None:
+    def __init__(self, store: Store, url: str, push: bool = False) -> None:
         self.store, self.clock, self.watcher = store, FakeClock(START), FakeWatcher()
-        self.machine_id = store.add_machine("mill-7", {})
+        self.machine_id = store.machines.add("mill-7", {})
         self.asked: list[Alarm] = []
         self.trouble: Exception | None = None
         self.outcome: Result | Exception = result(0)
@@ -140,7 +140,7 @@ class Bench:
         return state.reason
 
     def told(self) -> list[tuple[str, int]]:
-        rows = [json.loads(m.payload) for m in self.store.outbox_pending() if m.topic == TOPICS[1]]
+        rows = [json.loads(m.payload) for m in self.store.outbox.pending() if m.topic == TOPICS[1]]
         return [(row["code"], row.get("alarm", 0)) for row in rows]
 
     async def follow_up(self) -> str:
@@ -162,7 +162,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.fixture
 def bench(url: str) -> Iterator[Bench]:
-    with ServiceStore.open(url, utcnow=lambda: START + timedelta(days=1, hours=1)) as store:
+    with Store.open(url, utcnow=lambda: START + timedelta(days=1, hours=1)) as store:
         yield Bench(store, url)
 
 
@@ -181,7 +181,7 @@ async def test_raised_held_acknowledged_cleared_with_messages_and_audit(bench: B
     assert (await bench.check(result(3, 9.1))).startswith("alarm 1 cleared")
     assert open_alarms(bench.store, "mill-7") == []
     assert bench.told() == [("ALM-001", 1), ("DRV-002", 0), ("ALM-002", 1)]
-    assert [(r.target, r.outcome) for r in bench.store.audit()] == [("mill-7, alarm 1", "raised"), ("mill-7, alarm 1", "cleared")]
+    assert [(r.target, r.outcome) for r in bench.store.audit.events()] == [("mill-7, alarm 1", "raised"), ("mill-7, alarm 1", "cleared")]
 
 
 async def test_an_investigation_is_asked_for_once_and_a_failure_once_more(bench: Bench) -> None:
@@ -218,10 +218,10 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
     await bench.follow_up()
     at = START + timedelta(days=1, hours=3)
     entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="KEEP", doc={}, utc=utc_text(at), prev=GENESIS, digest="d" * 64)
-    bench.store.add_push_entry(entry)
+    bench.store.pushes.append(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq
-    bench.store.add_alarm_entry("mill-7", 1, last + 1, "pushed", {"word": "kept", "proposal": 1, "text": "proposal 1 kept"})
+    bench.store.alarms.append("mill-7", 1, last + 1, "pushed", {"word": "kept", "proposal": 1, "text": "proposal 1 kept"})
     follow_up = await bench.desk.due()
     assert follow_up is not None
     assert (follow_up.name, follow_up.schedule.recipe, follow_up.job) == ("daily (after push)", "quick-check", None)
@@ -235,27 +235,27 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
 
 
 async def test_a_push_that_the_service_did_not_survive_is_said_and_not_begun_again(url: str) -> None:
-    with ServiceStore.open(url) as store:
-        store.add_alarm_entry("mill-7", NO_ALARM, 0, "pushing", {"proposal": 7, "approval": 1, "text": "proposal 7 is being pushed"})
+    with Store.open(url) as store:
+        store.alarms.append("mill-7", NO_ALARM, 0, "pushing", {"proposal": 7, "approval": 1, "text": "proposal 7 is being pushed"})
         bench = Bench(store, url, push=True)
         assert await bench.follow_up() == ""
-        begun, ended = store.alarm_entries("mill-7")
+        begun, ended = store.alarms.entries("mill-7")
         assert (begun.kind, ended.kind, ended.doc["word"]) == ("pushing", "pushed", "failed")
         assert ended.doc["text"].startswith("proposal 7 failed: the service ended before anything was written")
         assert bench.told() == [("ALM-006", 0)]
         assert await bench.follow_up() == ""
-        assert len(store.alarm_entries("mill-7")) == 2
+        assert len(store.alarms.entries("mill-7")) == 2
 
 
 def test_a_line_on_old_knowledge_is_refused(bench: Bench) -> None:
-    bench.store.add_alarm_entry("mill-7", None, 0, "raised", {})
-    bench.store.add_alarm_entry("mill-7", 1, 1, "held", {})
+    bench.store.alarms.append("mill-7", None, 0, "raised", {})
+    bench.store.alarms.append("mill-7", 1, 1, "held", {})
     with pytest.raises(StoreError, match="alarm 1 of mill-7 was changed by somebody else"):
-        bench.store.add_alarm_entry("mill-7", 1, 1, "cleared", {})
-    assert bench.store.add_alarm_entry("mill-7", NO_ALARM, 0, "pushing", {}).alarm == NO_ALARM
-    assert bench.store.add_alarm_entry("mill-7", None, 0, "raised", {}).alarm == 2
-    assert bench.store.add_alarm_entry("mill-8", None, 0, "raised", {}).alarm == 1
-    assert [e.kind for e in bench.store.alarm_entries("mill-7")] == ["raised", "held", "pushing", "raised"]
+        bench.store.alarms.append("mill-7", 1, 1, "cleared", {})
+    assert bench.store.alarms.append("mill-7", NO_ALARM, 0, "pushing", {}).alarm == NO_ALARM
+    assert bench.store.alarms.append("mill-7", None, 0, "raised", {}).alarm == 2
+    assert bench.store.alarms.append("mill-8", None, 0, "raised", {}).alarm == 1
+    assert [e.kind for e in bench.store.alarms.entries("mill-7")] == ["raised", "held", "pushing", "raised"]
 
 
 FILE = """
@@ -273,7 +273,7 @@ url = "sqlite:///abbe.sqlite3"
 async def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     machine, url = tmp_path / "machine.toml", f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
     machine.write_text(FILE)
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         assert run(["alarm", "list", str(machine)]) == 0
         assert "no alarm of mill-7 is open" in capsys.readouterr().out
         await Bench(store, url).check(result(0, 25.0))

@@ -19,8 +19,8 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MachineInUse, StillActive, StoreError
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, State
+from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import ALLOWED, Permission, Role
@@ -163,15 +163,15 @@ async def test_the_end_stops_a_job_by_hand(bench: Bench) -> None:
 
 
 def test_rights_are_those_of_the_role_today(tmp_path: Path) -> None:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         people = People(store, FakeClock(NOON), Passwords(memory_kib=64, passes=1))
         for role in Role:
             people.add(f"a-{role}", role, "correct horse battery staple")
             for who in (f"user:a-{role}", f"token:a-{role}/ci"):
                 assert may_measure(store, who) == (Permission.MEASURE in ALLOWED[role]), who
-        strange = store.user("a-metrologist")
+        strange = store.people.find("a-metrologist")
         assert strange is not None
-        store.change_user(strange.id, role="king")
+        store.people.change(strange.id, role="king")
         people.disable("a-operator")
         for who in ("user:a-operator", "user:nobody", "anonymous", "", "a-metrologist", "system:a-metrologist"):
             assert not may_measure(store, who), who

@@ -26,8 +26,8 @@ from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.errors import StoreError, TableMismatch
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control, Prompts
+from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
@@ -39,7 +39,7 @@ BAR, LASER = "hang in the bar", "set up the laser"
 class Bench:
     """A real store, book, scheduler, board and audit; the campaign asks for a bar and a laser and ends as it is told to."""
 
-    store: ServiceStore
+    store: Store
     audit: AuditBook
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
     orders: list[CampaignOrder] = field(default_factory=list)
@@ -113,13 +113,13 @@ class Bench:
         return await self.ended()
 
     def recorded(self) -> list[tuple[str, str, str]]:
-        return [(r.who, r.target, r.outcome) for r in self.store.audit() if r.action == "campaign"]
+        return [(r.who, r.target, r.outcome) for r in self.store.audit.events() if r.action == "campaign"]
 
 
 @pytest.fixture
 async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         made = Bench(store, AuditBook(store, url))
         async with asyncio.TaskGroup() as tasks:
             made.book.open(made.scheduler, tasks)

@@ -27,7 +27,7 @@ from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreSilent
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.web.core_link.core_line import QUEUE, SILENT_S, CoreLine
 from abbe.service.web.process import import_guard
 from tests.patience import within
@@ -319,7 +319,7 @@ def seen_by_others(pid: int) -> str:
 async def test_a_web_process_that_hangs_or_dies_is_replaced(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The real process: killed, then frozen; each time there is another one, and at the end there is none."""
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    ServiceStore.open(url).close()
+    Store.open(url).close()
     monkeypatch.setattr(web_process, "HANG_S", 4.0)
     monkeypatch.setenv("ABBE_MQTT__URL", "mqtt://user:secret@broker")
     with socket.create_server(("127.0.0.1", 0)) as listening:

@@ -15,7 +15,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
 from abbe.service.scheduler.retrying_store import PAUSES_S, StoreLedger, StoreShelf
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.service.core.fakes import FakeClock, Result, utc
 
 SLOT = utc(2026, 6, 1, 4)
@@ -41,34 +41,34 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def store(url: str) -> Iterator[ServiceStore]:
-    with ServiceStore.open(url) as opened:
+def store(url: str) -> Iterator[Store]:
+    with Store.open(url) as opened:
         yield opened
 
 
-def shelf_of(store: ServiceStore, posted: list[int]) -> StoreShelf:
-    return StoreShelf(store, NoWait(), ("mill-7", store.add_machine("mill-7", {})), TOPICS, lambda: posted.append(1))
+def shelf_of(store: Store, posted: list[int]) -> StoreShelf:
+    return StoreShelf(store, NoWait(), ("mill-7", store.machines.add("mill-7", {})), TOPICS, lambda: posted.append(1))
 
 
 async def test_slots_survive_the_process(url: str) -> None:
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         ledger = StoreLedger(store, NoWait(), "mill-7")
         assert await ledger.last_claimed("weekly") is None
         assert await ledger.claim("weekly", SLOT)
         await ledger.finish("weekly", SLOT, "missed: 3 days late")
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         ledger = StoreLedger(store, NoWait(), "mill-7")
         assert not await ledger.claim("weekly", SLOT)
         assert await ledger.last_claimed("weekly") == SLOT
         assert await StoreLedger(store, NoWait(), "mill-8").claim("weekly", SLOT)
 
 
-async def test_two_processes_race_for_slots(store: ServiceStore, url: str) -> None:
+async def test_two_processes_race_for_slots(store: Store, url: str) -> None:
     slots = [utc(2026, 6, 1 + day, hour) for day in range(5) for hour in range(20)]
     won: list[list[bool]] = [[], []]
-    with ServiceStore.open(url) as other:
+    with Store.open(url) as other:
         threads = [
-            threading.Thread(target=lambda s=s, w=w: w.extend(s.claim_slot("m/weekly", slot) for slot in slots))
+            threading.Thread(target=lambda s=s, w=w: w.extend(s.slots.claim("m/weekly", slot) for slot in slots))
             for s, w in zip((store, other), won, strict=True)
         ]
         for thread in threads:
@@ -78,47 +78,47 @@ async def test_two_processes_race_for_slots(store: ServiceStore, url: str) -> No
     assert all(a != b for a, b in zip(*won, strict=True))
 
 
-async def test_a_verification_and_its_message(store: ServiceStore) -> None:
+async def test_a_verification_and_its_message(store: Store) -> None:
     posted: list[int] = []
     number = await shelf_of(store, posted).keep(record.found(OCCASION, Result()))
-    (kept,) = store.verifications_of("mill-7")
+    (kept,) = store.verifications.of_machine("mill-7")
     assert (kept.id, kept.verdict, kept.campaign_id) == (number, "pass", None)
-    (row,) = store.outbox_pending()
+    (row,) = store.outbox.pending()
     assert row.topic == TOPICS[0]
     assert json.loads(row.payload) == {"verification": number, **kept.doc}
     assert posted == [1]
-    assert store.waiting_messages() == 1
-    assert store.verifications_of("mill-8") == []
+    assert store.outbox.count() == 1
+    assert store.verifications.of_machine("mill-8") == []
 
 
-async def test_a_verification_belongs_to_its_campaign(store: ServiceStore) -> None:
-    machine = store.add_machine("mill-7", {"geometry": 1})
-    campaign = store.add_campaign(machine, "check-1", {})
+async def test_a_verification_belongs_to_its_campaign(store: Store) -> None:
+    machine = store.machines.add("mill-7", {"geometry": 1})
+    campaign = store.campaigns.add(machine, "check-1", {})
     await shelf_of(store, []).keep(record.found(OCCASION, Result()))
-    (kept,) = store.verifications_of("mill-7")
+    (kept,) = store.verifications.of_machine("mill-7")
     assert (kept.campaign_id, kept.machine_id) == (campaign, machine)
 
 
-async def test_a_failed_check_brings_an_alarm(store: ServiceStore) -> None:
+async def test_a_failed_check_brings_an_alarm(store: Store) -> None:
     doc = record.failed(OCCASION, LinkDown("tcp://127.0.0.1:5021", "connect", "refused", "switch it on"), SLOT, 0.4)
     await shelf_of(store, []).keep(doc)
-    result, alarm = store.outbox_pending()
+    result, alarm = store.outbox.pending()
     assert json.loads(result.payload)["verdict"] == "cannot tell"
     assert alarm.topic == TOPICS[1]
     assert json.loads(alarm.payload)["code"] == "DRV-002"
     assert json.loads(alarm.payload)["machine"] == "mill-7"
 
 
-async def test_result_and_message_together_or_not_at_all(store: ServiceStore) -> None:
+async def test_result_and_message_together_or_not_at_all(store: Store) -> None:
     doc = record.found(OCCASION, Result())
     with pytest.raises(ValueError, match="JSON compliant"):
-        store.keep_verification(store.add_machine("mill-7", {}), doc, [("t", doc), ("t", {"x": float("nan")})])
-    assert store.verifications_of("mill-7") == []
-    assert store.outbox_pending() == []
+        store.verifications.add_with_messages(store.machines.add("mill-7", {}), doc, [("t", doc), ("t", {"x": float("nan")})])
+    assert store.verifications.of_machine("mill-7") == []
+    assert store.outbox.pending() == []
 
 
-async def test_a_store_that_fails_for_a_while(store: ServiceStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, failures = store.keep_verification, [StoreError("database is locked")] * 3
+async def test_a_store_that_fails_for_a_while(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, failures = store.verifications.add_with_messages, [StoreError("database is locked")] * 3
 
     def flaky(*args: object) -> int:
         if failures:
@@ -126,13 +126,13 @@ async def test_a_store_that_fails_for_a_while(store: ServiceStore, monkeypatch: 
         return real(*args)  # type: ignore[arg-type]
 
     shelf = shelf_of(store, [])
-    monkeypatch.setattr(store, "keep_verification", flaky)
+    monkeypatch.setattr(store.verifications, "add_with_messages", flaky)
     assert await shelf.keep(record.found(OCCASION, Result())) == 1
 
 
 async def test_a_store_that_stays_broken_is_an_error(tmp_path: Path) -> None:
     clock = NoWait()
-    store = ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}")
+    store = Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}")
     with sqlite3.connect(tmp_path / "abbe.sqlite3") as raw:
         raw.execute("DROP TABLE slots")
     with pytest.raises(StoreError):

@@ -27,8 +27,8 @@ from abbe.service.errors import StoreError
 from abbe.service.push.states import PushState, S
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
+from abbe.service.storage.store import Store
 from abbe.service.tables.push_history import KIND
 from abbe.service.tables.table_history import table_history
 from abbe.service.users.passwords import Passwords
@@ -45,7 +45,7 @@ MACHINE, OLD, NEW, OTHER = "mill-7", b"the old one", b"the new one", b"another o
 class Bench:
     """A real store, book, scheduler and audit; what brings a table back writes into the journal what it is told to."""
 
-    store: ServiceStore
+    store: Store
     audit: AuditBook
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
     orders_seen: list[BackOrder] = field(default_factory=list)
@@ -100,13 +100,13 @@ class Bench:
         return self.book.seen()[0]
 
     def recorded(self) -> list[tuple[str, str, str, str]]:
-        return [(r.who, r.action, r.outcome, r.doc["reason"]) for r in self.store.audit()]
+        return [(r.who, r.action, r.outcome, r.doc["reason"]) for r in self.store.audit.events()]
 
 
 @pytest.fixture
 async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         made = Bench(store, AuditBook(store, url))
         async with asyncio.TaskGroup() as tasks:
             made.book.open(made.scheduler, tasks)
@@ -226,7 +226,7 @@ async def test_a_service_without_a_controller_takes_no_order(bench: Bench) -> No
 
 
 def test_who_may_is_who_may_approve_today(tmp_path: Path) -> None:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         people = People(store, FakeClock(utc(2026, 6, 1, 12)), Passwords(memory_kib=64, passes=1))
         for role in Role:
             people.add(f"a-{role}", role, "correct horse battery staple")

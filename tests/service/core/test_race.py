@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.service.core import racing_child
 from tests.service.core.racing_child import FIRST
 
@@ -45,7 +45,7 @@ def hear(process: subprocess.Popen[str]) -> str:
 
 
 def test_a_thousand_slots_no_duplicate_and_none_left_open(url: str) -> None:
-    ServiceStore.open(url).close()
+    Store.open(url).close()
     racers = [child(url), child(url)]
     try:
         assert [hear(one) for one in racers] == ["ready\n", "ready\n"]
@@ -55,11 +55,11 @@ def test_a_thousand_slots_no_duplicate_and_none_left_open(url: str) -> None:
         assert sorted(won[0] + won[1]) == list(range(COUNT))
         # Each tried all of them. On SQLite the one that is first once may be first always: it holds the file while the other waits.
         racers, won = zip(*sorted(zip(racers, won, strict=True), key=lambda pair: -len(pair[1])), strict=True)
-        with ServiceStore.open(url) as store:
-            assert len(store.slots_of("mill-7/weekly", 5000)) == COUNT
-            assert store.adopt_slots("mill-7/weekly") == [], "both live: nothing is nobody's"
+        with Store.open(url) as store:
+            assert len(store.slots.latest("mill-7/weekly", 5000)) == COUNT
+            assert store.slots.adopt("mill-7/weekly") == [], "both live: nothing is nobody's"
             ran = won[0][0]
-            store.begin_slot("mill-7/weekly", FIRST + timedelta(minutes=ran))
+            store.slots.begin("mill-7/weekly", FIRST + timedelta(minutes=ran))
             racers[0].kill()
             racers[0].wait()
             adopted = _adopt_from_two(store, url)
@@ -73,11 +73,11 @@ def test_a_thousand_slots_no_duplicate_and_none_left_open(url: str) -> None:
             one.communicate()
 
 
-def _adopt_from_two(store: ServiceStore, url: str) -> list[list[tuple[str, str]]]:
+def _adopt_from_two(store: Store, url: str) -> list[list[tuple[str, str]]]:
     taken: list[list[tuple[str, str]]] = [[], []]
-    with ServiceStore.open(url) as other:
+    with Store.open(url) as other:
         threads = [
-            threading.Thread(target=lambda s=s, t=t: t.extend((one.slot_utc, one.state) for one in s.adopt_slots("mill-7/weekly")))
+            threading.Thread(target=lambda s=s, t=t: t.extend((one.slot_utc, one.state) for one in s.slots.adopt("mill-7/weekly")))
             for s, t in zip((store, other), taken, strict=True)
         ]
         for thread in threads:
@@ -88,12 +88,12 @@ def _adopt_from_two(store: ServiceStore, url: str) -> list[list[tuple[str, str]]
 
 
 def test_a_slot_that_was_given_back_is_taken_again_and_keeps_its_reason(url: str) -> None:
-    with ServiceStore.open(url) as store:
-        assert store.claim_slot("m/s", FIRST)
-        store.release_slot("m/s", FIRST)
-        (one,) = store.adopt_slots("m/s")
+    with Store.open(url) as store:
+        assert store.slots.claim("m/s", FIRST)
+        store.slots.release("m/s", FIRST)
+        (one,) = store.slots.adopt("m/s")
         assert (one.state, one.finished_utc) == ("released", None)
-        store.finish_slot("m/s", FIRST, "missed: maintenance", "it lies in the maintenance window 'cleaning'")
-        (kept,) = store.slots_of("m/s")
+        store.slots.finish("m/s", FIRST, "missed: maintenance", "it lies in the maintenance window 'cleaning'")
+        (kept,) = store.slots.latest("m/s")
         assert (kept.state, kept.reason) == ("missed: maintenance", "it lies in the maintenance window 'cleaning'")
-        assert store.adopt_slots("m/s") == []
+        assert store.slots.adopt("m/s") == []

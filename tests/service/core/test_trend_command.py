@@ -12,7 +12,7 @@ import pytest
 from abbe.service.cli import run
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.service.core.fakes import Result, utc
 
 START = utc(2026, 3, 1, 5)
@@ -34,8 +34,8 @@ def machine(tmp_path: Path) -> Path:
     path = tmp_path / "machine.toml"
     path.write_text(FILE)
     rng = np.random.default_rng(7)
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        machine_id = store.add_machine("mill-7", {})
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        machine_id = store.machines.add("mill-7", {})
         schedule = Schedule("daily", "0 5 * * *", "UTC", "quick-check")
         for day in range(60):
             at = START + timedelta(days=day)
@@ -46,9 +46,9 @@ def machine(tmp_path: Path) -> Path:
                 limits={"body_diagonal_um": 20.0, "helix_rms_um": 5.0},
                 started_utc=at,
             )
-            store.keep_verification(machine_id, record.found(record.Occasion("mill-7", schedule, at), result), [])
+            store.verifications.add_with_messages(machine_id, record.found(record.Occasion("mill-7", schedule, at), result), [])
         gone = record.failed(record.Occasion("mill-7", schedule, at), OSError("cable"), at, 1.0)
-        store.keep_verification(machine_id, gone, [])
+        store.verifications.add_with_messages(machine_id, gone, [])
     return path
 
 

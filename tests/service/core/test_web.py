@@ -19,7 +19,7 @@ from abbe.service.errors import StoreError
 from abbe.service.queries.reader import Reader, read_as
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler import record
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.web import words
 from abbe.service.web.app import create_app
 from abbe.service.web.document import HEADERS
@@ -34,7 +34,7 @@ EVIL = '<script>alert("x")</script>'
 
 
 class Site:
-    def __init__(self, store: ServiceStore) -> None:
+    def __init__(self, store: Store) -> None:
         self.store = store
         self.clock = FakeClock(NOW)
         self.board = Board(DEVICES, self.clock)
@@ -51,17 +51,17 @@ class Site:
             doc = record.failed(occasion, result, at, 1.0)
         else:
             doc = {**record.found(occasion, result), "started_utc": at.isoformat()}
-        self.store.keep_verification(self.store.add_machine("mill-7", {}), doc, [])
+        self.store.verifications.add_with_messages(self.store.machines.add("mill-7", {}), doc, [])
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[ServiceStore]:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
         yield opened
 
 
 @pytest.fixture
-async def site(store: ServiceStore) -> AsyncIterator[Site]:
+async def site(store: Store) -> AsyncIterator[Site]:
     made = Site(store)
     async with made.client:
         yield made
@@ -180,7 +180,7 @@ async def test_a_store_that_is_gone_is_503(site: Site, monkeypatch: pytest.Monke
     def gone(*_: object) -> None:
         raise StoreError("database is locked")
 
-    monkeypatch.setattr(site.store, "page", gone)
+    monkeypatch.setattr(site.store.pages, "page", gone)
     for path in ("/readyz", "/", "/api/v1/status"):
         answer = await site.client.get(path)
         assert (answer.status_code, answer.json()["code"], answer.headers["retry-after"]) == (503, "STO-001", "5")
@@ -236,11 +236,11 @@ async def test_a_skipped_slot_changes_the_revision(site: Site) -> None:
         return str((await site.client.get("/api/v1/status")).json()["revision"])
 
     before, slot = await revision(), utc(2026, 11, 21, 5)
-    site.store.claim_slot("another mill/weekly", slot)
+    site.store.slots.claim("another mill/weekly", slot)
     assert await revision() == before, "what happens to another machine is none of this page's business"
-    site.store.claim_slot("mill-7/weekly", slot)
+    site.store.slots.claim("mill-7/weekly", slot)
     claimed = await revision()
-    site.store.finish_slot("mill-7/weekly", slot, "skipped: busy", "something else ran")
+    site.store.slots.finish("mill-7/weekly", slot, "skipped: busy", "something else ran")
     assert len({before, claimed, await revision()}) == 3
     assert await revision() == await revision()
 

@@ -150,7 +150,7 @@ def test_a_table_that_was_put_in_force_is_no_change_of_the_machine(store: Store,
     image = encode(table_image(growing(june()[0], np.array([-GROWN, 0.5 * GROWN, 0.0])), 100, 7))
     put(store, tmp_path, "july", [run | {"table": {"crc": crc32(image), "acting": True}} for run in runs])
     assert compared(store, "july") is None, "a table that nobody knows cannot be taken out"
-    store.add_table(store.campaign("july").machine_id, None, image, crc32(image), {})
+    store.tables.add(store.campaigns.find("july").machine_id, None, image, crc32(image), {})
     found = compared(store, "july")
     assert found is not None
     assert [c.motion for c in found.changes] == ["EZZ"]
@@ -183,7 +183,7 @@ def test_a_table_that_was_switched_on_in_between_is_another_table(tmp_path: Path
     with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as store:
         put(store, tmp_path, "june", [run | {"table": {"crc": crc, "acting": False}} for run in json.loads(text)])
         keep(store, from_store(store, "june"), doc)
-        store.add_table(store.campaign("june").machine_id, None, image, crc, {})
+        store.tables.add(store.campaigns.find("june").machine_id, None, image, crc, {})
         runs = moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 6)
         put(store, tmp_path, "july", [run | {"table": {"crc": crc, "acting": True}} for run in runs])
         found = compared(store, "july")
@@ -215,14 +215,14 @@ def test_what_was_taken_out_of_the_readings_then_is_taken_out_now(store: Store, 
     machine, text, doc = june()
     source = FindingSource(campaign="june", machine_digest=doc["inputs"]["machine"])
     book = grown(None, Finding(verdict="named", effects=(entry("backlash", "X", "drive", 4.0),)), source, 1)
-    store.add_model(NewVersion(machine["name"], None, document(book)))
+    store.models.add(NewVersion(machine["name"], None, document(book)))
     keep(store, from_store(store, "june"), doc | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}})
     put(store, tmp_path, "july", moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 1))
     found = compared(store, "july")
     assert found is not None
     assert found.since == 2
     assert [c.motion for c in found.changes] == ["EXX"]
-    store.add_model(NewVersion(machine["name"], 1, document(replace(book, effects=()))))
+    store.models.add(NewVersion(machine["name"], 1, document(replace(book, effects=()))))
     again = compared(store, "july")
     assert again is not None
     assert again == found

@@ -32,11 +32,15 @@ from abbe.service.domain.results import NewVersion
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns
+from abbe.service.storage.repositories.chunks import Chunks
+from abbe.service.storage.repositories.discoveries import Discoveries
+from abbe.service.storage.repositories.machines import Campaigns
+from abbe.service.storage.repositories.runs import Runs
 from abbe.service.storage.store import Store
 from tests.pretended_status import READY, controller_status
 from tests.service.discovery.discovery_bench import MACHINE, Search, circle, write_case
 
-WRITES = ("add_campaign", "start_run", "append_chunk", "finish_run", "add_discovery", "add_discovery_step")
+WRITES = ((Campaigns, "add"), (Runs, "start"), (Chunks, "append"), (Runs, "finish"), (Discoveries, "add"), (Discoveries, "add_step"))
 OLD = ("r01", "r02", "r03", "r04")
 ROUND_1, ROUND_2 = ("n1-feed", "n1-late"), ("n2-back",)
 BOOT = 77
@@ -115,8 +119,8 @@ class Bench:
             monkeypatch.setattr(f"abbe.service.{name}.check_devices", self._answer)
         monkeypatch.setattr("abbe.service.campaign_data.provenance.revision", lambda: "r")  # asks git for a second, each time
         monkeypatch.setattr(Owner, "is_gone", lambda _self: True)
-        for name in WRITES:
-            monkeypatch.setattr(Store, name, self._counted(getattr(Store, name)))
+        for repository, name in WRITES:
+            monkeypatch.setattr(repository, name, self._counted(getattr(repository, name)))
 
     def _file(self) -> None:
         stroke = [f"{a} = {json.dumps(v)}" for a, v in MACHINE["stroke_mm"].items()]
@@ -158,13 +162,13 @@ class Bench:
     async def _measure_test(self, _session: Any, store: Store, _site: Any, campaign: Any, test: Any, *_rest: Any) -> int:
         number = 5 + len(self.measured)
         self.measured.append(test.label)
-        name = store.campaign(campaign.id).name
+        name = store.campaigns.find(campaign.id).name
         run = circle(number, "identify", name) | {"run_id": test.label}
         run["setup"] = run["setup"] | {"setup_id": test.label}
         payload = encode_json(pack_columns(run["columns"]))
-        run_id = await store.write(store.start_run, campaign.id, test.label, run["test"], "identify", {"imported": run})
-        await store.write(store.append_chunk, run_id, "columns", 0, 120, JSON_CODEC, payload, 0.0, 0.0, 0, 0)
-        await store.write(store.finish_run, run_id, "complete", "", {})
+        run_id = await store.write(store.runs.start, campaign.id, test.label, run["test"], "identify", {"imported": run})
+        await store.write(store.chunks.append, run_id, "columns", 0, 120, JSON_CODEC, payload, 0.0, 0.0, 0, 0)
+        await store.write(store.runs.finish, run_id, "complete", "", {})
         return int(run_id)
 
     def live(self, end_after: int | None = None, campaign: str = "june", *more: str) -> int | None:
@@ -180,13 +184,13 @@ class Bench:
     def stored(self) -> dict[str, Any]:
         """What is in the database and must not depend on where the command was ended."""
         with Store.open(self.url) as store:
-            book = store.models("VMC-1")
-            runs = [r for c in store.campaigns() for r in store.runs(c.id)]
+            book = store.models.all("VMC-1")
+            runs = [r for c in store.campaigns.all() for r in store.runs.all(c.id)]
             return {
-                "campaigns": [c.name.split()[0] for c in store.campaigns()],
+                "campaigns": [c.name.split()[0] for c in store.campaigns.all()],
                 "complete": sorted(r.label.removesuffix("-2") for r in runs if r.visible_status == "complete"),
-                "states": [[s.state for s in store.discovery_steps(d.id)] for d in store.discoveries()],
-                "started": [(d.doc["model_version"], d.doc["after"], d.doc["continues"]) for d in store.discoveries()],
+                "states": [[s.state for s in store.discoveries.steps(d.id)] for d in store.discoveries.all()],
+                "started": [(d.doc["model_version"], d.doc["after"], d.doc["continues"]) for d in store.discoveries.all()],
                 "book": [(m.version, m.discovery_id, [round(e["strength"], 6) for e in m.doc["effects"]]) for m in book],
             }
 
@@ -278,16 +282,16 @@ def test_what_is_left_needs_the_clock_of_the_first_runs_and_what_is_complete_nee
     bench.boot += 1
     assert bench.live() == 2  # the next round has to be measured, and cannot be
     with Store.open(bench.url) as store:
-        assert len(store.discoveries()) == 2
-        assert [s.state for s in store.discovery_steps(2)] == STATES
+        assert len(store.discoveries.all()) == 2
+        assert [s.state for s in store.discoveries.steps(2)] == STATES
 
 
 def test_a_fault_of_one_run_keeps_the_others(bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     async def fails(_session: Any, store: Store, _site: Any, campaign: Any, test: Any, *rest: Any) -> int:
         if test.label != "n1-late":
             return await bench._measure_test(_session, store, _site, campaign, test, *rest)
-        run_id = await store.write(store.start_run, campaign.id, test.label, test.test, test.role, {})
-        await store.write(store.finish_run, run_id, "failed", "SEQ-003: the bar fell out", None)
+        run_id = await store.write(store.runs.start, campaign.id, test.label, test.test, test.role, {})
+        await store.write(store.runs.finish, run_id, "failed", "SEQ-003: the bar fell out", None)
         raise MeasurementFault("the bar fell out")
 
     with monkeypatch.context() as patch:
@@ -309,8 +313,8 @@ def test_a_run_that_another_process_measures_is_left_to_it(bench: Bench, monkeyp
 def test_a_machine_that_was_found_to_be_otherwise_meanwhile_is_searched_anew_and_not_measured_anew(bench: Bench, capsys: Any) -> None:
     assert bench.live(6 + 7 + 5) is None  # the second search stands at TESTING
     with Store.open(bench.url) as store:
-        first = store.models("VMC-1")[0]
-        store.add_model(NewVersion("VMC-1", 1, first.doc | {"effects": [], "why": "mended"}))
+        first = store.models.all("VMC-1")[0]
+        store.models.add(NewVersion("VMC-1", 1, first.doc | {"effects": [], "why": "mended"}))
     assert bench.live() == 0
     assert bench.measured == [*ROUND_1, *ROUND_2]
     assert [len(a) for a in bench.search.asked] == [4, 6, *SEARCHES]
@@ -326,7 +330,7 @@ def test_a_late_repeat_waits_until_it_is_late(bench: Bench, capsys: Any) -> None
     assert "too early for second_feed, longer_session: give the same command at " in capsys.readouterr().out
     assert bench.measured == []
     with Store.open(bench.url) as store:
-        assert [c.name for c in store.campaigns()] == ["june"]
+        assert [c.name for c in store.campaigns.all()] == ["june"]
     bench.now_s = 6100.0
     assert bench.live() == 0
     assert bench.stored() == WHOLE
@@ -343,7 +347,7 @@ def test_an_addition_that_is_gone_on_with_alone_has_labels_of_its_own(bench: Ben
     bench.search.adds = {4: ("second_feed",)}
     assert bench.live() == 0
     with Store.open(bench.url) as store:
-        names = [c.name for c in store.campaigns()]
+        names = [c.name for c in store.campaigns.all()]
         assert [rounds(store, n) for n in names] == [0, 1]
     bench.search.adds = {1: ("second_feed",)}
     assert bench.live(campaign=names[1]) == 0

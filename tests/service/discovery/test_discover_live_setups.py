@@ -52,12 +52,12 @@ class Played:
 
     def __init__(self, store: Store, june: Campaign) -> None:
         self.store, self.june = store, june
-        self.number = store.add_campaign(store.add_machine("VMC-1", MACHINE), "next1", {"continues": added(store, june, repeats()).link})
+        self.number = store.campaigns.add(store.machines.add("VMC-1", MACHINE), "next1", {"continues": added(store, june, repeats()).link})
 
     def run(self, label: str, *, complete: bool = True) -> None:
-        number = self.store.start_run(self.number, label, "ballbar_helix", "identify", {})
+        number = self.store.runs.start(self.number, label, "ballbar_helix", "identify", {})
         if complete:
-            self.store.finish_run(number, "complete", "", {})
+            self.store.runs.finish(number, "complete", "", {})
 
     def left(self) -> tuple[TestPlan, ...]:
         found: Added = added(self.store, self.june, repeats())

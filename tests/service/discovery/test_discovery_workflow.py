@@ -69,7 +69,7 @@ def test_states_follow_from_the_finding(folder: Path, book: Store, search: Searc
     discover(job, journal, search, ignore_progress)
     assert [step.state for step in journal.steps] == states
     stored = stored_steps(book, journal.id or 0)
-    assert [s.state for s in stored] == [s.state for s in book.discovery_steps(journal.id or 0)] == states
+    assert [s.state for s in stored] == [s.state for s in book.discoveries.steps(journal.id or 0)] == states
     assert all(s.decided_by == "abbe discover" and s.why for s in stored)
     assert stored[0].start is not None
     source = stored[0].start.source
@@ -295,7 +295,7 @@ def test_only_what_was_proved_and_has_no_rival_enters_the_book(
     finding = discover(job, journal, Search(ahead=ahead), ignore_progress)
     step = journal.steps[-1]
     assert (step.state, step.not_added) == ("EXPLAINED", why)
-    assert len(book.models("VMC-1")) == (1 if why is None else 0)
+    assert len(book.models.all("VMC-1")) == (1 if why is None else 0)
     told = [line for line in lines_of(finding) if line.startswith("not added to the model book: ")]
     assert told == ([] if why is None else [f"not added to the model book: {why}"])
     assert (why is None) or step.why.endswith(told[0])
@@ -312,7 +312,7 @@ def test_the_same_search_is_found_again_and_not_done_twice(folder: Path, book: S
     assert journal.ended
     assert discover(again, journal, search, ignore_progress) == first
     assert search.calls == 1
-    assert len(book.discoveries()) == len(book.models()) == 1
+    assert len(book.discoveries.all()) == len(book.models.all()) == 1
 
 
 def edited(folder: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> DiscoveryJob:
@@ -373,19 +373,22 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from abbe.service.domain.progress import ignore_progress
+from abbe.service.storage.repositories.discoveries import Discoveries
+from abbe.service.storage.repositories.discoveries import Discoveries
 from abbe.service.storage.store import Store
 from abbe.service.discovery.discover import discover
 from abbe.service.discovery.discovery_store import journal_of
 from tests.service.discovery.discovery_bench import Search
 from tests.service.discovery.test_discovery_workflow import job_of
 
-class Doomed(Store):
-    def add_discovery_step(self, discovery_id, seq, *rest):
+class Doomed(Discoveries):
+    def add_step(self, discovery_id, seq, *rest):
         if seq == int(sys.argv[3]):
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().add_discovery_step(discovery_id, seq, *rest)
+        return super().add_step(discovery_id, seq, *rest)
 
-store = Doomed.open(sys.argv[2])
+store = Store.open(sys.argv[2])
+store.discoveries = Doomed(store)
 job = job_of(Path(sys.argv[1]))
 discover(job, journal_of(store, job), Search(), ignore_progress)
 """
@@ -399,15 +402,15 @@ def test_killed_anywhere_it_goes_on_there(folder: Path, tmp_path: Path, step: in
     assert done.returncode == -signal.SIGKILL, done.stderr
     search = Search()
     with Store.open(url) as store:
-        number = store.discoveries()[0].id
-        assert [s.state for s in store.discovery_steps(number)] == ALL[:step]
-        assert store.models() == []
+        number = store.discoveries.all()[0].id
+        assert [s.state for s in store.discoveries.steps(number)] == ALL[:step]
+        assert store.models.all() == []
         job = job_of(folder, store)
         journal = journal_of(store, job)
         assert journal.id == number
         finding = discover(job, journal, search, ignore_progress)
         assert search.calls == searches
-        assert [s.state for s in store.discovery_steps(number)] == ALL
+        assert [s.state for s in store.discoveries.steps(number)] == ALL
         assert journal.version == 1
         assert finding.effects[0].label == "backlash:X"
         assert StoredJournal(store, number, "VMC-1").finding == finding

@@ -53,7 +53,7 @@ def job_of(folder: Path, store: Store) -> DiscoveryJob:
 
 
 def states_of(store: Store, journal: StoredJournal) -> list[str]:
-    return [s.state for s in store.discovery_steps(journal.id or 0)]
+    return [s.state for s in store.discoveries.steps(journal.id or 0)]
 
 
 def version(after: int | None, why: str = "by a test") -> NewVersion:
@@ -72,7 +72,7 @@ def test_the_later_of_two_discoveries_is_not_put_on_top_of_what_it_has_not_seen(
     assert "machine 'VMC-1' has model version 1 now, and this was made without any: nothing was added" in str(told.value)
     assert told.value.remedy.startswith("run the same command again: it searches anew with what the model knows now")
     one = pair[0]
-    assert [(m.version, m.discovery_id) for m in one.models(NAME)] == [(1, first.id)]
+    assert [(m.version, m.discovery_id) for m in one.models.all(NAME)] == [(1, first.id)]
     assert states_of(one, second) == ALL[:-1]  # the end and the version: both or none
     kept = StoredJournal(one, second.id or 0, NAME).finding
     assert kept is not None
@@ -96,20 +96,20 @@ def test_both_have_looked_before_either_writes(pair: tuple[Store, Store]) -> Non
     barrier = threading.Barrier(2)
     ids = []
     for number, store in enumerate(pair):
-        campaign = store.add_campaign(store.add_machine(NAME, {}), f"c{number}", {})
-        ids.append(store.add_discovery(campaign, "d", {"model_version": None}))
+        campaign = store.campaigns.add(store.machines.add(NAME, {}), f"c{number}", {})
+        ids.append(store.discoveries.add(campaign, "d", {"model_version": None}))
 
         def wait(_c: Any, _k: Any, statement: str, *_rest: Any) -> None:
             if statement.startswith("INSERT INTO machine_models"):
                 with suppress(threading.BrokenBarrierError):
                     barrier.wait(0.5)
 
-        event.listen(store._engine, "before_cursor_execute", wait)  # between the look and the write there is no other door
+        event.listen(store.engine, "before_cursor_execute", wait)  # between the look and the write there is no other door
     ends: dict[int, int | ModelMovedOn | None] = {}
 
     def enter(store: Store, discovery_id: int) -> None:
         try:
-            ends[discovery_id] = store.add_discovery_step(discovery_id, 0, "EXPLAINED", {}, version(None))
+            ends[discovery_id] = store.discoveries.add_step(discovery_id, 0, "EXPLAINED", {}, version(None))
         except ModelMovedOn as moved:
             ends[discovery_id] = moved
 
@@ -124,20 +124,20 @@ def test_both_have_looked_before_either_writes(pair: tuple[Store, Store]) -> Non
     moved = ends[loser]
     assert isinstance(moved, ModelMovedOn)
     assert "has model version 1 now" in moved.detail
-    assert [m.discovery_id for m in pair[0].models(NAME)] == winners
-    assert [len(pair[0].discovery_steps(k)) for k in (winners[0], loser)] == [1, 0]
+    assert [m.discovery_id for m in pair[0].models.all(NAME)] == winners
+    assert [len(pair[0].discoveries.steps(k)) for k in (winners[0], loser)] == [1, 0]
 
 
 def test_a_version_is_added_to_the_current_one_and_to_no_other(pair: tuple[Store, Store]) -> None:
     one, other = pair
     with pytest.raises(ModelMovedOn, match="machine 'VMC-1' has no model now, and this was made on version 1"):
-        one.add_model(version(1))
-    assert [store.add_model(version(after)) for store, after in ((one, None), (other, 1), (one, 2))] == [1, 2, 3]
+        one.models.add(version(1))
+    assert [store.models.add(version(after)) for store, after in ((one, None), (other, 1), (one, 2))] == [1, 2, 3]
     for after in (None, 1, 2, 4):
         with pytest.raises(ModelMovedOn, match="has model version 3 now"):
-            other.add_model(version(after))
-    assert [m.version for m in one.models()] == [1, 2, 3]
-    assert one.add_model(NewVersion("another machine", None, {})) == 1
+            other.models.add(version(after))
+    assert [m.version for m in one.models.all()] == [1, 2, 3]
+    assert one.models.add(NewVersion("another machine", None, {})) == 1
 
 
 RACER = """
@@ -151,7 +151,7 @@ with Store.open(sys.argv[1]) as store:
     sys.stdin.readline()
     for after in (None, *range(1, 20)):
         try:
-            store.add_model(NewVersion("VMC-1", after, {"by": sys.argv[2]}))
+            store.models.add(NewVersion("VMC-1", after, {"by": sys.argv[2]}))
             print("won", flush=True)
         except ModelMovedOn as moved:
             print(moved.code, flush=True)
@@ -177,7 +177,7 @@ def test_two_processes_race_twenty_times(url: str) -> None:
     ends = [out.split() for out, _ in said]
     assert [len(e) for e in ends] == [20, 20], said
     with Store.open(url) as store:
-        found = store.models(NAME)
+        found = store.models.all(NAME)
     assert [m.version for m in found] == list(range(1, len(found) + 1))
     assert [sum(m.doc["by"] == name for m in found) for name in "ab"] == [e.count("won") for e in ends]
     assert {word for e in ends for word in e} <= {"won", "DIS-004"}
@@ -186,18 +186,18 @@ def test_two_processes_race_twenty_times(url: str) -> None:
 
 def test_a_version_that_comes_while_a_person_goes_back_is_not_lost(pair: tuple[Store, Store], monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = pair
-    one.add_model(version(None))
-    one.add_model(version(1))
-    write = one.add_model
+    one.models.add(version(None))
+    one.models.add(version(1))
+    write = one.models.add
 
     def late(model: NewVersion, discovery_id: int | None = None) -> int:
-        other.add_model(version(2, "a discovery's"))
+        other.models.add(version(2, "a discovery's"))
         return write(model, discovery_id)
 
-    monkeypatch.setattr(one, "add_model", late)
+    monkeypatch.setattr(one.models, "add", late)
     with pytest.raises(ModelMovedOn, match="has model version 3 now, and this was made on version 2: nothing was added"):
         revert(one, NAME, 1)
-    assert [m.doc["why"] for m in other.models(NAME)] == ["by a test", "by a test", "a discovery's"]
+    assert [m.doc["why"] for m in other.models.all(NAME)] == ["by a test", "by a test", "a discovery's"]
     monkeypatch.undo()
     assert revert(one, NAME, 1) == 4
 
@@ -207,7 +207,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, url: str, monkeypatch: 
 
     def search(*words: Any) -> Any:
         with Store.open(url) as other:
-            other.add_model(version(None))
+            other.models.add(version(None))
         return Search()(*words)
 
     monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
@@ -220,7 +220,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, url: str, monkeypatch: 
 
 def test_a_book_of_another_geometry_is_not_used_and_yet_it_is_what_a_version_comes_after(tmp_path: Path, pair: tuple[Store, Store]) -> None:
     store = pair[0]
-    store.add_model(version(None))
+    store.models.add(version(None))
     folder, search = write_case(tmp_path / "june", "june"), Search()
     job = job_of(folder, store)
     assert (job.base, job.seen) == (None, 1)

@@ -85,20 +85,20 @@ def test_of_older_runs_the_database_knows_what_their_table_was(
 ) -> None:
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
     with Store.open(url) as store:
-        machine = store.add_machine("sim", {})
-        campaign = store.add_campaign(machine, "june", {})
+        machine = store.machines.add("sim", {})
+        campaign = store.campaigns.add(machine, "june", {})
         start = {"table": {"bank": 0, "crc": crc32(image), "gen": 1, "boot_id": 2}}
-        run_id = store.start_run(campaign, "r1", "ballbar_helix", "identify", start)
-        number = store.add_solution(campaign, "joint", [run_id], _document(_known()))  # of a version that named no tables
+        run_id = store.runs.start(campaign, "r1", "ballbar_helix", "identify", start)
+        number = store.solutions.add(campaign, "joint", [run_id], _document(_known()))  # of a version that named no tables
         if known == "pushed":
-            store.add_table(machine, None, image, crc32(image), {})
+            store.tables.add(machine, None, image, crc32(image), {})
         if known == "in force before":
             other = encode(TableImage(0, 9, 100, (0.0, 0.0, 0.0), (1e-5, 1e-5, 1e-5), (0, 0, 0), ()))
-            store.add_table(machine, None, other, crc32(other), {})
+            store.tables.add(machine, None, other, crc32(other), {})
             entry = follow(
                 (), 1, PushState.SNAPSHOT, {"base_crc": crc32(image), "base_image": image.hex()}, "2026-06-01T10:00:00Z", GENESIS
             )
-            store.add_push_entry(
+            store.pushes.append(
                 PushEntryRecord(
                     machine="sim",
                     push=1,

@@ -25,7 +25,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     found = f"sqlite:///{place / 'abbe.sqlite3'}"
     with Store.open(found) as store:
         fill(store, place, SEEDS)
-        store.add_campaign(1, "june-empty", {})
+        store.campaigns.add(1, "june-empty", {})
     return found
 
 
@@ -75,13 +75,13 @@ def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[Re
     out = capsys.readouterr().out
     assert [word in out for word in ("june-7", "june-8", "june-empty", "refused")] == [True] * 4
     with Store.open(url) as store:
-        before = len(store.solutions())
+        before = len(store.solutions.all())
     assert run(["solve-all", "june-8", "--model", "rigid6", "--store", url, "--keep", "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)
     with Store.open(url) as store:
-        assert len(store.solutions()) == before + 1
-        assert store.solution(doc["solution_id"]).doc["parameters"] == doc["parameters"]
-        assert store.audit(1)[0].action == "abbe solve-all"
+        assert len(store.solutions.all()) == before + 1
+        assert store.solutions.get(doc["solution_id"]).doc["parameters"] == doc["parameters"]
+        assert store.audit.events(1)[0].action == "abbe solve-all"
 
 
 def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -116,7 +116,7 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
         then = table_then(store, before)
         assert (then.table, then.why) == (None, f"measured with table {crc32(image):08X}, which this database does not know: {STAYS}")
         assert prepare(before, catalogue(), None, table=then).flags[-1] == then.why
-        store.add_table(store.campaign("july").machine_id, None, image, crc32(image), {})
+        store.tables.add(store.campaigns.find("july").machine_id, None, image, crc32(image), {})
         then = table_then(store, before)
         left = as_left(before, then.table)
         job = prepare(before, catalogue(), None, table=then)
@@ -158,7 +158,7 @@ def test_a_table_of_a_kind_that_nobody_reads_is_not_known(tmp_path: Path) -> Non
         before = from_folder(folder)
         for run in before.runs:
             run["table"] = {"crc": 5}
-        store.add_table(store.add_machine("VMC-1", {}), None, b"someone else's", 5, {})
+        store.tables.add(store.machines.add("VMC-1", {}), None, b"someone else's", 5, {})
         then = table_then(store, before)
         assert (then.table, then.why) == (None, f"measured with table 00000005, of a kind that cannot be read: {STAYS}")
 

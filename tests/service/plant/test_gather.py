@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from abbe.service.plant.gather import Gatherer, table_in_force
 from abbe.service.plant.opcua.picture import picture_of
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.service.core.fakes import STEP, FakeClock
 from tests.service.plant.facts_for_tests import NOON, facts
 
@@ -59,12 +60,12 @@ def test_no_push_no_table() -> None:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[ServiceStore]:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as opened:
         yield opened
 
 
-async def test_facts_of_a_real_store(store: ServiceStore) -> None:
+async def test_facts_of_a_real_store(store: Store) -> None:
     clock = FakeClock(NOON)
     board = Board({"laser": "modbus+tcp://127.0.0.1:502"}, clock)
     view = StatusReader(Reader(store, "mill-7", clock), "0.1.0", board, lambda: [], "")
@@ -72,19 +73,19 @@ async def test_facts_of_a_real_store(store: ServiceStore) -> None:
     empty = await gatherer.facts()
     assert (empty.state, empty.checks, empty.alarms, empty.table) == ("idle", (), (), None)
 
-    machine = store.add_machine("mill-7", {})
+    machine = store.machines.add("mill-7", {})
     cause = {"code": "DRV-002", "what": "refused", "remedy": "", "device": "laser"}
     doc = {"verdict": "cannot tell", "campaign": "", "started_utc": "2026-06-01T10:00:00+00:00", "text": "t", "cause": cause}
-    store.keep_verification(machine, doc, [])
+    store.verifications.add_with_messages(machine, doc, [])
     figures = {"values": {"body_diagonal_um": 11.8}, "uncertainties": {"body_diagonal_um": 1.1}, "limits": {"body_diagonal_um": 20.0}}
-    store.keep_verification(machine, doc | {"verdict": "pass", "cause": None} | figures, [])
+    store.verifications.add_with_messages(machine, doc | {"verdict": "pass", "cause": None} | figures, [])
     for schedule in ("mill-7/weekly", "mill-77/weekly", "mill_7/weekly"):
-        store.claim_slot(schedule, NOON)
-        store.finish_slot(schedule, NOON, "missed: 3 days late", f"{schedule} was missed")
-    store.claim_slot("mill-7/daily", NOON)
-    store.finish_slot("mill-7/daily", NOON, "done: pass", "")
+        store.slots.claim(schedule, NOON)
+        store.slots.finish(schedule, NOON, "missed: 3 days late", f"{schedule} was missed")
+    store.slots.claim("mill-7/daily", NOON)
+    store.slots.finish("mill-7/daily", NOON, "done: pass", "")
     for entry in journal("SNAPSHOT"):
-        store.add_push_entry(entry)
+        store.pushes.append(entry)
     board.job_progress(STEP)
     board.changes += 1
     known = await gatherer.facts()
@@ -115,20 +116,23 @@ def test_units_have_the_numbers_of_opc_ua() -> None:
     assert {key: UNITS[key].number for key in published} == published
 
 
-async def test_a_table_of_slots_is_not_read_every_second(store: ServiceStore) -> None:
+async def test_a_table_of_slots_is_not_read_every_second(store: Store) -> None:
     clock = FakeClock(NOON)
     board = Board({}, clock)
     asked = [0]
 
     class Counted:
-        def slots_not_run(self, machine: str, limit: int = 20, /) -> list[Any]:
+        def not_run(self, machine: str, limit: int = 20, /) -> list[Any]:
             asked[0] += 1
             return []
 
-        def last_push(self, machine: str, control: str = "", /) -> list[Any]:
+        def last(self, machine: str, control: str = "", /) -> list[Any]:
             return []
 
-    gatherer = Gatherer(StatusReader(Reader(store, "mill-7", clock), "0.1.0", board, lambda: [], "").status, Counted())
+    gatherer = Gatherer(
+        StatusReader(Reader(store, "mill-7", clock), "0.1.0", board, lambda: [], "").status,
+        SimpleNamespace(slots=Counted(), pushes=Counted()),
+    )
     for _ in range(59):
         await gatherer.facts()
         clock.now_s += 1.0

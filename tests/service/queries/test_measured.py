@@ -41,7 +41,7 @@ def test_a_list_of_a_state_says_whether_there_are_more(reader: Reader) -> None:
 
 
 def test_a_run_has_its_channels_and_says_what_it_lacks(reader: Reader, plant: Plant) -> None:
-    found = run(reader, plant.store.run("c2/r01").id)
+    found = run(reader, plant.store.runs.find("c2/r01").id)
     assert isinstance(found, RunDetail)
     assert [(one.channel, one.codec, one.chunks) for one in found.channels] == [("bar", "bar/1", 11)]
     assert (found.gaps, found.reason) == (1, "1 gaps, 2 samples missing")

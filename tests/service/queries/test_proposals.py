@@ -38,8 +38,8 @@ def test_a_changed_row_says_so_and_promises_nothing(reader: Reader) -> None:
 
 
 def test_a_decision_moves_the_state_once(reader: Reader, plant: Plant) -> None:
-    row = plant.store.proposal(plant.approvable[0])
-    number = plant.store.add_proposal(row.machine, row.solution_id, row.doc, row.digest)
+    row = plant.store.proposals.get(plant.approvable[0])
+    number = plant.store.proposals.add(row.machine, row.solution_id, row.doc, row.digest)
     approve_waiting(plant.store, number, "anna", 1.0, plant.clock, "user:anna")
     found = proposal(reader, number)
     assert (found.state, found.waits, [one.name for one in found.approvals]) == ("approved", True, ["anna"])

@@ -41,12 +41,12 @@ def stream(phase_us: int = 300, duration_us: int = PATH_US, idle: int = 20) -> l
 def stored(
     store: Store, campaign_id: int, samples: list[BarSample], end: dict[str, Any] | None, status: str = "complete"
 ) -> dict[str, Any]:
-    run_id = store.start_run(campaign_id, "r01", "ballbar_helix", "identify", start_doc())
+    run_id = store.runs.start(campaign_id, "r01", "ballbar_helix", "identify", start_doc())
     for number, at in enumerate(range(0, len(samples), 100)):
         part = samples[at : at + 100]
-        store.append_chunk(run_id, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
+        store.chunks.append(run_id, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
     if end is not None or status != "running":
-        store.finish_run(run_id, status, "", end)
+        store.runs.finish(run_id, status, "", end)
     return load_run(store, run_id)
 
 
@@ -149,11 +149,11 @@ def laser_record(ctrl_us: int, x_mm: float, tenth_nm: int, status: int = 4) -> d
 
 def test_laser_columns(store: Store, campaign_id: int) -> None:
     start = {"setup": {"setup_id": "L", "t_set_s": 0.0, "nominal_beam": [1.0, 0.0, 0.0]}, "machine": MACHINE, "ctrl0_us": 1_000_000}
-    run_id = store.start_run(campaign_id, "r02", "laser_linear", "holdout", start)
+    run_id = store.runs.start(campaign_id, "r02", "laser_linear", "holdout", start)
     records = [laser_record(1_000_000, 10.0, 50), laser_record(2_000_000, 20.0, 100_000_060), laser_record(3_500_000, 30.0, 7, status=1)]
-    store.append_chunk(run_id, "laser", 0, 2, JSON_CODEC, encode_json(records[:2]), 0.0, 0.0, 0, 0)
-    store.append_chunk(run_id, "laser", 1, 1, JSON_CODEC, encode_json(records[2:]), 0.0, 0.0, 0, 0)
-    store.finish_run(run_id, "complete", "", {})
+    store.chunks.append(run_id, "laser", 0, 2, JSON_CODEC, encode_json(records[:2]), 0.0, 0.0, 0, 0)
+    store.chunks.append(run_id, "laser", 1, 1, JSON_CODEC, encode_json(records[2:]), 0.0, 0.0, 0, 0)
+    store.runs.finish(run_id, "complete", "", {})
     columns = load_run(store, "r02")["columns"]
     assert columns["t_s"] == [0.0, 1.0, 2.5]
     assert columns["x_mm"] == [10.0, 20.0, 30.0]
@@ -167,7 +167,9 @@ def test_imported_run_comes_back_as_it_was(store: Store) -> None:
     columns = {"t_s": [0, 1.0], "deviation_mm": None, "load_percent": [1e-05, 3]}
     run = {"format": "abbe-run/1", "mystery": {"a": [1]}, "columns": None, "run_id": "r01", "zeta": None}
     packed = encode_json(pack_columns(columns))
-    store.import_campaign(("m", {}), ("c9", {}), [ImportedRun("r01", "laser_linear", "sealed", {"imported": run}, 2, JSON_CODEC, packed)])
+    store.runs.import_campaign(
+        ("m", {}), ("c9", {}), [ImportedRun("r01", "laser_linear", "sealed", {"imported": run}, 2, JSON_CODEC, packed)]
+    )
     back = load_run(store, "c9/r01")
     assert back == run | {"columns": columns}
     assert list(back) == list(run)
@@ -175,17 +177,17 @@ def test_imported_run_comes_back_as_it_was(store: Store) -> None:
 
 
 def test_documents_of_strangers_give_one_error(store: Store, campaign_id: int) -> None:
-    run_id = store.start_run(campaign_id, "r01", "ballbar_helix", "identify", {"machine": {}})
+    run_id = store.runs.start(campaign_id, "r01", "ballbar_helix", "identify", {"machine": {}})
     with pytest.raises(StoreError, match="c1/r01: its documents lack or garble 'path'"):
         load_run(store, run_id)
-    store.append_chunk(run_id, "bar", 0, 1, "bar/9", b"", 0.0, 0.0, 0, 0)
+    store.chunks.append(run_id, "bar", 0, 1, "bar/9", b"", 0.0, 0.0, 0, 0)
     with pytest.raises(StoreError, match="unknown codec 'bar/9'"):
         load_run(store, run_id)
 
 
 def test_a_set_up_was_mounted_when_the_end_document_says(store: Store) -> None:
-    campaign = store.add_campaign(store.add_machine("m", MACHINE), "c", {})
+    campaign = store.campaigns.add(store.machines.add("m", MACHINE), "c", {})
     run = stored(store, campaign, stream(), END | {"mounted_us": 7_250_000})
     assert run["setup"] == {"setup_id": "A", "t_set_s": 2.25}
-    other = store.add_campaign(store.add_machine("m", MACHINE), "d", {})
+    other = store.campaigns.add(store.machines.add("m", MACHINE), "d", {})
     assert stored(store, other, stream(), END)["setup"]["t_set_s"] == 3.5  # it was mounted before, or nobody noted it

@@ -46,7 +46,7 @@ def test_round_trip_is_exact(campaign_folder: Path, tmp_path: Path) -> None:
 
 def test_import_keeps_everything_in_every_database(store: Store, campaign_folder: Path, tmp_path: Path) -> None:
     import_folder(store, campaign_folder)
-    assert [run.visible_status for run in store.runs("c1")] == ["complete"] * 3
+    assert [run.visible_status for run in store.runs.all("c1")] == ["complete"] * 3
     assert load_run(store, "c1/r02")["columns"]["deviation_mm"] is None
     assert load_run(store, "r01") == read_json(campaign_folder / "r01-x.json")
     exported = export_folder(store, "c1", tmp_path / "out")
@@ -186,7 +186,7 @@ def assert_refused(store: Store, folder: Path, name: str, change: Change, messag
         import_folder(store, folder)
     assert ".json" in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert store.campaigns() == store.machines() == store.runs() == []
+    assert store.campaigns.all() == store.machines.all() == store.runs.all() == []
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_export_never_overwrites(file_store: Store, campaign_folder: Path, tmp_p
 def test_failed_export_leaves_nothing(file_store: Store, campaign_folder: Path, tmp_path: Path) -> None:
     import_folder(file_store, campaign_folder)
     before = sorted(path.name for path in tmp_path.iterdir())
-    broken = file_store.start_run(1, "r09", "ballbar_helix", "identify", {})
+    broken = file_store.runs.start(1, "r09", "ballbar_helix", "identify", {})
     with pytest.raises(StoreError, match="c1/r09"):
         export_folder(file_store, "c1", tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == before
@@ -249,12 +249,12 @@ MACHINE = {"name": "VMC-1", "chain": "w-X-Y-b-Z-t", "vertical_axis": "Z", "strok
 
 
 def test_measured_campaign_is_a_good_folder(file_store: Store, tmp_path: Path) -> None:
-    campaign = file_store.add_campaign(
-        file_store.add_machine("VMC-1", MACHINE), "monday", {"instruments": {"ballbar": {"resolution_mm": 1e-6}}}
+    campaign = file_store.campaigns.add(
+        file_store.machines.add("VMC-1", MACHINE), "monday", {"instruments": {"ballbar": {"resolution_mm": 1e-6}}}
     )
     setup = {"setup_id": "A", "t_set_s": 1.0, "centre_mm": [1, 2, 3], "radius_mm": 150.0, "turns": 1}
     path = {"feed_mm_min": 60.0, "direction": 1, "points_mm": [[0, 0, 0], [1, 0, 0]]}
-    run_id = file_store.start_run(
+    run_id = file_store.runs.start(
         campaign,
         "helix 1/2",
         "ballbar_helix",
@@ -262,8 +262,8 @@ def test_measured_campaign_is_a_good_folder(file_store: Store, tmp_path: Path) -
         {"setup": setup, "machine": MACHINE, "ctrl0_us": 0, "path": path, "rate_hz": 100},
     )
     samples = [BarSample(seq, 10_000 * seq, seq, 8 if 5 <= seq < 105 else 0) for seq in range(110)]
-    file_store.append_chunk(run_id, "bar", 0, 110, BAR_CODEC, encode_bar(samples), 0.0, 1.1, 0, 1_090_000)
-    file_store.finish_run(run_id, "complete", "", {"path_start_us": 2_000_000, "path_end_us": 3_000_000})
+    file_store.chunks.append(run_id, "bar", 0, 110, BAR_CODEC, encode_bar(samples), 0.0, 1.1, 0, 1_090_000)
+    file_store.runs.finish(run_id, "complete", "", {"path_start_us": 2_000_000, "path_end_us": 3_000_000})
     folder = export_folder(file_store, "monday", tmp_path / "out")
     assert sorted(path.name for path in folder.iterdir()) == ["campaign.json", "helix_1_2.json"]
     assert_round_trip(folder, tmp_path)

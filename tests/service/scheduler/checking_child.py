@@ -14,8 +14,8 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.scheduler.job import Checks, carry_out
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.scheduler.store import ServiceStore
 from abbe.service.sequences.control import Control
+from abbe.service.storage.store import Store
 
 QUICK = Schedule("quick", "*/1 * * * *", "UTC", "quick-check")
 FIRST = datetime(2026, 11, 22, 9, tzinfo=UTC)
@@ -37,18 +37,18 @@ class Result:
 
 async def main() -> None:
     url, name, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
-    with ServiceStore.open(url) as store:
-        machine_id, clock, done = store.add_machine(name, {"name": name}), SystemClock(), [0]
+    with Store.open(url) as store:
+        machine_id, clock, done = store.machines.add(name, {"name": name}), SystemClock(), [0]
 
         async def check(_recipe: str, _progress: ProgressSink, _control: object) -> Result:
             campaign = f"quick-check {name} {done[0]}"
-            number = await store.write(store.add_campaign, machine_id, campaign, {})
-            run_id = await store.write(store.start_run, number, "check-1", "laser_linear", "holdout", {"of": name})
-            await store.write(store.finish_run, run_id, "complete", "", None)
+            number = await store.write(store.campaigns.add, machine_id, campaign, {})
+            run_id = await store.write(store.runs.start, number, "check-1", "laser_linear", "holdout", {"of": name})
+            await store.write(store.runs.finish, run_id, "complete", "", None)
             return Result(campaign, {"body_diagonal_um": float(len(name))})
 
         shelf = StoreShelf(store, clock, (name, machine_id), ("v", "a"), lambda: None)
-        heartbeat = Heartbeat(name, "0", store, lambda: [], clock)
+        heartbeat = Heartbeat(name, "0", store.heartbeats, lambda: [], clock)
         checks, ledger = Checks(name, check, shelf, clock), StoreLedger(store, clock, name)
         sys.stdout.write("ready\n")
         sys.stdout.flush()

@@ -23,7 +23,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import HeartbeatRecord
 from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, row, stands, state_of
 from abbe.service.scheduler.heartbeat import SILENT_AFTER, Heartbeat
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.experiments.bench.history_case import START, History, build
 from tests.service.core.fakes import FakeClock
 
@@ -42,7 +42,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 def test_two_services_at_once_are_not_mixed(url: str) -> None:
     """Each with its timetable at the same seconds, as plants have it: slots, campaigns, runs and checks of one name in each."""
-    ServiceStore.open(url).close()
+    Store.open(url).close()
     names = ["mill-1", "lathe-3"]
     with ExitStack() as stack:
         children = [
@@ -57,19 +57,19 @@ def test_two_services_at_once_are_not_mixed(url: str) -> None:
         for child in children:
             child.communicate(b"go\n", timeout=60)
         assert [child.returncode for child in children] == [0, 0]
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         for name in names:
-            checks = store.verifications_of(name)
+            checks = store.verifications.of_machine(name)
             assert len(checks) == CHECKS
             assert {(one.doc["machine"], one.doc["values"]["body_diagonal_um"]) for one in checks} == {(name, float(len(name)))}
             for one in checks:
-                campaign = store.campaign(one.doc["campaign"])
+                campaign = store.campaigns.find(one.doc["campaign"])
                 assert campaign.id == one.campaign_id
-                assert store.machine(campaign.machine_id).name == name
-                assert [r.start_doc for r in store.runs(campaign.id)] == [{"of": name}]
-            assert {slot.state for slot in store.slots_of(f"{name}/quick")} == {"done: pass"}
-            assert len(store.slots_of(f"{name}/quick")) == CHECKS
-        assert sorted(store.heartbeats()) == store.machine_names() == sorted(names)
+                assert store.machines.get(campaign.machine_id).name == name
+                assert [r.start_doc for r in store.runs.all(campaign.id)] == [{"of": name}]
+            assert {slot.state for slot in store.slots.latest(f"{name}/quick")} == {"done: pass"}
+            assert len(store.slots.latest(f"{name}/quick")) == CHECKS
+        assert sorted(store.heartbeats.all()) == store.machines.names() == sorted(names)
         assert {line.machine: line.state for line in fleet(store, datetime.now(UTC))} == dict.fromkeys(
             names, "not running"
         )  # they have ended
@@ -81,11 +81,11 @@ def test_the_list_of_a_history(url: str, capsys: pytest.CaptureFixture[str]) -> 
     due = [
         {"schedule": name, "recipe": "quick-check", "due_utc": (now + timedelta(hours=h)).isoformat()} for name, h in (("b", 7), ("a", 2))
     ]
-    with ServiceStore.open(url) as store:
-        store.put_heartbeat("mill-1", {"state": "waiting", "due": due})
-        store.put_heartbeat("mill-2", {"state": "waiting", "due": []})
-        store.put_heartbeat("mill-2", {"state": "measuring", "due": []})
-        store.put_heartbeat("new-4", {"state": "waiting", "due": []})
+    with Store.open(url) as store:
+        store.heartbeats.put("mill-1", {"state": "waiting", "due": due})
+        store.heartbeats.put("mill-2", {"state": "waiting", "due": []})
+        store.heartbeats.put("mill-2", {"state": "measuring", "due": []})
+        store.heartbeats.put("new-4", {"state": "waiting", "due": []})
         one, two, three, new = fleet(store, now)
         standing = stands(store, now)
     assert standing == [
@@ -116,7 +116,7 @@ def test_the_list_of_a_history(url: str, capsys: pytest.CaptureFixture[str]) -> 
 def test_computers_with_one_key_prove_one_audit(postgres: Callable[[], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder stands for a computer: each keeps the heads of its own records."""
     url, books = postgres(), {}
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         for name in ("pc-1", "pc-2", "pc-3"):
             monkeypatch.setenv("ABBE_AUDIT_FOLDER", str(tmp_path / name))
             books[name] = AuditBook(store, url)
@@ -147,7 +147,7 @@ def test_no_database_and_an_empty_one(tmp_path: Path, capsys: pytest.CaptureFixt
     assert run(["fleet", "--store", "sqlite:///none.sqlite3"]) == 2
     assert capsys.readouterr().err.startswith("error STO-001: there is no database none.sqlite3")
     assert not (tmp_path / "none.sqlite3").exists()
-    ServiceStore.open("sqlite:///new.sqlite3").close()
+    Store.open("sqlite:///new.sqlite3").close()
     assert run(["fleet", "--store", "sqlite:///new.sqlite3"]) == 0
     assert "no machine is in this database yet" in capsys.readouterr().out
 
@@ -155,16 +155,16 @@ def test_no_database_and_an_empty_one(tmp_path: Path, capsys: pytest.CaptureFixt
 async def test_a_station_says_every_change_and_goes_on_when_the_database_does_not(tmp_path: Path) -> None:
     schedule = Schedule("daily", "0 5 * * *", "UTC", "quick-check")
     clock = FakeClock(NOW)
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         seen: asyncio.Queue[str] = asyncio.Queue()
         fails = [False]
 
         class Desk:
-            def put_heartbeat(self, machine: str, doc: dict) -> None:
+            def put(self, machine: str, doc: dict) -> None:
                 try:
                     if fails[0]:
-                        store.run("none")  # a real StoreError
-                    store.put_heartbeat(machine, doc)
+                        store.runs.find("none")  # a real StoreError
+                    store.heartbeats.put(machine, doc)
                 finally:  # not before: the test looks into the database, or lets it fail, as soon as it hears of this
                     loop.call_soon_threadsafe(seen.put_nowait, doc["state"])
 

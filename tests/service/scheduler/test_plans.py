@@ -10,7 +10,7 @@ from sqlalchemy import Connection, event
 
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.scheduler.fleet import fleet
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.verification.trend_table import trends
 from tests.experiments.bench.history_case import START, History, build
 
@@ -26,14 +26,14 @@ LISTS = {
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceStore]:
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     url = f"sqlite:///{tmp_path_factory.mktemp('history') / 'abbe.sqlite3'}"
     build(url, HISTORY)
-    with ServiceStore.open(url) as opened:
+    with Store.open(url) as opened:
         yield opened
 
 
-def plans(store: ServiceStore, work: Callable[[], object]) -> list[str]:
+def plans(store: Store, work: Callable[[], object]) -> list[str]:
     """The plan of every query that a call makes."""
     asked: list[tuple[str, Any]] = []
 
@@ -41,55 +41,55 @@ def plans(store: ServiceStore, work: Callable[[], object]) -> list[str]:
         if statement.lstrip().upper().startswith(("SELECT", "UPDATE", "INSERT", "WITH")):
             asked.append((statement, parameters))
 
-    event.listen(store._engine, "before_cursor_execute", before)
+    event.listen(store.engine, "before_cursor_execute", before)
     try:
         work()
     finally:
-        event.remove(store._engine, "before_cursor_execute", before)
+        event.remove(store.engine, "before_cursor_execute", before)
     assert asked
-    with store._engine.connect() as connection:
+    with store.engine.connect() as connection:
         return [str(row[3]) for statement, values in asked for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values)]
 
 
 NAME = "mill-2"
-CALLS: dict[str, Callable[[ServiceStore], object]] = {
-    "page: last checks": lambda s: s.verifications_of(NAME, 60),
-    "page: messages that wait": lambda s: s.waiting_messages(),
-    "timetable: last slot": lambda s: s.last_slot(f"{NAME}/quick"),
-    "timetable: open slots": lambda s: s.adopt_slots(f"{NAME}/quick"),
-    "timetable: slots": lambda s: s.slots_of(f"{NAME}/quick"),
-    "check: its campaign": lambda s: s.campaign(s.verifications_of(NAME, 1)[0].doc["campaign"]),
-    "check: its runs": lambda s: s.runs(s.verifications_of(NAME, 1)[0].doc["campaign"]),
-    "check: samples of a run": lambda s: s.chunks(1),
-    "check: keep": lambda s: s.keep_verification(2, s.verifications_of(NAME, 1)[0].doc, [("t", {})]),
-    "campaign by number": lambda s: s.campaign(7),
-    "run by number": lambda s: s.run_numbered(7),
-    "chunks of a run": lambda s: s.chunk_keys(7),
-    "solutions": lambda s: s.solutions(7),
-    "audit: end": lambda s: s.audit(1),
+CALLS: dict[str, Callable[[Store], object]] = {
+    "page: last checks": lambda s: s.verifications.of_machine(NAME, 60),
+    "page: messages that wait": lambda s: s.outbox.count(),
+    "timetable: last slot": lambda s: s.slots.last_due(f"{NAME}/quick"),
+    "timetable: open slots": lambda s: s.slots.adopt(f"{NAME}/quick"),
+    "timetable: slots": lambda s: s.slots.latest(f"{NAME}/quick"),
+    "check: its campaign": lambda s: s.campaigns.find(s.verifications.of_machine(NAME, 1)[0].doc["campaign"]),
+    "check: its runs": lambda s: s.runs.all(s.verifications.of_machine(NAME, 1)[0].doc["campaign"]),
+    "check: samples of a run": lambda s: s.chunks.of_run(1),
+    "check: keep": lambda s: s.verifications.add_with_messages(2, s.verifications.of_machine(NAME, 1)[0].doc, [("t", {})]),
+    "campaign by number": lambda s: s.campaigns.find(7),
+    "run by number": lambda s: s.runs.numbered(7),
+    "chunks of a run": lambda s: s.chunks.crcs(7),
+    "solutions": lambda s: s.solutions.all(7),
+    "audit: end": lambda s: s.audit.events(1),
 }
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_nothing_is_looked_for_row_by_row(store: ServiceStore, name: str) -> None:
+def test_nothing_is_looked_for_row_by_row(store: Store, name: str) -> None:
     told = plans(store, lambda: CALLS[name](store))
     scans = [one for one in told if one.startswith("SCAN")]
     # The end of the audit is where its number is highest: the table is entered there, and left after one row.
     assert [one for one in scans if one != "SCAN audit"] == [], told
 
 
-def test_the_whole_fleet_scans_only_what_has_a_row_a_machine(store: ServiceStore) -> None:
+def test_the_whole_fleet_scans_only_what_has_a_row_a_machine(store: Store) -> None:
     told = plans(store, lambda: fleet(store, START))
     assert {one for one in told if one.startswith("SCAN")} <= LISTS
 
 
-def test_this_test_would_see_a_missing_index(store: ServiceStore) -> None:
-    assert "SCAN runs" in plans(store, lambda: store.runs(None))
+def test_this_test_would_see_a_missing_index(store: Store) -> None:
+    assert "SCAN runs" in plans(store, lambda: store.runs.all(None))
 
 
-def test_the_history_is_what_it_says(store: ServiceStore) -> None:
-    assert len(store.campaigns()) == HISTORY.checks
-    assert len(store.runs()) == HISTORY.runs
-    found: list[VerificationRecord] = store.verifications_of(NAME)
+def test_the_history_is_what_it_says(store: Store) -> None:
+    assert len(store.campaigns.all()) == HISTORY.checks
+    assert len(store.runs.all()) == HISTORY.runs
+    found: list[VerificationRecord] = store.verifications.of_machine(NAME)
     assert {one.doc["machine"] for one in found} == {NAME}
     assert [one.figure for one in trends(found)] == ["body_diagonal_um", "helix_rms_um"]

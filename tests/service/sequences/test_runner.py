@@ -198,14 +198,15 @@ class FakeStore:
 
     def __init__(self) -> None:
         self.ended: tuple[str, str] | None = None
+        self.runs, self.chunks = self, SimpleNamespace(append=None)
 
     async def write(self, call, *args):
         return call(*args)
 
-    def start_run(self, *_):
+    def start(self, *_):
         return 1
 
-    def finish_run(self, _, status, reason, __):
+    def finish(self, _, status, reason, __):
         self.ended = (status, reason)
 
 
@@ -223,7 +224,6 @@ async def test_a_run_keeps_the_reason_why_it_ended(monkeypatch, error, ended):
 
     monkeypatch.setattr(Runner, "run", run)
     store, clock = FakeStore(), SimpleNamespace(utc=lambda: SimpleNamespace(isoformat=lambda: "now"), monotonic_s=lambda: 1.0)
-    store.append_chunk = None
     with pytest.raises(type(error)):
         await measure_test(session([]), store, SITE, OpenCampaign(1, 0), PLAN, lambda *_: None, clock)
     assert store.ended == ended
@@ -249,18 +249,17 @@ class KeepingStore(FakeStore):
         self.starts: list[dict] = []
         self.ends: list[dict] = []
 
-    def start_run(self, *args):
+    def start(self, *args):
         self.starts.append(args[-1])
         return len(self.starts)
 
-    def finish_run(self, _, status, reason, doc):
+    def finish(self, _, status, reason, doc):
         self.ends.append(doc)
 
 
 async def test_a_set_up_begins_when_it_is_mounted_and_all_its_runs_say_so():
     devices = Session(PatientController([]), MuteBar([]), None, Fixture([]))
     store = KeepingStore()
-    store.append_chunk = None
     clock = SimpleNamespace(utc=lambda: SimpleNamespace(isoformat=lambda: "now"), monotonic_s=lambda: 1.0)
     ways = [("first", (MountBar(150.0),)), ("second", ()), ("third", (Unmount(),))]
     campaign = OpenCampaign(1, 30_000_000)

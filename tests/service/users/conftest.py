@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 
@@ -36,7 +36,7 @@ class Turned:
 
 @dataclass
 class World:
-    store: ServiceStore
+    store: Store
     url: str
     clock: Turned
     people: People
@@ -46,5 +46,5 @@ class World:
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
     clock, url = Turned(), f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    with ServiceStore.open(url, utcnow=clock.utc) as store:
+    with Store.open(url, utcnow=clock.utc) as store:
         yield World(store, url, clock, People(store, clock, Passwords(memory_kib=64, passes=1)), AuditBook(store, url))

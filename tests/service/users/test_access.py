@@ -188,16 +188,16 @@ async def test_every_changing_route_leaves_one_record(gate: Gate) -> None:
     with_one_route_for_each_right(gate.app)
     for headers in (gate.session("a-admin"), gate.token("a-viewer", "t", ["read"]), OWN):
         for method, path, _ in sorted(cells(gate.app.routes), key=lambda cell: cell[1] == "/logout"):
-            before = len(gate.world.store.audit())
+            before = len(gate.world.store.audit.events())
             status = (await gate.ask(method, path, headers=headers)).status_code
-            new = gate.world.store.audit()[before:]
+            new = gate.world.store.audit.events()[before:]
             assert len(new) == (1 if method in MUTATING else 0), (method, path)
             if new and path != "/login":
                 assert new[0].action == f"{method} {path}"
                 assert new[0].outcome == f"{'done' if status < 400 else 'refused'} {status}"
                 assert new[0].target == path
     assert gate.world.book.verify() == []
-    assert {r.who for r in gate.world.store.audit()} == {"user:a-admin", "token:a-viewer/t", "anonymous"}
+    assert {r.who for r in gate.world.store.audit.events()} == {"user:a-admin", "token:a-viewer/t", "anonymous"}
 
 
 async def log_in(gate: Gate, name: str, password: str, **headers: str) -> httpx.Response:
@@ -221,7 +221,7 @@ async def test_login_rotates_the_session_and_logout_ends_it(gate: Gate) -> None:
     known = {"Cookie": f"{COOKIE}={second}", CSRF_HEADER: csrf_token(second), **OWN}
     assert (await gate.ask("POST", "/logout", headers=known)).status_code == 303
     assert (await gate.ask("GET", "/", headers=known)).status_code == 401
-    who = [(r.who, r.target, r.outcome) for r in gate.world.store.audit()]
+    who = [(r.who, r.target, r.outcome) for r in gate.world.store.audit.events()]
     assert who == [
         ("user:a-operator", "a-operator", "done 303"),
         ("user:a-operator", "a-operator", "done 303"),
@@ -249,7 +249,7 @@ async def test_guessing_is_slowed_and_told_from_nothing(gate: Gate) -> None:
     assert codes[0] == codes[1] == [401] * 5 + [429] * 25
     assert [a.text for a in answers["a-operator"]] == [a.text for a in answers["nobody"]]
     assert answers["nobody"][-1].headers["retry-after"] == "2"
-    told = " ".join(r.target for r in gate.world.store.audit())
+    told = " ".join(r.target for r in gate.world.store.audit.events())
     assert "nobody" not in told  # people type their password where the name belongs
     gate.world.clock.later(seconds=3)
     gate.auth.lockout.__init__(gate.world.clock.monotonic_s)  # type: ignore[misc]
@@ -289,7 +289,7 @@ async def test_a_flood_from_one_address_is_turned_away(world: World) -> None:
         assert (await client.get("/healthz")).status_code == 200
         refused = [(await client.post("/logout", headers=OWN)).status_code for _ in range(100)]
         assert set(refused) == {401}
-    assert len(world.store.audit()) == 20  # who hammers at the auth does not fill the audit
+    assert len(world.store.audit.events()) == 20  # who hammers at the auth does not fill the audit
 
 
 async def test_without_users_everybody_may_look_and_nobody_may_change(world: World) -> None:
@@ -391,15 +391,15 @@ def test_where_the_page_may_listen(host: str, names: tuple[str, ...], admins: in
 
 def test_only_an_admin_who_can_log_in_counts(world: World) -> None:
     """Anybody else could shut nobody out, and give nobody a right."""
-    assert world.store.active_admins() == 0
+    assert world.store.people.active_admins() == 0
     for role in Role:
         if role is not Role.ADMIN:
             world.people.add(f"a-{role}", role, PHRASE)
-    assert world.store.active_admins() == 0
+    assert world.store.people.active_admins() == 0
     world.people.add("ana", "admin", PHRASE)
     world.people.add("bob", "admin", PHRASE)
-    assert world.store.active_admins() == 2
+    assert world.store.people.active_admins() == 2
     world.people.disable("bob")
-    assert world.store.active_admins() == 1
-    world.store.change_user(world.people.get("ana").id, password="")
-    assert world.store.active_admins() == 0
+    assert world.store.people.active_admins() == 1
+    world.store.people.change(world.people.get("ana").id, password="")
+    assert world.store.people.active_admins() == 0

@@ -148,7 +148,7 @@ def test_writers_do_not_fork_the_chain(world: World) -> None:
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda n: books[n % 4].write(event(n)), range(40)))
     assert world.book.verify() == []
-    assert [r.id for r in world.store.audit()] == list(range(1, 41))
+    assert [r.id for r in world.store.audit.events()] == list(range(1, 41))
 
 
 def test_two_processes_do_not_fork_the_chain(world: World) -> None:
@@ -161,7 +161,7 @@ def test_two_processes_do_not_fork_the_chain(world: World) -> None:
     children = [subprocess.Popen([sys.executable, "-c", program, world.url]) for _ in range(2)]
     assert [child.wait() for child in children] == [0, 0]
     assert world.book.verify() == []
-    assert len(world.store.audit()) == 30
+    assert len(world.store.audit.events()) == 30
 
 
 def test_a_torn_line_of_the_heads_does_no_harm(world: World) -> None:
@@ -177,7 +177,7 @@ def test_passwords_of_addresses_are_masked(world: World) -> None:
     world.book.write(
         AuditEvent(who="w", action="a", target="mqtt://me:topsecret@host", outcome="done", doc={"db": "postgresql://me:topsecret@host/x"})
     )
-    assert "topsecret" not in str(world.store.audit())
+    assert "topsecret" not in str(world.store.audit.events())
 
 
 def test_a_record_that_cannot_be_written_is_an_error(world: World) -> None:
@@ -203,7 +203,7 @@ def test_on_postgresql_two_stores_write_one_chain_that_only_grows(
         books = [AuditBook(store, url) for store in (one, two)]
         list(pool.map(lambda n: books[n % 2].write(event(n)), range(20)))
         assert books[0].verify() == []
-        assert len(one.audit()) == 20
+        assert len(one.audit.events()) == 20
         assert {p.suffix for p in tmp_path.iterdir()} == {".audit-key", ".audit-head"}
         with pytest.raises(StoreError, match="the audit only grows"):
-            one._write(lambda connection: connection.exec_driver_sql("DELETE FROM audit"))
+            one.commit(lambda connection: connection.exec_driver_sql("DELETE FROM audit"))

@@ -84,7 +84,7 @@ def test_a_key_of_somebody_else_is_refused_in_one_line_before_anything(open_fold
                 assert found.value.code == "AUD-001"
                 assert "\n" not in str(found.value)
             assert "Permission denied" in book.verify()[0]
-        assert len(store.audit()) == 1
+        assert len(store.audit.events()) == 1
 
 
 def test_ready_leaves_nothing_behind_and_sees_each_file(world: World) -> None:
@@ -170,11 +170,11 @@ def test_nothing_in_the_audit_commands_a_terminal(world: World, capsys: pytest.C
     world.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={EVIL: [EVIL, {"k": EVIL}]}))
     raw = EVIL.replace("\udcff", "").replace("\0", "")
     key = world.book.key_file.read_bytes()
-    world.store.append_audit(
+    world.store.audit.append(
         lambda last, utc: follow(last, utc, AuditEvent(who=raw, action=raw, target=raw, outcome=raw, doc={"k": raw}), key)
     )
-    assert not set(EVIL) & set("\x1b\x9b\r\n\0") & set(str(world.store.audit()[0]))
-    assert world.store.audit()[0].target.startswith(r"\x1b[2J\x9b1;31m\nrecord 99\r\u202e\udcff\x00")
+    assert not set(EVIL) & set("\x1b\x9b\r\n\0") & set(str(world.store.audit.events()[0]))
+    assert world.store.audit.events()[0].target.startswith(r"\x1b[2J\x9b1;31m\nrecord 99\r\u202e\udcff\x00")
     assert run(["audit", "show", "--db", world.url]) == 0
     shown = capsys.readouterr().out
     assert not set("\x1b\x9b\r\u202e") & set(shown)
@@ -203,7 +203,7 @@ def test_a_file_name_that_is_no_text_is_recorded(folder: Path) -> None:
     Store.open(URL).close()
     assert run(["key", "new", os.fsdecode(b"k\xff.pem")]) == 0
     with Store.open(URL) as store:
-        assert [r.target for r in store.audit()] == [r"k\udcff.pem"]
+        assert [r.target for r in store.audit.events()] == [r"k\udcff.pem"]
         assert AuditBook(store, URL).verify() == []
 
 
@@ -212,8 +212,8 @@ def test_an_audit_that_was_emptied_beside_its_key_is_named(world: World) -> None
     world.book.ready()
     assert AuditBook(world.store, world.url).verify() == []
     world.book.write(event(1))
-    world.store._write(lambda connection: connection.exec_driver_sql("DROP TRIGGER audit_no_delete"))
-    world.store._write(lambda connection: connection.exec_driver_sql("DELETE FROM audit"))
+    world.store.commit(lambda connection: connection.exec_driver_sql("DROP TRIGGER audit_no_delete"))
+    world.store.commit(lambda connection: connection.exec_driver_sql("DELETE FROM audit"))
     world.book.head_file.unlink()
     assert ["is empty, but its key is here" in text for text in world.book.verify()] == [True]
 
@@ -227,8 +227,8 @@ def test_a_torn_line_costs_no_other_head(world: World) -> None:
         file.write(b"\0\0\0\xff")  # what some file systems leave of a line after a power cut
     world.book.ready()
     world.book.write(event(3))
-    world.store._write(lambda connection: connection.exec_driver_sql("DROP TRIGGER audit_no_delete"))
-    world.store._write(lambda connection: connection.exec_driver_sql("DELETE FROM audit WHERE id > 1"))
+    world.store.commit(lambda connection: connection.exec_driver_sql("DROP TRIGGER audit_no_delete"))
+    world.store.commit(lambda connection: connection.exec_driver_sql("DELETE FROM audit WHERE id > 1"))
     assert [text.split(",")[0] for text in world.book.verify()] == [f"the audit ended with record {n} at least" for n in (2, 3)]
 
 
@@ -245,13 +245,13 @@ REPLACING = (
 def test_replacing_a_record_is_refused_by_sqlite(world: World, change: str) -> None:
     world.book.write(event(1))
     world.book.write(event(2))
-    before = world.store.audit()
+    before = world.store.audit.events()
     with (
         closing(sqlite3.connect(world.book.key_file.parent / "abbe.sqlite3")) as file,
         pytest.raises(sqlite3.IntegrityError, match="the audit only grows"),
     ):
         file.execute(change)
-    assert world.store.audit() == before
+    assert world.store.audit.events() == before
     world.book.write(event(3))
     assert world.book.verify() == []
 
@@ -267,14 +267,14 @@ def test_emptying_the_table_is_refused_by_postgresql(
         book.write(event(1))
         for change in ("TRUNCATE audit", "TRUNCATE audit CASCADE", "TRUNCATE users, audit CASCADE"):
             with pytest.raises(StoreError, match="the audit only grows"):
-                store._write(lambda connection, change=change: connection.exec_driver_sql(change))
+                store.commit(lambda connection, change=change: connection.exec_driver_sql(change))
         assert book.verify() == []
         for change in ("DROP TRIGGER audit_not_emptied ON audit", "TRUNCATE audit"):
-            store._write(lambda connection, change=change: connection.exec_driver_sql(change))
+            store.commit(lambda connection, change=change: connection.exec_driver_sql(change))
         assert "the audit ended with record 1 at least" in book.verify()[0]
         read_only = f"ALTER DATABASE {url.rpartition('/')[2]} SET default_transaction_read_only = on"
-        store._write(lambda connection: connection.exec_driver_sql(read_only))
-        store._engine.dispose()
+        store.commit(lambda connection: connection.exec_driver_sql(read_only))
+        store.engine.dispose()
         with pytest.raises(StoreError, match="takes no writes"):
             book.ready()
 

@@ -86,7 +86,7 @@ def test_each_changing_command_leaves_one_record(words: str, folder: Path, monke
     typed(monkeypatch, f"{PHRASE}\n")
     code = run(SAMPLES[words])
     with Store.open("sqlite:///kept/abbe.sqlite3" if words == "demo" else URL) as store:
-        records = store.audit()
+        records = store.audit.events()
     assert len(records) == 1
     assert records[0].action == f"abbe {words}"
     assert records[0].who.startswith("os:")
@@ -124,7 +124,7 @@ def test_users_by_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert token not in shown
     assert PHRASE not in shown
     with Store.open(URL) as store:
-        assert store.active_admins() == 1
+        assert store.people.active_admins() == 1
     (folder / "abbe.sqlite3.audit-head").write_text("")
     code, out = abbe("audit", "verify")
     assert code == 1

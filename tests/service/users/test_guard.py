@@ -41,7 +41,7 @@ def cookie(jar: dict[str, str]) -> dict[str, str]:
 
 
 def told(world: World) -> list[tuple[str, str, str]]:
-    return [(r.who, r.action, r.outcome) for r in world.store.audit()]
+    return [(r.who, r.action, r.outcome) for r in world.store.audit.events()]
 
 
 async def test_a_change_that_ends_in_a_defect_is_recorded(gate: Gate) -> None:
@@ -280,7 +280,7 @@ async def test_guesses_from_ever_new_addresses_do_not_keep_a_user_out(world: Wor
         first = await client.post("/login", data=form, headers=OWN)
         assert first.status_code == 303
     device = first.cookies["abbe-device"]
-    assert device not in str(world.store.audit())
+    assert device not in str(world.store.audit.events())
     app, _ = behind(world, Front())  # started again: nothing is remembered
     begin = world.people.passwords.hashes
     for n in range(300):

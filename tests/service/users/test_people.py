@@ -49,7 +49,7 @@ def test_the_default_cost_is_that_of_the_specification() -> None:
 def test_a_weak_password_is_refused(world: World, password: str) -> None:
     with pytest.raises(PasswordRefused):
         world.people.add("ana", "viewer", password)
-    assert world.store.users() == []
+    assert world.store.people.all() == []
 
 
 @pytest.mark.parametrize("name", ["", "a b", "<b>", "x" * 65, "-a", "a\n", "ünal"])
@@ -115,8 +115,8 @@ def test_sessions_of_long_ago_are_cleared_away(world: World) -> None:
     old = world.people.begin(ana)
     world.clock.later(days=31)
     new = world.people.begin(ana)
-    assert world.store.session(digest_of(old)) is None
-    assert world.store.session(digest_of(new)) is not None
+    assert world.store.people.session(digest_of(old)) is None
+    assert world.store.people.session(digest_of(new)) is not None
 
 
 def test_a_token_has_at_most_its_scopes_and_ends(world: World) -> None:

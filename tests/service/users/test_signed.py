@@ -177,7 +177,7 @@ def test_export_signs_and_import_checks(folder: Path, capsys: pytest.CaptureFixt
     table.write_text(table.read_text() + "\n")
     assert standing("m.toml") == "error SIG-001"
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        told = [(r.action, r.outcome) for r in store.audit()]
+        told = [(r.action, r.outcome) for r in store.audit.events()]
     signed = [outcome for action, outcome in told if action == "abbe comp export"]
     assert signed == ["SIG-001", "SIG-001", "done"]  # without a machine file it is the default database, which is the same here
     assert [outcome for action, outcome in told if action == "abbe comp import"].count("SIG-001") == 4

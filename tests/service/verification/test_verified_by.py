@@ -33,7 +33,7 @@ from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler import record
 from abbe.service.scheduler.fleet import MachineStatus, stands
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.verification.verified_by import STRANGE, VerifiedBy, verified_by
 from abbe.service.web.page import environment, render
 from abbe.service.web.pages.times import trend_screen
@@ -49,19 +49,19 @@ class World:
     """A database with checks and pushes of one machine, and every display over it."""
 
     url: str
-    store: ServiceStore
+    store: Store
     board: Board
 
     def check(self, verdict: str, table: bytes | None = None, value: float = 9.0, begun: datetime | None = None) -> int:
         """A check that ends now, with the table that its campaign says was in force. ``begun``: when it says that it began."""
         now = datetime.now(UTC)
-        machine = self.store.add_machine("mill-7", MACHINE)
+        machine = self.store.machines.add("mill-7", MACHINE)
         name = f"quick-check {now:%H:%M:%S.%f}"
         if table is not None:
-            self.store.add_campaign(machine, name, {"table_crc": crc32(table)})
+            self.store.campaigns.add(machine, name, {"table_crc": crc32(table)})
         told = Result(verdict, {"body_diagonal_um": value}, text=verdict, started_utc=begun or now, duration_s=1.0, campaign=name)
         occasion = record.Occasion("mill-7", Schedule("weekly", "0 6 * * 1", "UTC", "quick-check"), now)
-        return self.store.keep_verification(machine, record.found(occasion, told), [])
+        return self.store.verifications.add_with_messages(machine, record.found(occasion, told), [])
 
     def push(self, base: bytes, new: bytes, states: tuple[Any, ...] = KEPT, **doc: Any) -> None:
         asyncio.run(as_if_pushed(self.store, SystemClock(), "mill-7", doc or {"proposal": 1}, (base, new), states))
@@ -103,8 +103,8 @@ class World:
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
     url = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    with ServiceStore.open(url) as store:
-        store.add_machine("mill-7", MACHINE)
+    with Store.open(url) as store:
+        store.machines.add("mill-7", MACHINE)
         yield World(url, store, Board({}, SystemClock()))
 
 
@@ -166,7 +166,7 @@ def test_the_same_table_as_before_is_unverified_as_well(world: World) -> None:
 def test_a_kept_push_is_verified_by_itself_and_says_so(world: World) -> None:
     world.check("fail", OLD, 42.0)
     world.push(OLD, NEW)
-    world.store.add_verification(1, None, "pass", {"text": "better", "push": 1, "figures": {}})
+    world.store.verifications.add(1, None, "pass", {"text": "better", "push": 1, "figures": {}})
     known = world.known()
     assert (known.state, known.why, known.number) == ("verified", "push", 1)
     assert "measured before and after; not checked since" in known.text
@@ -180,7 +180,7 @@ def test_a_push_that_was_taken_back_leaves_the_verdict_as_it_was(world: World) -
     """Its own verification is of a table that is not in force; it was the newest, and its "fail" was the machine's."""
     check = world.check("pass", OLD)
     world.push(OLD, NEW, TAKEN_BACK)
-    world.store.add_verification(1, None, "fail", {"text": "no improvement", "push": 1, "figures": {}})
+    world.store.verifications.add(1, None, "fail", {"text": "no improvement", "push": 1, "figures": {}})
     assert (world.known().why, world.known().number) == ("check", check)
     assert world.fleet().verdict == "pass"
     assert '<p class="verdict pass">' in world.home()
@@ -218,7 +218,7 @@ def test_a_table_that_somebody_else_changed_is_unverified_until_a_person_has_loo
     world.board.attention.append(text)
     assert world.status().verified.why == "changed"
     assert world.fleet().verdict == "pass"
-    world.store.put_heartbeat("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
+    world.store.heartbeats.put("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     assert world.fleet().verdict == "unverified"
     world.accept(b"a stranger's table")
     assert world.known().why == "accepted"
@@ -228,14 +228,14 @@ def test_a_check_measured_after_what_the_service_saw_ends_it(world: World) -> No
     """The service is gone, and so is what it said last: a check found the journal's table in force since."""
     world.push(OLD, NEW)
     text = f"{STRANGE}: somebody else changed the compensation in force"
-    world.store.put_heartbeat("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
+    world.store.heartbeats.put("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     world.check("pass")
     assert world.known().why == "changed", "with which table, nobody wrote down"
     world.check("pass", b"a stranger's table")
     assert world.known().why == "changed"
     world.check("pass", NEW)
     assert (world.known().why, world.fleet().verdict) == ("check", "pass")
-    world.store.put_heartbeat("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
+    world.store.heartbeats.put("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     assert world.known().why == "changed", "seen again"
 
 
@@ -254,7 +254,7 @@ def test_a_check_that_began_with_the_word_for_its_table_counts(world: World) -> 
 def test_a_changed_journal_is_no_verdict(world: World) -> None:
     world.push(OLD, NEW)
     world.check("pass", NEW)
-    with world.store._engine.begin() as connection:  # as somebody with a way to the database would
+    with world.store.engine.begin() as connection:  # as somebody with a way to the database would
         connection.exec_driver_sql("UPDATE push_entries SET utc = '2026-01-01T00:00:00Z' WHERE id = 3")
     assert (world.known().state, world.known().why) == ("unknown", "journal")
     assert world.fleet().verdict == "unknown"

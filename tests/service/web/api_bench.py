@@ -31,7 +31,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.exchange import import_folder
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
@@ -72,7 +72,7 @@ class Hour:
 class Plant:
     """A store with content, and the application over it."""
 
-    store: ServiceStore
+    store: Store
     url: str
     clock: Hour
     people: People
@@ -88,7 +88,7 @@ class Plant:
 
     def token(self, role: str) -> dict[str, str]:
         scopes = sorted(ALLOWED[Role(role)])
-        title = f"t{len(self.store.tokens())}"
+        title = f"t{len(self.store.people.tokens())}"
         return {"Authorization": f"Bearer {self.people.add_token(f'a-{role}', title, scopes, 5.0)}"}
 
 
@@ -100,79 +100,79 @@ def bar_samples() -> list[BarSample]:
     return out
 
 
-def fill(store: ServiceStore, folder: Path) -> list[int]:
+def fill(store: Store, folder: Path) -> list[int]:
     """One of everything; returns the proposals that can be approved."""
     import_folder(store, write_case(folder / "c1"))
     job = prepare(from_store(store, "c1"), catalogue())
     discover(job, journal_of(store, job), Search(), ignore_progress)
-    machine = store.machines()[0].id
-    _runs(store, store.add_campaign(machine, "c2", {}))
-    store.add_campaign(store.add_machine("other mill", {"odd": True}), "empty", {})
+    machine = store.machines.all()[0].id
+    _runs(store, store.campaigns.add(machine, "c2", {}))
+    store.campaigns.add(store.machines.add("other mill", {"odd": True}), "empty", {})
     _checks(store, machine)
-    store.add_solution(store.campaign("c1").id, "other", [], {"old": "form"})
+    store.solutions.add(store.campaigns.find("c1").id, "other", [], {"old": "form"})
     made = asyncio.run(_proposals(store))
     asyncio.run(_push(store))
     return made
 
 
-def _runs(store: ServiceStore, campaign: int) -> None:
+def _runs(store: Store, campaign: int) -> None:
     """A ball-bar run, one of the laser, one that broke off, one that was written by something else."""
     path = {"feed_mm_min": 6000.0, "direction": -1, "points_mm": POINTS}
     start = {"setup": {"setup_id": "A", "t_set_s": 3.5}, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
     samples = bar_samples()
     for label, status in (("r01", "complete"), ("r02", "aborted")):
-        run = store.start_run(campaign, label, "ballbar_helix", "identify", start)
+        run = store.runs.start(campaign, label, "ballbar_helix", "identify", start)
         for number, at in enumerate(range(0, SAMPLES, 100)):
             part = samples[at : at + 100]
-            store.append_chunk(run, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
+            store.chunks.append(run, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
         end = {"path_start_us": 8_000_000, "path_end_us": 8_000_000 + PATH_US, "gaps": [{"first": 3, "last": 4}]}
-        store.finish_run(run, status, "", end if status == "complete" else None)
-    run = store.start_run(campaign, "r03", "laser_linear", "identify", {"setup": {"setup_id": "L", "t_set_s": 0.1}, "machine": MACHINE})
+        store.runs.finish(run, status, "", end if status == "complete" else None)
+    run = store.runs.start(campaign, "r03", "laser_linear", "identify", {"setup": {"setup_id": "L", "t_set_s": 0.1}, "machine": MACHINE})
     records = [{"t_s": 1.0 * k, "position_mm": [10.0 * k, 0.0, 0.0], "note": "é"} for k in range(25)]
-    store.append_chunk(run, "laser", 0, 25, JSON_CODEC, encode_json(records), 0.0, 0.0, 0, 0)
-    store.finish_run(run, "failed", "SEQ-003 beam", None)
-    store.finish_run(store.start_run(campaign, "r04 '; DROP", "ballbar_circle", "sealed", {}), "complete", "", None)
+    store.chunks.append(run, "laser", 0, 25, JSON_CODEC, encode_json(records), 0.0, 0.0, 0, 0)
+    store.runs.finish(run, "failed", "SEQ-003 beam", None)
+    store.runs.finish(store.runs.start(campaign, "r04 '; DROP", "ballbar_circle", "sealed", {}), "complete", "", None)
 
 
-def _checks(store: ServiceStore, machine: int) -> None:
+def _checks(store: Store, machine: int) -> None:
     for k in range(CHECKS):
         at = (datetime(2026, 11, 1, 6, tzinfo=UTC) + timedelta(days=k)).isoformat()
         doc = {"machine": NAME, "schedule": "daily", "recipe": "quick-check", "slot_utc": at, "started_utc": at, "duration_s": 60.0}
         doc |= {"verdict": "pass", "values": {"body_diagonal_um": 10.0 + 0.3 * k, "helix_rms_um": None}}
         doc |= {"uncertainties": {"body_diagonal_um": 1.0, "helix_rms_um": None}, "limits": {"body_diagonal_um": 20.0, "helix_rms_um": 3.0}}
         doc |= {"campaign": "c1" if k == 0 else "", "runs": [], "text": "inside", "cause": None}
-        store.keep_verification(machine, doc, [])
-        store.claim_slot(f"{NAME}/daily", at)
-        store.finish_slot(f"{NAME}/daily", at, "done: pass", "as planned")
+        store.verifications.add_with_messages(machine, doc, [])
+        store.slots.claim(f"{NAME}/daily", at)
+        store.slots.finish(f"{NAME}/daily", at, "done: pass", "as planned")
 
 
-async def _proposals(store: ServiceStore) -> list[int]:
+async def _proposals(store: Store) -> list[int]:
     """Proposals 1 as it was made, 2 and 3 without what spoke against it, 4 for a machine that needs two people, 5 that was altered."""
     image = encode(TableImage(0, 0, 100, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0, 0, 0), ()))
     base = Base(CompStatus(0xAB, 2, 0, (crc32(image), 0), (2, 0), 0, 0), image)
     found = from_store(store, "c1")
-    records = store.runs("c1")
-    gathered = Gathered(store.campaign("c1"), records, found.runs, base, TableFormat(100, 4096))
+    records = store.runs.all("c1")
+    gathered = Gathered(store.campaigns.find("c1"), records, found.runs, base, TableFormat(100, 4096))
     made = await make(store, found.site, gathered, progress=ignore_progress)
     assert made.proposed.reasons, "imported circles without temperatures speak against themselves"
     free = replace(made.proposed, reasons=(), by="somebody")
     numbers = [_stored(store, free), _stored(store, free), _stored(store, replace(free, two_people=True, by="a-approver"))]
-    row = store.proposal(numbers[0])
-    store.add_proposal(row.machine, row.solution_id, row.doc | {"by": "another"}, row.digest)
+    row = store.proposals.get(numbers[0])
+    store.proposals.add(row.machine, row.solution_id, row.doc | {"by": "another"}, row.digest)
     assert load(store, numbers[0]).valid_until_s > 0
     return numbers[:2]
 
 
-def _stored(store: ServiceStore, proposed: Any) -> int:
+def _stored(store: Store, proposed: Any) -> int:
     doc = doc_of(proposed)
-    return store.add_proposal(NAME, proposed.solution_id, doc, digest_of_doc(doc))
+    return store.proposals.add(NAME, proposed.solution_id, doc, digest_of_doc(doc))
 
 
-async def _push(store: ServiceStore) -> None:
+async def _push(store: Store) -> None:
     """A push that was refused before anything was written."""
     image = load(store, 2).image
     base = load(store, 2).base.image
-    table = store.add_table(store.machines()[0].id, 1, image, crc32(image), {"proposal": 1})
+    table = store.tables.add(store.machines.all()[0].id, 1, image, crc32(image), {"proposal": 1})
     book = await StoreBook.new(store, NAME, Hour())
     known = {
         "table": table,
@@ -191,7 +191,7 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
     """The plant over a SQLite file in ``folder``, with a user of each role; close the stack."""
     stack, clock = contextlib.ExitStack(), Hour()
     url = f"sqlite:///{folder / 'abbe.sqlite3'}"
-    store = stack.enter_context(ServiceStore.open(url, utcnow=clock.utc))
+    store = stack.enter_context(Store.open(url, utcnow=clock.utc))
     approvable = fill(store, folder)
     people = People(store, clock, Passwords(memory_kib=64, passes=1))
     for role in Role:
@@ -203,7 +203,7 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
     return Plant(store, url, clock, people, book, app, auth, approvable), stack
 
 
-def app_of(store: ServiceStore, clock: Hour, auth: Authenticator | None) -> FastAPI:
+def app_of(store: Store, clock: Hour, auth: Authenticator | None) -> FastAPI:
     board = Board({"cnc": "modbus://127.0.0.1:5020"}, clock)
     schedules = (Schedule("daily", "0 6 * * *", "Europe/Berlin", "quick-check"), Schedule("hours", "", "UTC", "verification", every_h=8.0))
     view = StatusReader(Reader(store, NAME, clock), "0.1.0", board, list, "")

@@ -28,8 +28,8 @@ async def client(plant: Plant) -> AsyncIterator[httpx.AsyncClient]:
 @pytest.fixture
 def fresh(plant: Plant) -> int:
     """A proposal that nobody has decided on."""
-    row = plant.store.proposal(plant.approvable[0])
-    return plant.store.add_proposal(row.machine, row.solution_id, row.doc, row.digest)
+    row = plant.store.proposals.get(plant.approvable[0])
+    return plant.store.proposals.add(row.machine, row.solution_id, row.doc, row.digest)
 
 
 async def decide(client: httpx.AsyncClient, number: int, what: str, who: dict[str, str], key: str = "k1", **body: Any) -> httpx.Response:
@@ -45,10 +45,10 @@ async def test_approved_by_a_session_is_what_a_push_will_find(client, plant, fre
         "expiry": "2026-11-22T11:00:00.000000Z", "reason": None,
     }  # fmt: skip
     proposed = load(plant.store, fresh)
-    found, why = valid_approval(proposed, plant.store.approvals(fresh), plant.clock.utc().timestamp(), two_people=True)
+    found, why = valid_approval(proposed, plant.store.proposals.approvals(fresh), plant.clock.utc().timestamp(), two_people=True)
     assert (why, found.name, found.login) == ("", "a-approver", "user:a-approver")
     assert (await client.get(f"/proposals/{fresh}", headers=plant.token("viewer"))).json()["state"] == "approved"
-    last = plant.store.audit(1)[0]
+    last = plant.store.audit.events(1)[0]
     assert (last.who, last.target, last.outcome) == ("user:a-approver", f"/api/v1/proposals/{fresh}/approve", "done 200")
 
 
@@ -59,13 +59,13 @@ async def test_the_same_key_is_answered_again_and_does_nothing_again(client, pla
     assert (first.status_code, again.status_code, again.content) == (200, 200, first.content)
     assert (first.headers.get("idempotent-replayed"), again.headers["idempotent-replayed"]) == (None, "true")
     # The decision stands once in the audit; that somebody sent it again stands there as that.
-    told = [one.outcome for one in plant.store.audit(10) if one.action.endswith("/approve") and f"/{fresh}/" in one.target]
+    told = [one.outcome for one in plant.store.audit.events(10) if one.action.endswith("/approve") and f"/{fresh}/" in one.target]
     assert told[-2:] == ["done 200", "replayed 200"]
-    assert len(plant.store.approvals(fresh)) == 1
+    assert len(plant.store.proposals.approvals(fresh)) == 1
     other = await decide(client, fresh, "approve", who, key="same", hours=4)
     assert (other.status_code, other.json()["code"]) == (409, "API-001")
     assert (await decide(client, fresh, "reject", who, key="same", reason="no")).json()["code"] == "API-001"
-    assert plant.store.rejections(fresh) == []
+    assert plant.store.proposals.rejections(fresh) == []
     mine = await decide(client, fresh, "approve", plant.token("approver"), key="same", hours=4)
     assert mine.status_code == 200, "a key belongs to whoever made it up"
 
@@ -77,7 +77,7 @@ async def test_a_refusal_is_kept_for_its_key_too(client, plant):
         assert (answer.status_code, answer.json()["code"]) == (409, "CMP-001")
         assert "reasons against it" in answer.json()["detail"]
     assert answer.headers["content-type"] == "application/problem+json"
-    assert plant.store.approvals(1) == []
+    assert plant.store.proposals.approvals(1) == []
 
 
 async def test_requests_that_come_together_are_one(client, plant, fresh):
@@ -85,18 +85,18 @@ async def test_requests_that_come_together_are_one(client, plant, fresh):
     answers = await asyncio.gather(*(decide(client, fresh, "approve", who, key="at-once") for _ in range(12)))
     assert {answer.status_code for answer in answers} <= {200, 409}
     assert {answer.json().get("code") for answer in answers if answer.status_code == 409} <= {"API-002"}
-    assert len(plant.store.approvals(fresh)) == 1
+    assert len(plant.store.proposals.approvals(fresh)) == 1
 
 
 async def test_a_key_of_a_request_that_died_can_be_used_again(plant):
     store = plant.store
-    assert store.claim_reply("user:x", "k", "d") is None
-    assert store.claim_reply("user:x", "k", "d").status is None
+    assert store.replies.claim("user:x", "k", "d") is None
+    assert store.replies.claim("user:x", "k", "d").status is None
     plant.clock.now = plant.clock.now.replace(minute=2)
     try:
-        assert store.claim_reply("user:x", "k", "d") is None
-        store.keep_reply("user:x", "k", 200, "{}")
-        assert store.claim_reply("user:x", "k", "d").body == "{}"
+        assert store.replies.claim("user:x", "k", "d") is None
+        store.replies.keep("user:x", "k", 200, "{}")
+        assert store.replies.claim("user:x", "k", "d").body == "{}"
     finally:
         plant.clock.now = plant.clock.now.replace(minute=0)
 
@@ -104,10 +104,10 @@ async def test_a_key_of_a_request_that_died_can_be_used_again(plant):
 async def test_nobody_is_two_people_by_a_token(client, plant):
     """Proposal 4 was made by a-approver on a machine that needs two people."""
     for who in ({**plant.session("approver"), "Origin": BASE}, plant.token("approver")):
-        answer = await decide(client, 4, "approve", who, key=f"own-{len(plant.store.tokens())}")
+        answer = await decide(client, 4, "approve", who, key=f"own-{len(plant.store.people.tokens())}")
         assert (answer.status_code, answer.json()["code"]) == (409, "CMP-001")
         assert "second person" in answer.json()["detail"]
-    assert plant.store.approvals(4) == []
+    assert plant.store.proposals.approvals(4) == []
 
 
 async def test_a_rejection_is_final_and_says_why(client, plant, fresh):
@@ -141,7 +141,7 @@ async def test_a_push_is_told_of_a_rejection(plant, fresh):
 async def test_a_rejection_needs_a_reason(client, plant, fresh, reason):
     answer = await decide(client, fresh, "reject", plant.token("approver"), key=f"r{fresh}", reason=reason)
     assert answer.status_code in {409, 422}
-    assert plant.store.rejections(fresh) == []
+    assert plant.store.proposals.rejections(fresh) == []
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ async def test_bodies_that_are_none(client, plant, fresh, content, kind):
     answer = await client.post(f"/proposals/{fresh}/approve", content=content, headers=headers)
     assert answer.status_code in {400, 413, 422}, answer.text
     assert answer.headers["content-type"].startswith(("application/problem+json", "text/plain"))
-    assert plant.store.approvals(fresh) == []
+    assert plant.store.proposals.approvals(fresh) == []
 
 
 @pytest.mark.parametrize("key", [None, "", "with space", "k" * 101, "ключ".encode(), "'; DROP TABLE replies; --"])
@@ -175,4 +175,4 @@ async def test_without_a_key_nothing_is_decided(client, plant, fresh, key):
     headers: dict[str, Any] = plant.token("approver") | ({} if key is None else {"Idempotency-Key": key})
     answer = await client.post(f"/proposals/{fresh}/approve", json={}, headers=headers)
     assert (answer.status_code, answer.json()["code"]) == (422, "WEB-422")
-    assert plant.store.approvals(fresh) == []
+    assert plant.store.proposals.approvals(fresh) == []

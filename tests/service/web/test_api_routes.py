@@ -48,7 +48,7 @@ async def test_pages_have_every_run_once_newest_first(client, plant):
         if (cursor := part["next_cursor"]) is None:
             break
         assert len(part["runs"]) == 3
-    assert seen == [run.id for run in reversed(plant.store.runs())]
+    assert seen == [run.id for run in reversed(plant.store.runs.all())]
 
 
 async def test_filters_reach_the_read_model(client):
@@ -59,7 +59,7 @@ async def test_filters_reach_the_read_model(client):
 
 
 async def test_samples_are_those_that_were_stored(client, plant):
-    run = plant.store.run("c2/r01").id
+    run = plant.store.runs.find("c2/r01").id
     told = await got(client, f"/runs/{run}")
     assert told["channels"] == [{"channel": "bar", "codec": "bar/1", "chunks": 11, "samples": SAMPLES}]
     assert told["gaps"] == 1
@@ -78,16 +78,16 @@ async def test_samples_are_those_that_were_stored(client, plant):
 
 
 async def test_laser_records_and_columns(client, plant):
-    run = plant.store.run("c2/r03").id
+    run = plant.store.runs.find("c2/r03").id
     part = await got(client, f"/runs/{run}/samples", channel="laser", first=20)
     assert [record["t_s"] for record in part["records"]] == [20.0, 21.0, 22.0, 23.0, 24.0]
     assert (part["count"], part["total"], part["records"][0]["note"]) == (5, 25, "é")
-    bar = plant.store.run("c2/r01").id
+    bar = plant.store.runs.find("c2/r01").id
     columns = await got(client, f"/runs/{bar}/columns", first=10, limit=5)
     whole = load_run(plant.store, bar)["columns"]
     assert columns["columns"]["x_mm"] == whole["x_mm"][10:15]
     assert columns["total"] == len(whole["x_mm"])
-    sealed = plant.store.run("c1/r04").id
+    sealed = plant.store.runs.find("c1/r04").id
     assert (await got(client, f"/runs/{sealed}/columns"))["columns"]["deviation_mm"] is None
 
 
@@ -122,7 +122,7 @@ async def test_what_is_not_there_is_told_with_its_code(client, path, params, wan
 
 async def test_a_run_that_cannot_be_evaluated_is_told(client, plant):
     for label in ("c2/r03", "c2/r04 '; DROP"):
-        assert await code(client, f"/runs/{plant.store.run(label).id}/columns") == (409, "STO-003")
+        assert await code(client, f"/runs/{plant.store.runs.find(label).id}/columns") == (409, "STO-003")
 
 
 async def test_machines_campaigns_and_what_was_made_of_them(client, plant):
@@ -135,7 +135,7 @@ async def test_machines_campaigns_and_what_was_made_of_them(client, plant):
     assert campaign["discoveries"] == [1]
     assert set(campaign["solutions"]) == {1, 2}
     found = await got(client, "/solutions/2")
-    stored = plant.store.solution(2).doc
+    stored = plant.store.solutions.get(2).doc
     assert found["document"]["not_observable"] == stored["not_observable"]
     assert len(found["document"]["not_observable"]) > 0
     u = {name: one["u"] for name, one in found["document"]["parameters"].items()}

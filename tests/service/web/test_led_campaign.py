@@ -111,7 +111,7 @@ async def test_the_answer_is_the_core_s_and_stands_in_the_audit(desk: Desk, plan
     who = plant.token("operator")
     answer = (await desk.client.post(DONE, headers=who)).json()
     assert (answer["kind"], answer["state"], answer["prompt"], answer["ask"], answer["proposal"]) == ("campaign", "asking", 3, ASK, None)
-    record = plant.store.audit(1)[0]
+    record = plant.store.audit.events(1)[0]
     assert (record.target, record.outcome) == (f"job {NUMBER}, prompt 3", "done 202")
     desk.answer = ("conflict", "prompt 3 is not what this job waits for", "")
     late = await desk.client.post(DONE, headers=who)
@@ -157,7 +157,7 @@ async def test_who_may_not_propose_starts_checks_only(desk: Desk, plant: Plant) 
         for rate in (100, 500):
             sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "rate_hz": rate}, headers=who)
             assert (sent.status_code, "needs 'propose'" in sent.json()["detail"], desk.asked) == (403, True, [])
-    record = plant.store.audit(1)[0]
+    record = plant.store.audit.events(1)[0]
     assert (record.target, record.outcome) == (f"recipe {CAMPAIGN} at 500 Hz", "refused 403")
     await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
     shown = await desk.page(f"/new?recipe={CAMPAIGN}", plant.session("operator"))

@@ -11,8 +11,8 @@ from tests.service.web.api_bench import Plant
 
 def test_a_rejected_proposal_stays_one(plant: Plant, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SystemClock, "utc", lambda _: plant.clock.utc())  # its measurement is not too old yet
-    row = plant.store.proposal(plant.approvable[0])
-    number = str(plant.store.add_proposal(row.machine, row.solution_id, row.doc, row.digest))
+    row = plant.store.proposals.get(plant.approvable[0])
+    number = str(plant.store.proposals.add(row.machine, row.solution_id, row.doc, row.digest))
     at = ["--db", plant.url]
     assert run(["comp", "reject", number, "--reason", " ", *at]) == 1
     assert "without a reason" in capsys.readouterr().out

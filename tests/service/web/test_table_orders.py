@@ -110,7 +110,7 @@ async def test_the_answer_is_the_core_s(desk: Desk, plant: Plant) -> None:
     desk.answer = ("done", "asked for before, with this key", JOB.id)
     answer = await desk.post(who)
     assert (answer.status_code, answer.headers[REPLAYED]) == (202, "true")
-    assert plant.store.audit(1)[0].outcome == "replayed 202"
+    assert plant.store.audit.events(1)[0].outcome == "replayed 202"
     for outcome, status in (("forbidden", 403), ("conflict", 409), ("busy", 409)):
         desk.answer = (outcome, "one clear line", "")  # type: ignore[assignment]
         answer = await desk.post(who)

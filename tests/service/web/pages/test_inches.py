@@ -102,7 +102,7 @@ def test_every_node_of_the_map_and_its_picture(running: Served) -> None:
 
 
 def test_a_prediction(running: Served) -> None:
-    record, one = running.store.solution(running.filled.solution), observed(running)
+    record, one = running.store.solutions.get(running.filled.solution), observed(running)
     page = got(running, f"/whatif?id={record.id}&take={one}")
     outcomes = forecast(stored_field(running.store, record), [one])
     rows = [re.findall(PAIR, row) for row in re.findall(r"<tr><th scope=\"row\">.*?</tr>", page)]
@@ -122,7 +122,7 @@ def test_a_prediction(running: Served) -> None:
 
 
 def test_the_budget(running: Served) -> None:
-    doc = running.store.solution(running.filled.solution).doc
+    doc = running.store.solutions.get(running.filled.solution).doc
     page = got(running, f"/budget?id={running.filled.solution}")
     sizes = dict(re.findall(r'<td class="words">(.*?)</td><td class="n">([\d.]+)</td>', page))
     for b in doc["uncertainty"]["budget"]:
@@ -154,7 +154,7 @@ def test_the_picture_of_a_result_has_the_unit_of_its_table(running: Served) -> N
 
 
 def test_compared_runs(running: Served) -> None:
-    records = [running.store.run(n) for n in runs_of(running, "ballbar_helix")[1:3]]
+    records = [running.store.runs.find(n) for n in runs_of(running, "ballbar_helix")[1:3]]
     page = got(running, "/compare?" + "&".join(f"run={r.id}" for r in records))
     loaded = []
     for record in records:

@@ -18,7 +18,7 @@ from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.fleet import FleetFigure, MachineLine
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from abbe.service.web.app import create_app
 from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line
@@ -29,7 +29,7 @@ from tests.service.web.pages.test_screens import as_user
 CANARY = "c4n4ry-7f3a"
 
 
-def machine(store: ServiceStore, name: str, value: float | None, verdict: str) -> None:
+def machine(store: Store, name: str, value: float | None, verdict: str) -> None:
     at = datetime.now(UTC).isoformat()
     doc = {"machine": name, "started_utc": at, "verdict": verdict, "values": {} if value is None else {"body_diagonal_um": value}}
     doc |= {
@@ -40,11 +40,11 @@ def machine(store: ServiceStore, name: str, value: float | None, verdict: str) -
         "runs": [],
         "cause": None,
     }
-    store.keep_verification(store.add_machine(name, {"name": name}), doc, [])
+    store.verifications.add_with_messages(store.machines.add(name, {"name": name}), doc, [])
 
 
 def test_machines_stand_worst_first_and_can_be_filtered(tmp_path: Path) -> None:
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
+    with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
         machine(store, "good", 8.0, "pass")
         machine(store, "bad", 30.0, "fail")
         machine(store, "broken", None, "cannot tell")
@@ -72,11 +72,11 @@ def test_a_certificate_says_how_long_it_holds(tmp_path: Path) -> None:
     today = date(2026, 11, 22)
     until = {"ballbar": today + timedelta(days=5), "laser": today - timedelta(days=1)}
     devices = [DeviceStatus(role=r, url=f"modbus://me:{CANARY}@h/{r}", state="answered") for r in ("cnc", "ballbar", "laser")]
-    with ServiceStore.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
-        number = store.add_campaign(store.add_machine("m", {}), "c", {})
+    with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
+        number = store.campaigns.add(store.machines.add("m", {}), "c", {})
         told = {"link": "laser", "device": "d", "code": "DRV-003", "run": "r1", "text": "no answer"}
         for phase, state in (("detected", ""), ("outcome", "recovered")):
-            store.add_checkpoint(number, "incident", told | {"phase": phase, "state": state, "times": 3})
+            store.checkpoints.add(number, "incident", told | {"phase": phase, "state": state, "times": 3})
         screen = device_screen(store, "m", devices, until, today)
     assert [None if line.certificate is None else line.certificate.sign for line in screen.lines] == [None, "open", "bad"]
     assert CANARY not in "".join(line.url for line in screen.lines)
@@ -163,7 +163,7 @@ def test_what_stands_under_a_word_for_a_secret_is_blanked_whole_and_nothing_else
 
 def test_the_bundle_holds_no_secret_and_stands_in_the_audit(running: Served) -> None:
     secret = running.people.begin(running.people.get("adam"))
-    hashes = [user.password for user in running.store.users()]
+    hashes = [user.password for user in running.store.people.all()]
     running.tail._lines.extend([f"mqtt://me:{CANARY}@broker refused", f"login with password={CANARY}", f"cookie: {secret}"])
     running.board.devices = [replace(d, url=f"modbus://me:{CANARY}@127.0.0.1:502") for d in running.board.devices]
     with as_user(running, "adam") as client:
@@ -176,7 +176,7 @@ def test_the_bundle_holds_no_secret_and_stands_in_the_audit(running: Served) -> 
     assert [one for one in (CANARY, secret, *hashes) if one in whole] == []
     assert json.loads(texts["config.json"])["machine"] == running.filled.machine
     assert json.loads(texts["diagnosis.json"])["size_b"] > 10_000
-    assert any(record.action == "support bundle" and record.who == "user:adam" for record in running.store.audit(50))
+    assert any(record.action == "support bundle" and record.who == "user:adam" for record in running.store.audit.events(50))
 
 
 async def test_a_screen_that_is_not_there_is_not_in_the_bar(running: Served) -> None:

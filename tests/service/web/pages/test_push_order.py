@@ -21,7 +21,7 @@ from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
-from abbe.service.scheduler.store import ServiceStore
+from abbe.service.storage.store import Store
 from tests.pages_world import Filled, Served
 from tests.patience import within
 from tests.pretended_push import TAKEN_BACK, as_if_pushed
@@ -32,7 +32,7 @@ from tests.service.core.fakes import FakeLedger, FakeShelf, fake_checks
 class Bench:
     """A copy of the filled store, and orders over it; the push writes into the journal that it was taken back, and says otherwise."""
 
-    store: ServiceStore
+    store: Store
     audit: AuditBook
     filled: Filled
     clock: SystemClock = field(default_factory=SystemClock)
@@ -78,7 +78,7 @@ async def bench(running: Served, tmp_path: Path) -> AsyncIterator[Bench]:
     with closing(sqlite3.connect(running.filled.url.removeprefix("sqlite:///"))) as there, closing(sqlite3.connect(copy)) as here:
         there.backup(here)
     url = f"sqlite:///{copy}"
-    with ServiceStore.open(url) as store:
+    with Store.open(url) as store:
         made = Bench(store, AuditBook(store, url), running.filled)
         async with asyncio.TaskGroup() as tasks:
             made.book.open(made.scheduler, tasks)
@@ -99,7 +99,7 @@ async def test_only_what_is_approved_is_pushed_and_the_journal_has_the_word(benc
     assert (done.kind, done.who, done.state, bench.pushed) == ("push", "user:anna", "done: rolled back", [number])
     assert (await bench.ask(number, key="k")).job == first.job
     assert (await bench.ask(number)).text.startswith(f"proposal {number} is rolled back")
-    told = [(r.who, r.action, r.outcome, r.doc["proposal"]) for r in bench.store.audit(2)]
+    told = [(r.who, r.action, r.outcome, r.doc["proposal"]) for r in bench.store.audit.events(2)]
     assert told == [("user:anna", "push", "begun", number), ("user:anna", "push", "rolled back", number)]
 
 

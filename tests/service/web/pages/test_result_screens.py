@@ -23,7 +23,7 @@ from tests.pages_world import Served, as_user
 
 
 def statuses(running: Served) -> dict[str, str]:
-    return {name: told["status"] for name, told in running.store.solution(running.filled.solution).doc["motions"].items()}
+    return {name: told["status"] for name, told in running.store.solutions.get(running.filled.solution).doc["motions"].items()}
 
 
 def observed(running: Served) -> str:
@@ -45,9 +45,9 @@ def test_the_interface_answers_the_map_with_the_whole_covariance(running: Served
     number = running.filled.solution
     with as_user(running, "vera") as client:
         told = client.get(f"/api/v1/solutions/{number}/field", params={"nodes": 3}).json()
-    doc = running.store.solution(number).doc
+    doc = running.store.solutions.get(number).doc
     terms, coefficients, covariance = stored_prediction(doc["prediction"])
-    machine = machine_from_doc(running.store.machines()[-1].doc | doc["machine"])
+    machine = machine_from_doc(running.store.machines.all()[-1].doc | doc["machine"])
     points = np.array([[x, y, z] for x in told["x_mm"] for y in told["y_mm"] for z in told["z_mm"]])
     d = field(machine, terms, points, None, volume_frame(machine))
     assert np.allclose(told["deviation_um"], 1e3 * d @ coefficients, atol=6e-4)
@@ -124,7 +124,7 @@ def test_a_prediction_is_asked_only_for_what_shows_by_itself(running: Served) ->
 
 
 def test_the_budget_has_type_freedom_and_intervals(running: Served) -> None:
-    doc = running.store.solution(running.filled.solution).doc
+    doc = running.store.solutions.get(running.filled.solution).doc
     page = got(running, f"/budget?id={running.filled.solution}")
     lines = doc["uncertainty"]["budget"]
     assert {b["source"] for b in lines if b["type"] == "A"} == {"bar_noise", "laser_noise", "estimated_sizes"}
@@ -145,7 +145,7 @@ def test_the_budget_has_type_freedom_and_intervals(running: Served) -> None:
 
 
 def runs_of(running: Served, test: str) -> list[int]:
-    return [r.id for r in running.store.runs() if r.test == test and r.visible_status == "complete"]
+    return [r.id for r in running.store.runs.all() if r.test == test and r.visible_status == "complete"]
 
 
 def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> None:
@@ -163,9 +163,9 @@ def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> No
     assert "<polyline" not in refused
     lines = "&".join(f"run={n}" for n in runs_of(running, "laser_linear")[:2])
     assert "they ran along different paths" in got(running, f"/compare?{lines}", 409)
-    other = next(r.id for r in running.store.runs() if r.campaign == "c1" and r.label == "r01")
+    other = next(r.id for r in running.store.runs.all() if r.campaign == "c1" and r.label == "r01")
     assert "runs of two machines have no difference" in got(running, f"/compare?run={laser}&run={other}", 409)
-    sealed = next(r.id for r in running.store.runs() if r.campaign == "c1" and r.label == "r04")
+    sealed = next(r.id for r in running.store.runs.all() if r.campaign == "c1" and r.label == "r04")
     assert "it is sealed" in got(running, f"/compare?run={other}&run={sealed}", 409)
     assert "No run 999 in the store" in got(running, f"/compare?run={a}&run=999", 409)
     many = "&".join(f"run={n}" for n in range(1, 6))
@@ -173,11 +173,11 @@ def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> No
     chooser = got(running, f"/compare?run={laser}")
     offered = {int(n) for n in re.findall(r'name="run" value="(\d+)"', chooser)}
     assert offered
-    assert all(running.store.run(n).test == "laser_linear" for n in offered)
+    assert all(running.store.runs.find(n).test == "laser_linear" for n in offered)
 
 
 def test_a_difference_counts_the_mounting_and_names_direction_and_feed(running: Served) -> None:
-    record = running.store.run(runs_of(running, "ballbar_helix")[0])
+    record = running.store.runs.find(runs_of(running, "ballbar_helix")[0])
     run, document = run_document(running.store, record, Rules())
     one = LoadedRun("a", "m", run, run_data(run), document.figures)
     columns = {name: list(values) for name, values in run["columns"].items()}

@@ -59,13 +59,13 @@ def test_nobody_sees_a_screen_without_logging_in(running: Served) -> None:
 def test_who_may_approve(running: Served, filled: Filled, name: str) -> None:
     may = Permission.APPROVE in ALLOWED[Role(USERS[name])]
     form = {"number": str(filled.proposals[2]), "hours": "1"}
-    before = len(running.store.approvals(filled.proposals[2]))
+    before = len(running.store.proposals.approvals(filled.proposals[2]))
     with as_user(running, name) as client:
         answer = client.post("/proposal/approve", data=form)
         assert answer.status_code == (303 if may else 403)
         for wrong in ({CSRF_HEADER: "0" * 64}, {"Origin": "http://evil.example"}):
             assert client.post("/proposal/approve", data=form, headers=wrong).status_code == 403
-    told = running.store.approvals(filled.proposals[2])
+    told = running.store.proposals.approvals(filled.proposals[2])
     assert len(told) == before + may
     if may:
         assert (told[-1].name, told[-1].login, answer.headers["location"]) == (name, f"user:{name}", f"/proposal?id={filled.proposals[2]}")
@@ -91,7 +91,7 @@ def test_what_cannot_be_approved_says_why(running: Served, form: dict[str, str],
         answer = client.post("/proposal/approve", data=form)
     assert answer.status_code == status
     assert answer.json()["detail"]
-    assert running.store.approvals(1) == []
+    assert running.store.proposals.approvals(1) == []
 
 
 def test_the_proposer_cannot_be_the_second_person(running: Served, filled: Filled) -> None:
@@ -104,7 +104,7 @@ def test_the_proposer_cannot_be_the_second_person(running: Served, filled: Fille
         running.people.set_role(PROPOSER, "metrologist")
     assert answer.status_code == 409
     assert "second person" in answer.json()["detail"]
-    assert all(a.name != PROPOSER for a in running.store.approvals(filled.proposals[2]))
+    assert all(a.name != PROPOSER for a in running.store.proposals.approvals(filled.proposals[2]))
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_the_result_names_all_21_motions_and_those_that_do_not_show(running: Ser
         page = client.get(f"/result?id={filled.solution}").text
     motions = re.findall(r'data-motion="(\w+)"', page)
     assert len(set(motions)) == len(motions) == 21
-    doc = running.store.solution(filled.solution).doc
+    doc = running.store.solutions.get(filled.solution).doc
     hidden = [name for name, told in doc["motions"].items() if told["status"] == "not observable"]
     assert page.count("not observable</td>") == len(hidden) > 3
     named = re.search(r"Not shown by themselves: ([^.]*)\.", page)
@@ -148,8 +148,8 @@ def test_the_result_names_all_21_motions_and_those_that_do_not_show(running: Ser
 
 
 def test_a_changed_proposal_is_shown_as_changed(running: Served) -> None:
-    doc = running.store.proposal(running.filled.proposals[0]).doc
-    number = running.store.add_proposal(running.filled.machine, running.filled.solution, doc | {"by": "somebody"}, "0" * 64)
+    doc = running.store.proposals.get(running.filled.proposals[0]).doc
+    number = running.store.proposals.add(running.filled.machine, running.filled.solution, doc | {"by": "somebody"}, "0" * 64)
     with as_user(running, "anna") as client:
         answer = client.get(f"/proposal?id={number}")
         assert (answer.status_code, "changed after it was stored" in answer.text) == (409, True)

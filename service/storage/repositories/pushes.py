@@ -1,0 +1,113 @@
+"""The journals of pushes: one chain for each control, named as the machine was that pushed first; only ever appended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sqlalchemy import Connection, func, select
+
+from abbe.service.domain.decisions import PushEntryRecord
+from abbe.service.errors import StoreError
+from abbe.service.storage.mappings import PUSH_ENTRY, PUSH_MARK
+from abbe.service.storage.repository import Repository, insert_row
+from abbe.service.storage.tables import push_entries
+
+MARKS = ("base_crc", "crc", "accepted_crc", "machine", "control", "by")
+"""Keys of an entry's document that say which tables, whose, and who vouched."""
+NAME_LENGTH = 200
+
+
+class Pushes(Repository):
+    """Journals of pushes."""
+
+    def append(self, entry: PushEntryRecord) -> int:
+        """Append an entry to its journal if the entry before it is still the last one; return its id. On return it is on disk.
+
+        Raises
+        ------
+        StoreError
+            Another process has written an entry meanwhile, or it cannot be written.
+        """
+
+        def work(connection: Connection) -> int:
+            query = select(push_entries.c.digest).where(push_entries.c.machine == entry.machine).order_by(push_entries.c.id.desc()).limit(1)
+            head = connection.execute(query).scalar()
+            if head is not None and head != entry.prev:
+                raise StoreError(
+                    f"push {entry.push} of {entry.machine}: somebody else has written into the journal meanwhile",
+                    "another process pushes or recovers on this machine: wait until it has ended",
+                )
+            return insert_row(connection, push_entries, **PUSH_ENTRY.values(entry, "id"))
+
+        return self._db.commit(work)
+
+    def chain(self, machine: str, control: str = "") -> str:
+        """Name of the journal of a control: that of the first machine that pushed into it.
+
+        Parameters
+        ----------
+        machine : str
+            Name of the machine.
+        control : str
+            Identity of its control. Empty: not known, the journal is that which this name was last used in.
+        """
+        doc = push_entries.c.doc
+        names = (push_entries.c.machine, doc["machine"].as_string().label("name"), doc["control"].as_string().label("control"))
+        query = select(*names).where(push_entries.c.seq == 0).order_by(push_entries.c.id.desc())
+        rows = self._db.read(lambda connection: connection.execute(query).all())
+        return chain_of([(row.machine, row.name or row.machine, row.control or "") for row in rows], machine, control)
+
+    def entries(self, machine: str, control: str = "") -> list[PushEntryRecord]:
+        """Read the journal of all pushes of a machine's control from its beginning (`chain`)."""
+        return self.entries_of(self.chain(machine, control))
+
+    def entries_of(self, chain: str) -> list[PushEntryRecord]:
+        """Read a journal by its own name."""
+        return self._all(PUSH_ENTRY, push_entries.c.machine == chain)
+
+    def last(self, machine: str, control: str = "") -> list[PushEntryRecord]:
+        """Read the journal of the last push of a machine's control (`chain`); empty if there was none."""
+        chain = self.chain(machine, control)
+        latest = select(func.max(push_entries.c.push)).where(push_entries.c.machine == chain).scalar_subquery()
+        return self._all(PUSH_ENTRY, push_entries.c.machine == chain, push_entries.c.push == latest)
+
+    def marks(self) -> list[PushEntryRecord]:
+        """Read what the journals of all machines say of tables, in the order of writing; documents hold `MARKS` only, no images."""
+        marks = [push_entries.c.doc[key].as_string().label(f"mark_{key}") for key in MARKS]
+        query = PUSH_MARK.select().add_columns(*marks).order_by(push_entries.c.id)
+        rows = self._db.read(lambda connection: connection.execute(query).mappings().all())
+        return [
+            replace(
+                PUSH_MARK.from_values(row),
+                doc={key: int(value) if key.endswith("crc") else str(value) for key in MARKS if (value := row[f"mark_{key}"]) is not None},
+            )
+            for row in rows
+        ]
+
+
+def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) -> str:
+    """Which journal is that of a control.
+
+    Parameters
+    ----------
+    begun : sequence of tuple
+        First entries of pushes, newest first: journal, name of the machine, control (empty: not known).
+    machine, control : str
+        Name and control of the machine; without a control the name decides: the journal that it was last used in.
+    """
+    if not control:
+        return next((chain for chain, name, _ in begun if name == machine), machine)
+    last: dict[str, tuple[str, str]] = {}
+    for chain, name, at in begun:
+        last.setdefault(chain, (name, at))
+    # An address that a control has left says nothing of who is there now: the last one of each journal counts.
+    own = next((chain for chain, (_, at) in last.items() if at == control), None)
+    if own is not None:
+        return own
+    # A control that is nowhere noted: at a new address. The journal of its name is its, unless a machine of another name has used it
+    # since. An open push in it is held against the control (`abbe.service.tables.whose_push`).
+    named = next((chain for chain, (name, _) in last.items() if name == machine), None)
+    if named is not None:
+        return named
+    return machine if machine not in last else f"{machine} ({control})"[:NAME_LENGTH]
