@@ -23,7 +23,7 @@ from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, installed, parse_url
 
 HEARTBEAT_S = 1.0
-"""A controller or laser that nobody asks anything is asked for its canary so often, so that a lost one is known within 3 s."""
+"""Seconds between two reads of the canary of an idle controller or laser, so that a lost one is known within 3 s."""
 
 
 async def open_ballbar(url: str) -> BallBar:
@@ -34,7 +34,7 @@ async def open_ballbar(url: str) -> BallBar:
     BadUrl
         Not such a URL.
     LinkDown, ReplyTimeout
-        Nobody there, or no answer.
+        No connection, or no answer.
     """
     if (entry := installed("ballbar", url)) is not None:
         return cast(BallBar, await _opened(entry, url))
@@ -111,7 +111,7 @@ async def open_fixture(url: str, ask: Ask) -> Fixture:
     BadUrl
         Not such a URL.
     LinkDown
-        Nobody there.
+        No connection.
     """
     parsed = parse_url(url)
     if isinstance(parsed, FixtureConsoleUrl):

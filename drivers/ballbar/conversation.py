@@ -102,7 +102,7 @@ class Box:
         await self.accept()
 
     def error_of(self, end: SegmentEnd) -> DriverError:
-        """What a person is told when a stream cannot go on."""
+        """The message when a stream cannot go on."""
         if isinstance(end, OtherSettings):
             return SettingsChanged(self._name, "stream", str(end), _RESTORE)
         if isinstance(end, OtherPace):
@@ -155,7 +155,7 @@ class Conversation:
         Raises
         ------
         LinkDown, ReplyTimeout, BadFrame
-            Nobody there, no answer, or nothing that can be understood.
+            No connection, no answer, or an answer that cannot be understood.
         """
         answer = await self._ask(frames.identify_command, "identify")
         if not isinstance(answer, frames.Info):
@@ -188,13 +188,13 @@ class Conversation:
             raise Refused(self._name, operation, frames.ACK_TEXT.get(answer.result, f"result {answer.result}"), remedy)
 
     def answered(self, frame: frames.Answer) -> None:
-        """An answer has come; one that nobody waits for is forgotten."""
+        """Deliver an answer; drop it when no question waits for it."""
         future = self._open.get(frame.tag)
         if future is not None and not future.done():
             future.set_result(frame)
 
     def fail(self, error: LinkDown) -> None:
-        """Nothing more will come: whoever waits hears why."""
+        """No more answers will come: every waiting question fails with this reason."""
         for future in self._open.values():
             if not future.done():
                 future.set_exception(error)

@@ -92,7 +92,7 @@ class SerialBallBar:
         WrongDevice
             Another box than the one that was here before, or than the URL says.
         LinkDown, ReplyTimeout, BadFrame
-            Nobody there, no answer, or nothing that can be understood.
+            No connection, no answer, or an answer that cannot be understood.
         """
         try:
             info = await self._box.accept()
@@ -104,7 +104,7 @@ class SerialBallBar:
         return DeviceInfo("ballbar", info.model, str(info.serial_no), info.boot_id, firmware)
 
     async def peek_boot_id(self) -> int | None:
-        """Boot id of the box that answers now, without accepting it as the one that counts; None if nobody answers."""
+        """Boot id of the box that answers now, without accepting it as the one that counts; None without an answer."""
         try:
             return await self._box.peek()
         except DriverError:
@@ -163,7 +163,7 @@ class SerialBallBar:
         error = self._box.rebooted(f"boot id {info.boot_id:#x} instead of {known:#x}")
         self.incidents.note(error, latched=True)
         if self._box.settings is None:
-            self._box.boot_id = known  # nobody has accepted it
+            self._box.boot_id = known  # not accepted yet
             raise error
         await self.restore_settings()
         self.incidents.accepted()
@@ -204,7 +204,7 @@ class SerialBallBar:
 
     @asynccontextmanager
     async def stream(self, rate_hz: int, tap: BarTap | None = None) -> AsyncIterator[AsyncIterator[BarBatch]]:
-        """Stream samples while the context is open; the box is told to stop when it ends, however it ends.
+        """Stream samples while the context is open; the box gets a stop when it ends, however it ends.
 
         Parameters
         ----------
@@ -224,7 +224,7 @@ class SerialBallBar:
         Raises
         ------
         Refused
-            The box does not accept this rate, or is already streaming to somebody here.
+            The box does not accept this rate, or already streams to another caller here.
         Rebooted
             The box has restarted since ``identify``.
         SettingsChanged
@@ -249,7 +249,7 @@ class SerialBallBar:
             yield self._batches(stream, max(_SILENCE_S, 50 / rate_hz))
             self._judge(stream, self.counters.bad_bytes - bad_bytes)
         except DriverError as error:
-            if error.device == self.name:  # whoever measures may fail at another device
+            if error.device == self.name:  # the caller may have failed at another device
                 self.incidents.note(error, latched=isinstance(error, _LATCHED))
             raise
         finally:
@@ -299,7 +299,7 @@ class SerialBallBar:
 
     @property
     def settings(self) -> frames.BoxSettings | None:
-        """Unit, range and zero of the box as it told them last; None before it was identified, and of firmware 1.0, which does not tell."""
+        """The last known unit, range and zero of the box; None before `identify`, and with firmware 1.0, which reports none."""
         return self._box.settings
 
     @property

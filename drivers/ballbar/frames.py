@@ -309,7 +309,7 @@ class Framing:
                 self._counters.bad_frames += frame.reason == "check sum"
                 self._counters.frames -= 1
             else:
-                self._give(host_s, samples)  # what came before an answer is stored before whoever waits for it goes on
+                self._give(host_s, samples)  # samples before an answer are stored before the answer is delivered
                 samples = []
                 self._tell(self._answered, frame)
         self._give(host_s, samples)
@@ -338,5 +338,5 @@ class Framing:
             stream.mark(mark)
 
     def _tell(self, call: Callable[..., None], *arguments: object) -> None:
-        with suppress(RuntimeError):  # the loop has been closed: nobody is left to tell
+        with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(call, *arguments)

@@ -1,6 +1,6 @@
 """Samples in order, and the stream that brings them to those who want them.
 
-Gaps, duplicates, latecomers and restarts are told apart by sequence numbers and device time (`SequenceTracker`). A `Stream` stands between
+Sequence numbers and device time distinguish gaps, duplicates, late samples and restarts (`SequenceTracker`). A `Stream` stands between
 the thread that frames samples and their users: the tap to the disk, and a consumer in the event loop.
 """
 
@@ -50,7 +50,7 @@ class SegmentEnd(Exception):  # noqa: N818 - an event, not a mistake
 
 
 class SequenceRestart(SegmentEnd):
-    """The numbers or the device clock went back: the box was restarted, or somebody else started a new stream."""
+    """The numbers or the device clock went back: the box restarted, or another program started a new stream."""
 
 
 class OtherPace(SegmentEnd):
@@ -74,8 +74,8 @@ class SequenceTracker:
     Attributes
     ----------
     accepted, lost, overrun, duplicates, strays : int
-        Samples given out; missing between them; missing because nobody fetched them from the box in time (it says so): no fault of the
-        line; dropped as already known; dropped because number, clock or reading cannot be.
+        Samples given out; missing between them; missing because this computer did not fetch them from the box
+        in time (it says so), no fault of the line; dropped as already known; dropped because number, clock or reading cannot be.
     """
 
     def __init__(self, rate_hz: int, reads: Reads | None = None) -> None:

@@ -94,7 +94,7 @@ class Banks:
 
         Two programs can take the same number: the controller executes the first and passes over the second, and its acknowledge looks the
         same to both. So what the acknowledge says is held against who has the lease. A command that was passed over was certainly not
-        executed and never will be; it is sent again under another number, but for ACTIVATE: whoever asked decides about that.
+        executed and never will be; it is sent again under another number, except ACTIVATE: the caller decides about that.
         """
         async with self._commands:
             for _ in range(1 if command == reg.ACTIVATE else _TRIES):
@@ -105,7 +105,7 @@ class Banks:
                 detail = "another program's command took its number: it was not executed"
                 raise DeviceFault(self._name, operation, detail, "let one program at a time push; read the status again, then decide")
         if command == reg.RELEASE and result == _LEASED and counts["LEASE_OWNER"] == 0:
-            return  # some controls refuse to release what is free: nobody has it, which is what was asked for
+            return  # some controls refuse to release a free lease: it is free, as asked
         if result:
             raise Refused(self._name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
 
@@ -113,7 +113,7 @@ class Banks:
         await self._session.check_boot()
         counts = await self._comp_counts()
         if not anyway and command in (reg.LEASE, reg.RELEASE) and counts["LEASE_OWNER"] not in (0, fields["owner"]):
-            return _LEASED, counts  # asking all the same would take the number from under a command of whoever has it
+            return _LEASED, counts  # asking all the same would take the number of a command of the lease's owner
         number = next_number(counts["COMP_ACK_SEQ"])
         try:
             words = reg.encode_comp(number, command, **fields)

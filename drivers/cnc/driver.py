@@ -137,7 +137,7 @@ class ModbusController:
         Raises
         ------
         DeviceFault
-            Somebody keeps changing banks.
+            Another program or the operator keeps changing banks.
         """
         return await self._banks.status()
 

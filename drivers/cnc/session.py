@@ -70,7 +70,7 @@ class ControllerSession:
             error = Rebooted(self.name, "check boot id", detail, remedy)
             self.link.incidents.note(error, latched=True)
             raise error
-        # Only now: as long as this fails, every status asks again, and nothing is done with a device that nobody has accepted.
+        # Only now: as long as this fails, every status asks again, and nothing is done with a device that was not accepted.
         self._connection = self.link.connections
 
     async def status(self) -> ControllerStatus:

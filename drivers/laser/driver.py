@@ -1,17 +1,80 @@
-"""Conversation with a laser displacement meter."""
+"""Conversation with a laser displacement meter: its register map (docs/protocols/laser.md) as data, and the driver."""
 
 from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Sequence
 
 from abbe.drivers.api import DeviceInfo, LaserReading
 from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
 from abbe.drivers.flags import LaserFlag, beam_is_gone, is_zeroed
-from abbe.drivers.laser import registers as reg
 from abbe.drivers.links.modbus_line import ModbusOperation
 from abbe.drivers.links.modbus_link import ModbusLink
-from abbe.drivers.links.words import check_clock, check_identity, next_number, run_numbered
+from abbe.drivers.links.words import Register, RegisterBlock, check_clock, check_identity, next_number, run_numbered
+
+MAP_VERSION = 1
+
+IDENTITY = RegisterBlock(
+    0,
+    9,
+    (
+        Register(0, "i32", "CANARY_I32"),
+        Register(2, "u32", "CANARY_F32"),
+        Register(4, "u16", "MAP_VER"),
+        Register(5, "u32", "BOOT_ID"),
+        Register(7, "u32", "SERIAL_NO"),
+    ),
+)
+
+READING = RegisterBlock(
+    10,
+    18,
+    (
+        Register(10, "u32", "SAMPLE_COUNT"),
+        Register(12, "u64", "DEVICE_TIME_US", 1e6, "s"),
+        Register(16, "i64", "DISPLACEMENT", 1e7, "mm"),
+        Register(20, "u16", "SIGNAL", 1000.0),
+        Register(21, "u16", "STATUS"),
+        Register(22, "i16", "AIR_TEMPERATURE", 100.0, "degree C"),
+        Register(23, "u32", "AIR_PRESSURE", 1.0, "Pa"),
+        Register(25, "u16", "HUMIDITY", 10.0, "%"),
+        Register(26, "u32", "REFRACTIVITY", 1e10),
+    ),
+    lead=10,
+)
+
+ACKNOWLEDGE = RegisterBlock(43, 2, (Register(43, "u16", "CMD_ACK_SEQ"), Register(44, "u16", "CMD_RESULT")), lead=3)
+
+COMMAND_ADDRESS = 40
+ZERO, CLEAR_BEAM, ENVIRONMENT = 1, 2, 3
+RESULT_TEXT = {1: "bad argument", 2: "refused: beam blocked"}
+
+
+def decode_reading(words: Sequence[int], host_s: float) -> LaserReading:
+    """Turn registers 10..27 of one request into a reading.
+
+    Parameters
+    ----------
+    words : sequence of int
+        The 18 registers.
+    host_s : float
+        Monotonic host seconds at the last byte.
+    """
+    counts = READING.counts(words)
+    return LaserReading(
+        host_s=host_s,
+        sample_count=counts["SAMPLE_COUNT"],
+        device_us=counts["DEVICE_TIME_US"],
+        displacement_tenth_nm=counts["DISPLACEMENT"],
+        signal_permille=counts["SIGNAL"],
+        status=counts["STATUS"],
+        air_temp_c=READING.physical("AIR_TEMPERATURE", counts["AIR_TEMPERATURE"]),
+        air_pressure_pa=READING.physical("AIR_PRESSURE", counts["AIR_PRESSURE"]),
+        humidity_percent=READING.physical("HUMIDITY", counts["HUMIDITY"]),
+        refractivity=READING.physical("REFRACTIVITY", counts["REFRACTIVITY"]),
+    )
+
 
 _POLL_S = 0.005
 _READ_S = 5.0
@@ -51,7 +114,7 @@ class ModbusLaser:
             The wire.
         """
         counts = await self._identity()
-        clock_us = reg.decode_reading(await self._link.read_block(reg.READING), time.monotonic()).device_us
+        clock_us = decode_reading(await self._link.read_block(READING), time.monotonic()).device_us
         try:
             check_clock(self.name, clock_us)
         except WrongDevice as error:
@@ -74,7 +137,7 @@ class ModbusLaser:
         Rebooted, LinkDown, ReplyTimeout, BadFrame
             The meter restarted, or the wire.
         """
-        await self._command(reg.ZERO, 0, "zero")
+        await self._command(ZERO, 0, "zero")
 
     async def clear_beam(self) -> None:
         """Clear the latch of a lost beam. A new ``zero`` is needed after it.
@@ -86,7 +149,7 @@ class ModbusLaser:
         Rebooted, LinkDown, ReplyTimeout, BadFrame
             The meter restarted, or the wire.
         """
-        await self._command(reg.CLEAR_BEAM, 0, "clear beam-lost latch")
+        await self._command(CLEAR_BEAM, 0, "clear beam-lost latch")
 
     async def set_environment_compensation(self, on: bool) -> None:
         """Switch the compensation of the wavelength in air on or off (off, the meter reads some 270 ppm more).
@@ -96,7 +159,7 @@ class ModbusLaser:
         Refused, Rebooted, LinkDown, ReplyTimeout, BadFrame
             As for ``zero``.
         """
-        await self._command(reg.ENVIRONMENT, int(on), "switch environmental compensation")
+        await self._command(ENVIRONMENT, int(on), "switch environmental compensation")
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
         """Read the current output sample, or wait for one that is newer than ``after_count`` and than the last command.
@@ -147,8 +210,8 @@ class ModbusLaser:
         await self._link.close()
 
     async def _read_once(self) -> LaserReading:
-        words = await self._link.read_block(reg.READING)
-        reading = reg.decode_reading(words, time.monotonic())
+        words = await self._link.read_block(READING)
+        reading = decode_reading(words, time.monotonic())
         if reading.device_us < self._last_us or self._connection != self._link.connections:
             await self._check_boot()
         self._last_us = reading.device_us
@@ -167,9 +230,9 @@ class ModbusLaser:
 
     async def _identity(self) -> dict[str, int]:
         """The identity block, proven to be this map's: asked again at every new connection, because another device may be there now."""
-        counts = reg.IDENTITY.counts(await self._link.read_block(reg.IDENTITY))
+        counts = IDENTITY.counts(await self._link.read_block(IDENTITY))
         try:
-            check_identity(self.name, counts, reg.MAP_VERSION)
+            check_identity(self.name, counts, MAP_VERSION)
         except WrongDevice as error:
             self._link.incidents.note(error, latched=True)
             raise
@@ -189,15 +252,15 @@ class ModbusLaser:
             number = next_number(acknowledged)
 
             async def write() -> None:
-                await self._link.write(reg.COMMAND_ADDRESS, (number, command, argument), ModbusOperation.NUMBERED)
+                await self._link.write(COMMAND_ADDRESS, (number, command, argument), ModbusOperation.NUMBERED)
 
             result = await run_numbered(self.name, operation, number, write, self._read_ack)
         if result:
-            raise Refused(self.name, operation, reg.RESULT_TEXT.get(result, f"result {result}"), "free the beam, or clear_beam first")
+            raise Refused(self.name, operation, RESULT_TEXT.get(result, f"result {result}"), "free the beam, or clear_beam first")
         self._shown_at_command = (await self._read_once()).sample_count
 
     async def _read_ack(self) -> tuple[int, int]:
-        counts = reg.ACKNOWLEDGE.counts(await self._link.read_block(reg.ACKNOWLEDGE))
+        counts = ACKNOWLEDGE.counts(await self._link.read_block(ACKNOWLEDGE))
         return counts["CMD_ACK_SEQ"], counts["CMD_RESULT"]
 
 

@@ -30,7 +30,7 @@ class Incident:
     host_s : float
         Monotonic host seconds.
     state : str
-        Of an outcome: ``recovered`` (it answers again), ``accepted`` (somebody identified it anew), ``closed``.
+        Of an outcome: ``recovered`` (it answers again), ``accepted`` (it was identified anew), ``closed``.
     times : int
         Of an outcome: how many errors belonged to it.
     """
@@ -78,7 +78,7 @@ class Incidents:
         Parameters
         ----------
         latched : bool
-            A good reply does not end this trouble (another device, a restart): somebody has to accept it.
+            A good reply does not end this trouble (another device, a restart): the device has to be identified anew.
         """
         if error.run == NO_RUN:
             error.run = self.run
@@ -94,7 +94,7 @@ class Incidents:
             self._end("recovered")
 
     def accepted(self) -> None:
-        """Somebody identified the device anew: whatever it was is over."""
+        """The device was identified anew: every trouble is over."""
         self._end("accepted")
 
     def closed(self) -> None:

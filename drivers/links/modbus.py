@@ -2,7 +2,7 @@
 
 What the library (3.16.1) does not do by itself and this file adds: no hidden repetition of writes, no hidden reconnects, every reply
 compared with its request (`tcp_mismatch`, `rtu_mismatch`) before the library sees it, the old socket closed before a new one is made, and
-an ear for bytes that nobody asked for.
+an ear for unsolicited bytes.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ class ModbusWire:
         Raises
         ------
         LinkDown
-            Nobody answers there, or the port cannot be opened.
+            No answer there, or the port cannot be opened.
         """
         await self.drop()
         client, self._lost, self.strays = self._new_client(timeout_s), False, 0
@@ -332,7 +332,7 @@ class ModbusWire:
         self.heard_at = asyncio.get_running_loop().time()
         if self._deadline is None or self._deadline.expired():
             self.strays += len(data)
-            return b""  # nobody asked: the quarantine hears it, nobody reads it
+            return b""  # unsolicited: the quarantine hears it, no reply is read from it
         self._heard = data
         self._complaint = rtu_mismatch(self._sent, data) if self.rtu else tcp_mismatch(self._sent, data)
         if not self._complaint:

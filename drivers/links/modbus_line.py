@@ -61,7 +61,7 @@ ACKNOWLEDGE, BUSY = 5, 6
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What an exception code says, which error it becomes, what a person can do. ``dead``: nobody at the far end answered."""
+    """What an exception code says, which error it becomes, what a person can do. ``dead``: the far end did not answer."""
 
     text: str
     error: type[DriverError]
@@ -147,7 +147,7 @@ class ModbusLine:
         self._known: tuple[int, ...] | None = None
         self._turn = 0
         self.closing = False
-        """Somebody wants an end of it: no more waiting for silence."""
+        """Stop waiting for silence."""
         self.dirty = False
         """The next request has to wait until the line is proven."""
         self.foreign_bytes = 0

@@ -78,7 +78,7 @@ class ModbusLink:
         Raises
         ------
         LinkDown
-            Nobody answers there, or the port cannot be opened.
+            No answer there, or the port cannot be opened.
         """
         link = cls(url, timeout_s=timeout_s, canary=canary, backoff=backoff, heartbeat_s=heartbeat_s)
         await link._ready(_PATIENCE_S)
@@ -166,7 +166,7 @@ class ModbusLink:
         except asyncio.CancelledError:
             if self._closed and task.cancelled():
                 raise LinkDown(self.name, str(request), "the link was closed", "open it again") from None
-            self._abandoned = True  # what is on the wire is waited for, but nothing is sent for somebody who has gone
+            self._abandoned = True  # what is on the wire is awaited, but nothing is sent for a caller that has gone
             if not self._on_wire:
                 task.cancel()
             raise

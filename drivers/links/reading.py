@@ -80,7 +80,7 @@ class Ring:
         """The oldest pieces, about 64 KiB; waits for the first. Empty after ``timeout_s``, None when nothing will come any more."""
         with self._news:
             if not self._pieces:
-                self._idle = True  # whoever takes comes back only when he is done with what he took before
+                self._idle = True  # the taker comes back only when it is done with what it took before
                 self._news.notify_all()
                 if not self._ended:
                     self._news.wait(timeout_s)
@@ -94,7 +94,7 @@ class Ring:
             return pieces if pieces or not self._ended else None
 
     def drained(self, timeout_s: float) -> bool:
-        """Wait until everything that was put has been taken and whoever took it is done with it; False when that did not come to pass."""
+        """Wait until everything that was put has been taken and processed; False when that did not happen."""
         with self._news:
             return self._news.wait_for(lambda: self._idle and not self._pieces, timeout_s)
 

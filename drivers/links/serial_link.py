@@ -37,7 +37,7 @@ class Adapter:
 
 
 def adapter_at(path: str, listed: Sequence[Adapter]) -> Adapter | None:
-    """The adapter behind a path (links are followed); None when it has no serial number, so that nobody could know it again."""
+    """The adapter behind a path (links are followed); None when it has no serial number by which to recognise it."""
     real = os.path.realpath(path)
     found = [adapter for adapter in listed if os.path.realpath(adapter.node) == real]
     return found[0] if found and found[0].serial_number else None
@@ -222,11 +222,11 @@ class ByteLink:
         loop = asyncio.get_running_loop()
 
         def lost(error: OSError | None) -> None:
-            with suppress(RuntimeError):  # the loop has been closed: nobody is left to tell
+            with suppress(RuntimeError):  # the loop is closed
                 loop.call_soon_threadsafe(tell, error)
 
         def tell(error: OSError | None) -> None:
-            if self._reading is reading:  # else somebody closed the port meanwhile and knows
+            if self._reading is reading:  # else the port was closed meanwhile on purpose
                 on_lost(self._lost("read", error))
 
         reading = self._reading = ReadingThread(descriptor, ring, lost, self.name)
@@ -273,7 +273,7 @@ class ByteLink:
                 raise self._lost("drop input", error) from error
 
     async def close(self) -> None:
-        """Close the port; whoever waits in ``read`` or ``write`` gets ``LinkDown``. Closing twice does nothing.
+        """Close the port; a pending ``read`` or ``write`` raises ``LinkDown``. Closing twice does nothing.
 
         What was written leaves first, half a second at the most; what has arrived goes into the ring of `start_reading`.
         """
@@ -315,7 +315,7 @@ class ByteLink:
             await waiter
         finally:
             self._waiting.discard(waiter)
-            if self._port is not None:  # after close() the number may already belong to somebody else
+            if self._port is not None:  # after close() the number may already belong to another file
                 remove(descriptor)
 
     def _lost(self, operation: str, error: Exception | None) -> LinkDown:

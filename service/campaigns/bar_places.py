@@ -98,7 +98,7 @@ class BarPlaces:
         Raises
         ------
         DriverError
-            Nobody did; a note says that they are still in.
+            They were not; a note says that they are still in.
         """
         if not self.mounted:
             return

@@ -17,7 +17,7 @@ from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_sour
 from abbe.service.sequences.steps import CampaignPlan
 
 IDENTIFICATION = "identification"
-"""The full campaign: no check, and only with somebody who mounts its set-ups."""
+"""The full campaign: no check, and only with a person who mounts its set-ups."""
 USUAL_HZ = 100
 RATES_HZ = (50, 100, 200, 250, 500, 1000)
 """Rates of the ball-bar that a person is offered; any other that divides 1000 can be named as well."""

@@ -8,21 +8,86 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from abbe.drivers.api import Point
+from abbe.drivers.api import DeviceInfo, Point
+from abbe.drivers.errors import DriverError, LinkDown, Rebooted, ReplyTimeout
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.columns import path_so_far
 from abbe.service.runs.pieces import SoFar
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import Watching, check_interlocks
-from abbe.service.sequences.journal import DONE, RUN, Journal
+from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.interlocks import Suspending, Watching, check_interlocks
+from abbe.service.sequences.journal import DONE, RUN, WAITS, Journal
+from abbe.service.sequences.needed import BEFORE_S
 from abbe.service.sequences.path_resume import PathRemainder
 from abbe.service.sequences.preconditions import ExpectedTable, check_expected
 from abbe.service.sequences.resume_plan import Attempt, ResumeTrail, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
-from abbe.service.sequences.steps import CampaignPlan, TestPlan
+from abbe.service.sequences.steps import CampaignPlan, ReadBar, RecordPath, TestPlan
 from abbe.service.sequences.waiting import may_suspend, paused, suspended
 from abbe.service.storage.store import Store
+
+BALLBAR = "ballbar"
+"""The word in ``[limits] continue_after``."""
+MOST_BREAKS = 5
+"""So often a test begins again because the box was lost; then a person has to look at it."""
+BREAKS = (LinkDown, ReplyTimeout, Rebooted)
+
+
+async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
+    """Before a run: if it needs the ball-bar, the same box answers, and reads as it did when it was first met.
+
+    Raises
+    ------
+    DriverError
+        It is not there, is another one, or a person has to look at it.
+    """
+    if session.ballbar is None or not any(isinstance(step, RecordPath | ReadBar) for step in test.steps):
+        return None
+    return await session.ballbar.make_ready(within_s=BEFORE_S)
+
+
+class BarBreaks:
+    """What becomes of a test whose runs are ended by the loss of the box.
+
+    Parameters
+    ----------
+    session : Session
+        Open devices.
+    control : Control
+        How the wait can be stopped.
+    suspending : Suspending
+        Whether and how long to wait for the box; without ``ballbar`` in its conditions the error ends the measurement.
+    """
+
+    def __init__(self, session: Session, control: Control, suspending: Suspending) -> None:
+        self._bar, self._control, self._suspending = session.ballbar, control, suspending
+        self._count = 0
+
+    async def wait(self, error: DriverError, runner: Runner, journal: Journal) -> None:
+        """After a run that ended by this error: returns when nothing is to be done about it here.
+
+        Raises
+        ------
+        RunInterrupted
+            The box is back: the test begins again, in a run of its own. The person who plugged it in may have touched what is mounted.
+        DriverError
+            It did not come back in time, or another one did.
+        Stopped, Aborted
+            That was asked for meanwhile.
+        """
+        if self._bar is None or error.device != self._bar.name or not isinstance(error, BREAKS):
+            return
+        self._count += 1
+        if BALLBAR not in self._suspending.conditions or self._count > MOST_BREAKS:
+            return
+        self._control.now(State.SUSPENDED, str(error))
+        await journal.add(WAITS, why=str(error), condition=BALLBAR)
+        await self._control.unless_stopped(self._bar.make_ready(within_s=self._suspending.longest_s))
+        runner.touched = True
+        raise RunInterrupted(
+            f"the ball-bar's box was lost and is back ({error.code})", "the test begins again; what was read is kept as evidence"
+        ) from error
+
 
 MOST_TRIES = 5
 """So often in a row a test is suspended or mounted anew without a new point; then a person has to look."""
@@ -36,7 +101,7 @@ def _in_vain(why: SetupDisturbed | Interlock | RunInterrupted) -> SetupDisturbed
 
 
 async def decline(_: str) -> bool:
-    """Nobody is there to say that a set-up was not touched: it is mounted anew."""
+    """For unattended campaigns: no person confirms that a set-up was not touched, so it is mounted anew."""
     return False
 
 
@@ -79,7 +144,7 @@ class Item:
         return str(self.test.setup["setup_id"])
 
     def attempt(self) -> Attempt:
-        """What the runner is told."""
+        """What the runner gets."""
         return Attempt(self.test.label, self.setup, self.offset, self.mounting, self.resume_trail, remainder=self.remainder)
 
 
@@ -209,7 +274,7 @@ class CampaignRun:
             return run_id
 
     async def _ready(self) -> None:
-        """Before a run starts: the same controller with the same table, nobody else's program, and no hold that a killed process has left.
+        """Before a run starts: the same controller with the same table, no other program, and no hold that a killed process has left.
 
         Raises
         ------
@@ -241,7 +306,7 @@ class CampaignRun:
             touched = await suspended(self.session, self.control, self.watching, self.expected, self.journal, why)
         else:
             touched = await paused(self.session, self.control, self.watching, self.expected, self.journal) or runner.touched
-        if runner.asked is not None:  # nobody knows how far whoever mounts has come
+        if runner.asked is not None:  # it is unknown how far the mounting has come
             return self.again_mounted(item)
         records = () if isinstance(why, BeamLost) else tuple(runner.records)
         again = gone_on(item, runner.hand, records)
@@ -251,7 +316,7 @@ class CampaignRun:
         return self.again_mounted(item) if (item.setup, item.mounting) in self.used else again
 
     async def untouched(self, item: Item) -> bool:
-        """Whether what is mounted can go on being used after somebody may have touched it.
+        """Whether what is mounted can still be used after a person may have touched it.
 
         A set-up of which nothing is kept has nothing that it could contradict; a laser run that goes on reads its last point again. Else a
         person must say so: the stretch of a path that is read twice shows a cup that was knocked along the bar, not across it.

@@ -1,6 +1,6 @@
 """Listening to a program that the operator starts: the laser is read all the time, and its standstills become the readings of the recipe.
 
-For controllers that nobody moves by registers. Abbe writes nothing to the controller; of its status it uses the clock, the position and "NC
+For controllers that Abbe does not move. Abbe writes nothing to the controller; of its status it uses the clock, the position and "NC
 program running". Times are those at which the laser took its samples, by its own clock, brought to the controller's.
 """
 
@@ -119,7 +119,7 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, say: S
 
 
 async def _at_start(session: Session, test: TestPlan, start_mm: Point, say: Say) -> None:
-    """Wait until the machine stands where the test begins: whoever mounts has to find it there."""
+    """Wait until the machine stands where the test begins: the mirror is mounted there."""
     before, told = None, False
     while True:
         status = await session.controller.status()
@@ -145,7 +145,7 @@ async def _hear(session: Session, quiet_s: float) -> Heard:
             status = await session.controller.status()
             heard.statuses.append(status)
             running = status.program_runs
-            if ran and not running and moved_us:  # before that, somebody went on from one halt to the next
+            if ran and not running and moved_us:  # before that, the operator went on from one halt to the next
                 return heard
             ran = running or (ran and bool(moved_us))
         level = reading.displacement_tenth_nm if level is None else level
@@ -212,7 +212,7 @@ def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: 
 
 
 def _record(one: ListenRequest, reading: DwellReading | None, middle_s: float, heard: Heard, times: Callable[[F1], F1]) -> dict[str, Any]:
-    """A record as the sequencer makes it, of one standstill; of one that nobody saw the nominal place, marked as missing."""
+    """A record as the sequencer makes it, of one standstill; of one that was not seen the nominal place, marked as missing."""
     near = min(heard.readings, key=lambda r: abs(r.device_us * 1e-6 - middle_s))
     told: dict[str, Any] = {"displacement_tenth_nm": round(one.along_mm / MM_PER_COUNT), "missing": True}
     if reading is not None:

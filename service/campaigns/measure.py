@@ -12,25 +12,33 @@ from typing import Any
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
-from abbe.service.campaigns.bar_link import BarBreaks, bar_ready
 from abbe.service.campaigns.builtin_recipes import RecipeSource
-from abbe.service.campaigns.campaign_run import CampaignRun, Confirm, Resumed, decline, in_mounting, items, plan_hash, read_path
-from abbe.service.campaigns.progress import ProgressMeter
+from abbe.service.campaigns.campaign_run import (
+    BarBreaks,
+    CampaignRun,
+    Confirm,
+    Resumed,
+    bar_ready,
+    decline,
+    in_mounting,
+    items,
+    plan_hash,
+    read_path,
+)
 from abbe.service.capture.live import LiveFeed
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.devices.clock_notes import notes_since
-from abbe.service.devices.session import Session
+from abbe.service.devices.session import Session, notes_since
 from abbe.service.domain.measured import DISK_FULL
 from abbe.service.domain.owner import this_process
-from abbe.service.domain.progress import ProgressSink, ignore_progress
+from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.guard import warnings_of
 from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
 from abbe.service.sequences.needed import check_devices
+from abbe.service.sequences.paths import warnings_of
 from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import Attempt
 from abbe.service.sequences.runner import Runner, Tick
@@ -38,8 +46,77 @@ from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLase
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
+WAITING = (State.PAUSED, State.SUSPENDED)
+
+
+@dataclass
+class ProgressMeter:
+    """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
+
+    The time in which the job waited for a person (``waited_s``) says nothing about the machine and does not count.
+    """
+
+    stage: str
+    total_s: float
+    sink: ProgressSink
+    clock: Clock
+    done_s: float = 0.0
+    start_s: float = field(default=0.0)
+    waited_s: float = 0.0
+    skipped_s: float = 0.0
+    control: Control | None = None
+    message: str = ""
+    _at_s: float = 0.0
+    _waits_since_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Start the stopwatch."""
+        self.start_s = self.clock.monotonic_s()
+
+    def at(self, done_s: float, message: str, waited_s: float = 0.0) -> None:
+        """Report how far the job is, and how long the last step waited for a person."""
+        self.waited_s += waited_s
+        self.message, self._at_s = message, done_s
+        self._report(self._eta_s(done_s))
+
+    async def tell(self) -> None:
+        """Report every pause and suspension as it begins and ends; a suspension's time is left out of the ETA."""
+        if self.control is None:
+            return
+        async for now in self.control.watch():
+            if now.state in WAITING:
+                self.waits()
+                self._report(None)
+            else:
+                self.goes_on()
+
+    def waits(self) -> None:
+        """The job waits from now on."""
+        if self._waits_since_s is None:
+            self._waits_since_s = self.clock.monotonic_s()
+
+    def goes_on(self) -> None:
+        """It does not wait any more."""
+        if self._waits_since_s is not None:
+            self.waited_s += self.clock.monotonic_s() - self._waits_since_s
+            self._waits_since_s = None
+
+    def skip(self, duration_s: float) -> None:
+        """Planned time of what was complete before this job began: it says nothing about how fast this one is."""
+        self.done_s += duration_s
+        self.skipped_s += duration_s
+
+    def _eta_s(self, done_s: float) -> float | None:
+        elapsed, made_s = self.clock.monotonic_s() - self.start_s - self.waited_s, done_s - self.skipped_s
+        return elapsed / made_s * (self.total_s - done_s) if made_s > 0.02 * self.total_s else None
+
+    def _report(self, eta_s: float | None) -> None:
+        now = self.control.progress if self.control is not None else Progress()
+        self.sink(replace(now, stage=self.stage, done=self._at_s, total=self.total_s, eta_s=eta_s, message=self.message))
+
+
 RUN_STATUS: dict[type[Exception], str] = {Stopped: "stopped", Aborted: "aborted", RunInterrupted: "aborted"}
-"""How a run is closed that a person has ended, or that is gone on with; everything else has failed."""
+"""How a run is closed that a person has ended, or that resumes later; everything else has failed."""
 
 
 LAST_LINE_S = 10.0
@@ -115,7 +192,7 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     campaign : tuple of int, optional
         A campaign that was begun, as `start_campaign` gives it; default: a new one of the plan's name.
     manner : Manner, optional
-        Control from outside, and from where to go on; default: nobody interrupts, from the beginning.
+        Control from outside, and from where to go on; default: no interruption, from the beginning.
 
     Raises
     ------
@@ -302,7 +379,7 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
 
 @contextmanager
 def shown(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) -> Iterator[None]:
-    """Whoever looks on sees what the test's path reads, beside the way to the disk."""
+    """Live views get what the test's path reads, beside the way to the disk."""
     path = next((step for step in test.steps if isinstance(step, RecordPath)), None)
     if live is None or path is None:
         yield

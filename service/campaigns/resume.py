@@ -1,6 +1,6 @@
-"""Going on with a campaign that was broken off: by Ctrl-C, an interlock, a crash or a power cut. What was complete is used, nothing twice.
+"""Resumes a campaign that was broken off by Ctrl-C, an interlock, a crash or a power cut. Complete runs are used, none twice.
 
-Everything is looked at again and said; what changed so that nothing can be gone on with is refused in one line.
+Everything is checked again and reported; a change that makes resuming impossible is refused in one line.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class RealFileIO:
     """The file system of this computer."""
 
     def create(self, path: Path) -> int:
-        """Make a new file, refuse an existing one; returns a descriptor, whose lock tells others that somebody writes."""
+        """Make a new file, refuse an existing one; returns a descriptor, whose lock tells other processes that it is being written."""
         descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -27,7 +27,7 @@ class SampleGap:
     stream : int
         Which stream of the run, from 0.
     first, last : int
-        Sequence numbers; ``last`` is None when nobody knows how many would have come.
+        Sequence numbers; ``last`` is None when it is unknown how many would have come.
     cause : str
         In words.
     before_us, after_us : int or None
@@ -43,7 +43,7 @@ class SampleGap:
 
     @property
     def missing(self) -> int:
-        """How many; 0 where nobody knows."""
+        """How many; 0 where unknown."""
         return 0 if self.last is None else self.last - self.first + 1
 
     def doc(self) -> dict[str, Any]:
@@ -227,7 +227,7 @@ class Drafter:
     def lost(self, cause: str, last: int | None, after_us: int | None, stream: int | None = None) -> Record:
         """A gap from the next expected number on, of the present stream or of a later one that nothing was drafted of."""
         at = self._stream if stream in (None, self._stream.number) else _Stream(int(stream or 0))
-        if last is not None and last < at.next_seq:  # nobody knows: the numbers went back
+        if last is not None and last < at.next_seq:  # unknown: the numbers went back
             last = None
         return self.gap_record(SampleGap(max(0, at.number), at.next_seq, last, cause, at.last_us, after_us))
 

@@ -1,6 +1,6 @@
-"""What a running path reads, for whoever wants to look on: a bounded copy beside the way to the disk, which never waits and may lose.
+"""What a running path reads, for live views: a bounded copy beside the way to the disk, which never waits and may lose.
 
-The driver's thread puts batches in (`LiveFeed.take`), the event loop takes stretches out. What nobody takes out in time is dropped here and
+The driver's thread puts batches in (`LiveFeed.take`), the event loop takes stretches out. What is not taken out in time is dropped here and
 nowhere else: the recorder has been given every sample before.
 """
 
@@ -30,7 +30,7 @@ MOST_BATCHES = 2000
 LONGEST = 4096
 """So many deviations make a stretch at most: a message of the channel is bounded, and a longer one would end the page's process."""
 ANGLES = 512
-"""Places of a path at which its angle is told; in between the browser interpolates."""
+"""Places of a path whose angle is sent; in between the browser interpolates."""
 UM_PER_NM = 1e-3
 
 

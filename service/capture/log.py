@@ -92,7 +92,7 @@ class CaptureLog:
             self._given += 1
             self._samples += len(item[1].samples) if isinstance(item[1], BarBatch) else 1
             if first or self._samples >= MAX_PENDING:
-                self._news.notify_all()  # what joins a group wakes nobody
+                self._news.notify_all()  # joining a group does not wake the writer
 
     def flush(self) -> None:
         """Wait until everything given so far is on the disk, or never will be. Blocks."""

@@ -41,7 +41,7 @@ Look = Callable[[BarBatch], None]
 
 
 def ignore_batch(_: BarBatch) -> None:
-    """Nobody looks on."""
+    """No live view."""
 
 
 class _Tap:
@@ -76,7 +76,7 @@ class CaptureRecorder:
         self._keep, self._io = keep, io
         self._streams = 0
         self.look: Look = ignore_batch
-        """Whoever looks on; set before a stream begins."""
+        """The live view; set before a stream begins."""
 
     def tap(self) -> _Tap:
         """What a new stream gives every sample to."""

@@ -93,7 +93,7 @@ _POLL_S = 0.05
 
 @contextmanager
 def held_alone(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
-    """Hold a lock file; False when somebody else held it all the time.
+    """Hold a lock file; False when another process held it all the time.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def held_alone(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
 
 @contextmanager
 def is_free(path: Path) -> Iterator[bool]:
-    """Tell whether nobody writes a segment, and keep it so meanwhile. Raises OSError."""
+    """Tell whether no process writes a segment, and keep it so meanwhile. Raises OSError."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         yield _got(handle)
@@ -277,7 +277,7 @@ def _take_over(store: Store, path: Path, run: RunRecord | None, settings: Captur
 
 
 def _of_closed(store: Store, path: Path, run: RunRecord, held: Scan, settings: CaptureSettings) -> RecoveredRun | None:
-    """A run that was closed before the process could delete the file, or that somebody else closed without it."""
+    """A run that was closed before the process could delete the file, or that another process closed without it."""
     if settings.keep:
         return None
     keys = store.chunks.crcs(run.id)
@@ -333,7 +333,7 @@ def _name(run: RunRecord) -> str:
 
 
 def _abandoned(run: RunRecord) -> bool:
-    # a run of this very process that nobody records into any more was left by a database that did not take its end
+    # a run of this very process that is no longer recorded into was left by a database that did not take its end
     return run.owner.is_gone() or run.owner == this_process()
 
 

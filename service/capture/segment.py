@@ -289,7 +289,8 @@ class Scan:
 def scan(data: bytes | memoryview) -> Scan:
     """Find every good record of a segment.
 
-    A bad record ends the search only if no good one follows: a torn tail is told from damage in the middle; neither costs a good record.
+    A bad record ends the search only if no good one follows: this distinguishes a torn tail from damage in the
+    middle; neither costs a good record.
     """
     records: list[Record] = []
     damaged: list[Damage] = []

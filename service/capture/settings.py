@@ -46,7 +46,7 @@ class CaptureSettings:
 
 
 def is_memory(database_url: str) -> bool:
-    """Tell whether the database ends with the process; segments that outlive it would be nobody's."""
+    """Tell whether the database ends with the process; segments that outlive it would belong to no database."""
     parsed = parse_url(database_url)
     return parsed.drivername == "sqlite" and parsed.database in {None, "", ":memory:"}
 
@@ -117,7 +117,7 @@ def free_name(path: Path, suffix: str) -> Path:
 
 
 def set_aside(path: Path, suffix: str) -> Path:
-    """Rename a file so that nobody takes it for a segment any more, and nothing is overwritten. Raises OSError."""
+    """Rename a file so that it no longer counts as a segment, and nothing is overwritten. Raises OSError."""
     name = free_name(path, suffix)
     path.rename(name)
     return name

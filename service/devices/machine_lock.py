@@ -23,11 +23,11 @@ from abbe.service.errors import MachineInUse, UnsafeToMove
 ENVIRONMENT = "ABBE_LOCK_FOLDER"
 """Names another folder, for a computer or a container where the usual ones do not serve."""
 INSTALLED = Path("/run/abbe")
-"""Made at boot by deploy/abbe-tmpfiles.conf, for a group. Where it is, no other one is used: who may not open it is told so."""
+"""Made at boot by deploy/abbe-tmpfiles.conf, for a group. Where it exists, no other is used; an account without access gets an error."""
 WITHOUT_INSTALLATION = Path("/tmp/abbe-machines")  # noqa: S108 - the same for all accounts, whatever TMPDIR says
 """Open to every account. A service with a ``/tmp`` of its own needs the other one."""
 SHARED = 0o1777
-"""Rights of a folder in which everybody makes files and nobody takes away those of others."""
+"""Mode of a folder in which every account makes files and removes only its own."""
 TRIES = 100
 
 
@@ -42,7 +42,7 @@ def lock_machine(url: str | None) -> Iterator[None]:
     MachineInUse
         Another process, or another job of this one, has it.
     UnsafeToMove
-        Nobody can say whether it is in use: the lock cannot be opened.
+        The lock cannot be opened, so it is unknown whether the machine is in use.
     """
     if url is None:
         yield
@@ -106,11 +106,11 @@ def _shared(folder: Path) -> Path:
 
 
 class _Held(Exception):  # noqa: N818 - reads as what it is
-    """Somebody has the lock; his own words."""
+    """The lock is held; the text is what its holder wrote into it."""
 
 
 def _locked(path: Path) -> int:
-    """Open and lock a file; a file that was removed from its name meanwhile keeps nobody apart, and does not count."""
+    """Open and lock a file; a file that was removed from its name meanwhile locks nothing, and does not count."""
     for _ in range(TRIES):
         handle = _opened(path)
         try:
@@ -131,7 +131,7 @@ def _locked(path: Path) -> int:
 
 
 def _opened(path: Path) -> int:
-    """Open the lock of a machine; make it if nobody has, with the rights of its folder, in one step: nobody meets it half made."""
+    """Open the lock of a machine; make it if it is missing, with the rights of its folder, in one step."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     with suppress(FileNotFoundError):
         return _plain(os.open(path, flags))

@@ -1,6 +1,6 @@
 """The port of the push machine to a real controller: one operation becomes one call of the driver, and its errors become outcomes.
 
-What a driver says decides nothing here: Refused means that nothing changed, Doubt that nobody knows. The machine decides.
+What a driver says decides nothing here: Refused means that nothing changed, Doubt that it is unknown. The machine decides.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class ControllerPort:
                     lost.set()
                     return
                 except (DriverError, TimeoutError):
-                    continue  # whoever measures meets the same trouble, and decides
+                    continue  # the measurement meets the same trouble, and decides
         finally:
             ended.cancel()
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import Aborted, Stopped
 
-# What a measurement asks a person to do where nobody sits at its console, and the word that it is done: for the prompt that stands alone.
+# What a measurement asks a person to do when its console is unattended, and the word that it is done: for the prompt that stands alone.
 #
 # All calls belong into the event loop of the measurement.
 
@@ -41,7 +41,7 @@ class Prompts:
         return self._now
 
     async def ask(self, text: str) -> None:
-        """Wait until somebody says that it is done. Where the wait is cancelled nothing is asked for any more."""
+        """Wait until a person says that it is done. Cancelling the wait withdraws the request."""
         assert self._now is None, "one thing at a time"
         self._count += 1
         self._now, self._done = Prompt(self._count, text), asyncio.get_running_loop().create_future()

@@ -93,7 +93,7 @@ def check_interlocks(status: ControllerStatus) -> None:
 
 
 def check_ours(status: ControllerStatus) -> None:
-    """Refuse to send anything, a stop included, to a machine that somebody else works with.
+    """Refuse to send anything, a stop included, to a machine that another program works with.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def check_ours(status: ControllerStatus) -> None:
 
 
 def somebody_at_work(status: ControllerStatus) -> bool:
-    """Whether the door is open or the mode is somebody else's: what is mounted may be touched."""
+    """Whether the door is open or the mode is not remote: a person may touch what is mounted."""
     return Condition.DOOR_OPEN in status.conditions or not status.remote
 
 

@@ -63,7 +63,7 @@ class Way:
             return
         self._lag_mm = lag_mm if self._lag_mm is None else self._lag_mm
         if abs(lag_mm - self._lag_mm) > STEADY_MM or abs(self._lag_mm) > BEHIND_S * self._feed_mm_s + BEHIND_MM:
-            self._lost = True  # feed changed, or the axes stand: from here on nobody knows where which sample was taken
+            self._lost = True  # feed changed, or the axes stand: from here on the place of a sample is unknown
             return
         self.start_us, self.good_us = status.path_start_us, status.ctrl_us
 
@@ -81,7 +81,7 @@ class Way:
         return float(gone_mm - at[near][np.argmin(np.abs(at[near] - gone_mm))]) if off.min() < STEADY_MM else None
 
     def doc(self) -> dict[str, Any]:
-        """What the end document of a run that was broken off needs; empty when nothing can be gone on with."""
+        """What the end document of a run that was broken off needs; empty when the path cannot resume."""
         if self.good_us is None or self.boot_id is None:
             return {}
         return {"path_start_us": self.start_us, "good_us": self.good_us, "box_boot_id": self.boot_id}

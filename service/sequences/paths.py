@@ -1,21 +1,93 @@
-"""Paths: the ball-bar streams while the axes run a polyline, and whatever goes wrong on the way ends both."""
+"""Paths: the ball-bar streams while the axes run a polyline, and an error on the way ends both.
+
+Motion never outlives the block that commanded it (`motion_guard`); when the stop does not get through, the error says so.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 
 from abbe.drivers.api import BarBatch, Condition, ControllerStatus, Motion, Paths
+from abbe.drivers.errors import DriverError
 from abbe.drivers.flags import bar_is_out, bar_is_valid, on_path
+from abbe.drivers.links.shielded import run_to_end
 from abbe.service.devices.session import Session
-from abbe.service.errors import BarOutOfRange, MeasurementFault, RunInterrupted
+from abbe.service.errors import AbbeError, BarOutOfRange, MeasurementFault, RunInterrupted
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control
-from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import check_interlocks
 from abbe.service.sequences.path_resume import PathRemainder, SameStretch, Way
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
+
+STOP_S = 10.0
+"""Outer bound only. The driver's own limits govern: seconds for each write, five until the axes stand still."""
+Spare = Callable[[], Awaitable[bool]]
+UNDELIVERED = "the stop could not be delivered: press e-stop"
+
+
+@asynccontextmanager
+async def motion_guard(controller: Motion, spare: Spare | None = None) -> AsyncIterator[None]:
+    """Whatever ends this block early also stops the axes: abort is sent although the task is being cancelled.
+
+    Parameters
+    ----------
+    spare : callable, optional
+        Whether nothing of ours can move and another program works with the machine: then it is left alone.
+
+    Raises
+    ------
+    BaseException
+        What ended the block. When the stop did not get through, its text says so: the axes may still move.
+    """
+    try:
+        yield
+    except BaseException as error:
+        stopped = asyncio.Event()
+        try:
+            await run_to_end(_stop(controller, stopped, spare))
+        except asyncio.CancelledError as cancelled:
+            if stopped.is_set():
+                raise
+            raise with_warning(cancelled) from error
+        if stopped.is_set():
+            raise
+        told = with_warning(error)
+        if told is error:
+            raise
+        raise told from error
+
+
+async def _stop(controller: Motion, stopped: asyncio.Event, spare: Spare | None) -> None:
+    try:
+        async with asyncio.timeout(STOP_S):
+            if spare is None or not await spare():
+                await controller.abort()
+    except Exception:  # noqa: BLE001 - why it failed is not what matters now: that the axes may run on is, and the caller says so
+        return
+    stopped.set()
+
+
+def with_warning(error: BaseException) -> BaseException:
+    """The same kind of error, saying as well that the axes may still move; errors without a text for people get a note."""
+    if isinstance(error, AbbeError | DriverError):
+        if UNDELIVERED in error.detail:
+            return error
+        detail = f"{error.detail}; {UNDELIVERED}"
+        if isinstance(error, DriverError):
+            return type(error)(error.device, error.operation, detail, error.remedy)
+        return type(error)(detail, error.remedy)
+    if UNDELIVERED not in warnings_of(error):
+        error.add_note(UNDELIVERED)
+    return error
+
+
+def warnings_of(error: BaseException) -> list[str]:
+    """What was added to an error on its way up."""
+    return list(getattr(error, "__notes__", []))
+
 
 POLL_S = 0.01
 STALL_S = 10.0

@@ -28,8 +28,8 @@ async def check_preconditions(session: Session, expected: ExpectedTable | None, 
 
     Raises
     ------
-    WorldChanged
-        Another boot id or another table. Nothing can be gone on with.
+    PreconditionsChanged
+        Another boot id or another table: the campaign cannot resume.
     Interlock
         A condition that has to be cleared first.
     """
@@ -51,7 +51,7 @@ def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> Non
 
     Raises
     ------
-    WorldChanged
+    PreconditionsChanged
         Which.
     """
     if boot_id != expected.boot_id:

@@ -1,4 +1,4 @@
-"""From where a test that was broken off is gone on with, and how the machine gets there. Pure.
+"""Where a test that was broken off resumes, and how the machine gets there. Pure.
 
 A bar must not be moved through its sphere, a mirror not out of its beam: the way back is the way that the test came, to the last
 checkpoint. A path with the ball-bar goes on where it was broken off (abbe.service.sequences.path_resume), or begins again; a run with the
@@ -36,7 +36,7 @@ BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
 STANDS = MountBar | TakeBarOut | ChangeBar | MountLaser
 """After these something stands in the machine: a bar hangs in, a cup stands, a mirror is on the spindle."""
 OFF_PATH_MM = 0.05
-"""Farther than this beside the way it came, the machine was moved by somebody else, and what is mounted cannot be relied on."""
+"""Farther than this beside the way it came, another program or person moved the machine, and what is mounted cannot be relied on."""
 SAME_WAY_MM = 0.005
 """Two passages of one place are as far apart as chords of a circle are beside it, and positions are rounded."""
 KEEP_FROM = 2

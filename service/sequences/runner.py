@@ -15,11 +15,10 @@ from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, Setu
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control
-from abbe.service.sequences.guard import motion_guard
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.path_resume import PathRemainder, Way
-from abbe.service.sequences.paths import bar_trouble, follow_path, record_path
+from abbe.service.sequences.paths import bar_trouble, follow_path, motion_guard, record_path
 from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
 from abbe.service.sequences.steps import (
@@ -97,7 +96,7 @@ class Runner:
     session : Session
         Open devices.
     control : Control, optional
-        How a person pauses, stops and aborts; default: nobody does.
+        How a person pauses, stops and aborts; default: never.
     watching : Watching, optional
         What the watcher looks at.
     journal : Journal, optional
@@ -123,7 +122,7 @@ class Runner:
         self._points = 0
         self._still = self._stands = False
         self.touched = False
-        """Somebody may have touched what is mounted, in the pause that ended the run."""
+        """A person may have touched what is mounted, in the pause that ended the run."""
         self.hand: int | None = None
         """Last step by hand that was done; ``asked``: one that a person was asked for and that was not done."""
         self.asked: int | None = None
@@ -151,7 +150,7 @@ class Runner:
         result: dict[str, int] = {}
         done, clock = 0.0, asyncio.get_running_loop().time
         # The guard stands outside: what it has to say of a stop that did not get through must not be lost with the watcher's own errors.
-        check_ours(await self._s.controller.status())  # before the guard: its stop would end somebody else's program
+        check_ours(await self._s.controller.status())  # before the guard: its stop would end another program
         self._stands = not plan.mounts
         async with motion_guard(self._s.controller, self._spared), watched(self._s, self._control, self._watching) as watch:
             check_interlocks(await self._s.controller.status())
@@ -198,14 +197,14 @@ class Runner:
             raise RunInterrupted("the axes were moved during the pause", "the test goes on from its last checkpoint")
 
     async def _spared(self) -> bool:
-        """Whether nothing of ours can move, and somebody else works with the machine: a stop would end his program."""
+        """Whether nothing of ours can move, and another program works with the machine: a stop would end that program."""
         if not self._still:
             return False
         status = await self._s.controller.status()
         return status.program_runs or not status.remote
 
     async def _nobody_inside(self, step: Step, watch: Watch) -> None:
-        """After somebody has worked inside, the first motion waits for nobody: the door is closed, or the test ends here."""
+        """After a person has worked inside, the first motion does not wait: the door is closed, or the test ends here."""
         if watch.tolerated and not isinstance(step, BY_HAND):
             check_interlocks(await self._s.controller.status())
             watch.tolerated = NOTHING
@@ -231,7 +230,7 @@ class Runner:
         self._still = True
         await self._control.unless_stopped(self._done_by_hand(step))
         self._still, self._stands = False, not isinstance(step, Unmount)
-        status = await self._s.controller.status()  # whoever mounts takes minutes: the clock is asked when it is done
+        status = await self._s.controller.status()  # mounting takes minutes: the clock is read when it is done
         await self.journal.add(HAND, phase="done", ctrl_us=status.ctrl_us, **line)
         self.hand, self.asked = attempt.offset + k, None
         if not isinstance(step, MountBar | MountLaser):

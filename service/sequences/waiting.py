@@ -23,12 +23,12 @@ async def paused(
 ) -> bool:
     """Wait until a pause is taken back and everything is as it has to be; what is not is said, and the pause goes on.
 
-    Where nobody may pause (`Control.hurry`) it does not go on: without a person's word nothing moves because a door was closed.
+    Where no pause is allowed (`Control.hurry`) it does not go on: a closed door alone, without a person's word, moves nothing.
 
     Returns
     -------
     bool
-        Whether somebody may have touched what is mounted: the door was open, the mode another, or the controller did not say.
+        Whether a person may have touched what is mounted: the door was open, the mode another, or the controller did not say.
 
     Raises
     ------
@@ -60,7 +60,7 @@ async def paused(
 
 
 class Visits:
-    """Looks whether somebody is at work in the machine, while nothing moves."""
+    """Looks whether a person works in the machine, while nothing moves."""
 
     def __init__(self, session: Session) -> None:
         self._controller = session.controller
@@ -71,7 +71,7 @@ class Visits:
         try:
             self.seen = self.seen or somebody_at_work(await self._controller.status())
         except DriverError:
-            self.seen = True  # nobody knows
+            self.seen = True  # unknown counts as touched
 
     async def during(self, work: Awaitable[None]) -> None:
         """Wait for something, and look again and again meanwhile."""
@@ -89,7 +89,7 @@ class Visits:
 
 
 def may_suspend(trouble: Interlock, suspending: Suspending) -> bool:
-    """Whether a condition only suspends: it can clear by itself, and somebody has said that it may."""
+    """Whether a condition only suspends: it can clear by itself, and the machine file permits it."""
     return trouble.condition in CAN_CLEAR & suspending.conditions
 
 
@@ -101,7 +101,7 @@ async def suspended(
     Returns
     -------
     bool
-        Whether somebody may have touched what is mounted meanwhile.
+        Whether a person may have touched what is mounted meanwhile.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 From an event to the end of the motion command stream: one period, one exchange, and the stop. The controller's link carries one request
 at a time, so the watcher waits its turn like everybody else and never has more than one request under way. While others ask more often than
-it (a path is followed), it looks at what they were told, and asks only when that is a period old.
+it (a path is followed), it uses their answers, and asks only when the last one is a period old.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from typing import Any
 
 from abbe.drivers.api import ControllerStatus, DisplacementMeter
 from abbe.drivers.errors import DriverError, Rebooted
-from abbe.service.devices.clock_notes import latest_status
-from abbe.service.devices.session import Session
+from abbe.service.devices.session import Session, latest_status
 from abbe.service.errors import Interlock, MeasurementFault, StatusUnknown
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching, air_trouble, beam_trouble, tripped
@@ -75,7 +74,7 @@ class Watch:
             await self._rest(left_s)
 
     def _just_heard(self) -> ControllerStatus | None:
-        """What somebody else was told less than a period ago."""
+        """A status that another task read less than a period ago."""
         status = latest_status(self._s.controller)
         if status is None or status.host_s <= max(self._since_s, time.monotonic() - self._w.period_s):
             return None
@@ -140,7 +139,7 @@ class Watch:
 
 @asynccontextmanager
 async def watched(session: Session, control: Control, watching: Watching) -> AsyncIterator[Watch]:
-    """A block that ends as soon as a watcher objects or a person aborts. Whoever moves axes inside stops them when cancelled.
+    """A block that ends as soon as a watcher objects or a person aborts. Code that moves axes inside stops them when it is cancelled.
 
     Raises
     ------
@@ -163,7 +162,7 @@ async def watched(session: Session, control: Control, watching: Watching) -> Asy
     watch.end()
     aborting.cancel()
     await beside.ended()
-    if me.cancelling() > before:  # whoever wants this process to end is heard, whatever came together with it
+    if me.cancelling() > before:  # a cancellation from outside goes first, whatever came together with it
         raise body if isinstance(body, asyncio.CancelledError) else asyncio.CancelledError
     if body is not None and not isinstance(body, asyncio.CancelledError):
         raise await watch.named(body) from body

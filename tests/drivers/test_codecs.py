@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from abbe.drivers.ballbar import frames
 from abbe.drivers.ballbar.frames import Ack, BoxSettings, FrameDecoder, Info
-from abbe.drivers.laser import registers as laser
+from abbe.drivers.laser import driver as laser
 from abbe.drivers.links.words import bytes_of, words_of
 from abbe.simulators.ballbar.device import Settings as DeviceSettings
 from abbe.simulators.ballbar.wire import Parser, encode_ack, encode_info, encode_settings

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from abbe.drivers.cnc import registers as cnc
 from abbe.drivers.errors import WrongDevice
-from abbe.drivers.laser import registers as laser
+from abbe.drivers.laser import driver as laser
 from abbe.drivers.links.modbus import rtu_mismatch, tcp_mismatch
 from abbe.drivers.links.words import Register, RegisterBlock, bytes_of, check_identity, words_of
 

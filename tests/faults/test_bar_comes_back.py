@@ -13,7 +13,7 @@ import pytest
 
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.errors import DriverError, LinkDown, Rebooted, WrongDevice
-from abbe.service.campaigns.bar_link import MOST_BREAKS, BarBreaks
+from abbe.service.campaigns.campaign_run import MOST_BREAKS, BarBreaks
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.capture.recovery import ledger_of

@@ -20,9 +20,8 @@ from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.cli.app import app
 from abbe.service.clock import SystemClock
 from abbe.service.sequences.control import State
-from abbe.service.sequences.incident_account import troubles
 from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, links_of
-from abbe.service.sequences.journal import ENDED, INCIDENT, StoreJournal
+from abbe.service.sequences.journal import ENDED, INCIDENT, StoreJournal, troubles
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.simulators.faults.modbus_proxy import ModbusProxy

@@ -10,13 +10,13 @@ from abbe.service.cli.common import print_json, print_table
 
 if TYPE_CHECKING:
     from abbe.service.domain.measured import CampaignRecord
-    from abbe.service.sequences.incident_account import Trouble
+    from abbe.service.sequences.journal import Trouble
     from abbe.service.storage.store import Store
 
 
 def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> None:
     """Print a campaign: one line for each run, one for each kind of trouble on a link and how it ended."""
-    from abbe.service.sequences.incident_account import not_written, troubles
+    from abbe.service.sequences.journal import not_written, troubles
 
     runs, journal = store.runs.all(campaign.id), store.checkpoints.of_campaign(campaign.id)
     found, lost = troubles(journal), not_written(journal)

@@ -1,1 +1,1 @@
-"""NC programs for controllers that nobody moves by registers: what the operator starts while Abbe only listens."""
+"""NC programs for controllers that Abbe does not move: the operator starts them while Abbe listens."""

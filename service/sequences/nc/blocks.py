@@ -33,12 +33,12 @@ LASER_DWELL_S = 0.7
 """After settling: 14 output samples of the laser, so that a few may be lost at either end of a standstill."""
 BAR_DWELL_S = 0.3
 PATH_REST_S = 2.0
-"""Standstill before and after a path that is recorded as it runs: whoever listens sees where it begins and ends."""
+"""Standstill before and after a path that is recorded as it runs: the listener sees where it begins and ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Say:
-    """Words for whoever reads the program."""
+    """A comment for the reader of the program."""
 
     text: str
 
@@ -140,7 +140,7 @@ def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
     feed = min((s.feed_mm_min for s in steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=0.0)
     for k, step in enumerate(steps):
         if isinstance(step, ZeroLaser) and k and isinstance(steps[k - 1], MountLaser):
-            continue  # one halt for both: whoever starts the program between them would be taken for the measurement
+            continue  # one halt for both: a start of the program between them would be taken for the measurement
         if mount is not None and k == hang:
             radius = test.setup["radius_mm"]
             yield Halt(f"hang in the bar of {radius:g} mm")

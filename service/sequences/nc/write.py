@@ -123,7 +123,7 @@ def _minutes(made: Program, took: Runtime) -> str:
 
 
 def _time_words(took: Runtime, pace: Pace) -> tuple[str, str]:
-    """Rounded up: whoever stands beside it rather waits less than was said."""
+    """Rounded up: the operator should wait less than was said, not longer."""
     return (
         f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells; not counted are"
         " the stops for a person and the way to the first position",

@@ -53,7 +53,7 @@ class CupTest(TestRecipe):
     """A ball-bar test: where its cup stands and what bar hangs in it.
 
     ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
-    ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: nobody measured it.
+    ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: the length was never measured.
     ``change_bar``: the test before had another radius; the cup stays, the bar is taken out before the machine moves and the other one is
     hung in where its path starts. ``link_mm``: where the test before has left the machine, if this one begins elsewhere on the same sphere.
     """

@@ -161,7 +161,7 @@ class Circle(CupTest):
     ``direction`` 1: the way the angles count; -1: the same arc back. ``feed_in_deg`` and ``feed_out_deg`` prolong the arc along the same
     circle and do not count (ISO 230-4: 180 degrees for a full circle). Where nothing is said, the plane across ``axis`` has a full circle
     from 0 degrees, and the two planes that hold it the partial arc of 220 degrees about the pole with 2 degrees before and after it: what
-    carries the cup stands below. ``under_the_cup``: points lower than that are wanted; somebody has made sure that there is room.
+    carries the cup stands below. ``under_the_cup``: points lower than that are wanted; the user has made sure that there is room.
     The machine takes the way over the pole between two arcs about one cup.
     """
 
@@ -177,7 +177,7 @@ class Circle(CupTest):
     chord_mm: float = inner(0.5)
 
     def arc(self) -> dict[str, float]:
-        """Where the arc begins, how long it is, feed-in and feed-out, degrees; what nobody said is chosen."""
+        """Where the arc begins, how long it is, feed-in and feed-out, degrees; fields without a value are chosen."""
         upright = AXES[self.axis] in self.plane
         span = self.span_deg if self.span_deg is not None else PARTIAL_DEG if upright else 360.0
         pole = (0.0 if self.plane[0] == AXES[self.axis] else 90.0) + (0.0 if self.opens > 0 else 180.0)

@@ -10,7 +10,7 @@ from abbe.service.compensation.proved_levels import KIND
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.measured import CampaignRecord
 from abbe.service.secrets import mask_secrets
-from abbe.service.sequences.incident_account import Trouble, troubles
+from abbe.service.sequences.journal import Trouble, troubles
 from abbe.service.storage.store import Store
 
 CAMPAIGNS = 10

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from abbe.drivers.ballbar.frames import Bad, FrameDecoder
 from abbe.drivers.cnc import registers as cnc
-from abbe.drivers.laser import registers as laser
+from abbe.drivers.laser import driver as laser
 from abbe.drivers.links.words import RegisterBlock, words_of
 from abbe.simulators.ballbar.device import Settings
 from abbe.simulators.ballbar.wire import encode_ack, encode_info, encode_settings

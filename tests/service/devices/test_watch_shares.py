@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 
 from abbe.drivers.api import Condition, ControllerStatus
-from abbe.service.devices.clock_notes import noted
-from abbe.service.devices.session import Session
+from abbe.service.devices.session import Session, noted
 from abbe.service.errors import DoorOpen
 from abbe.service.sequences.interlocks import AT_WORK, Watching
 from abbe.service.sequences.watch import NOTHING, Watch

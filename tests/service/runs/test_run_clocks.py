@@ -9,7 +9,7 @@ import pytest
 
 from abbe.drivers.api import BarSample
 from abbe.service.campaign_data.run_times import times
-from abbe.service.devices.clock_notes import KEPT, noted, notes_since
+from abbe.service.devices.session import KEPT, noted, notes_since
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.domain.owner import Owner
 from abbe.service.runs.codec import BAR_CODEC, encode_bar

@@ -8,11 +8,10 @@ import pytest
 
 from abbe.drivers.api import BarBatch, BarSample, Condition
 from abbe.drivers.errors import LinkDown, ReplyTimeout
-from abbe.service.campaigns.measure import OpenCampaign, measure_test
-from abbe.service.campaigns.progress import ProgressMeter
+from abbe.service.campaigns.measure import OpenCampaign, ProgressMeter, measure_test
 from abbe.service.devices.session import Session
 from abbe.service.errors import MeasurementFault
-from abbe.service.sequences.guard import UNDELIVERED, motion_guard, warnings_of
+from abbe.service.sequences.paths import UNDELIVERED, motion_guard, warnings_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
 from tests.pretended_status import READY, controller_status
