@@ -8,6 +8,7 @@ from typing import Any
 
 from abbe.service.campaign_data.provenance import machine_digest, run_digest
 from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.errors import CampaignRefused
 from abbe.service.runs.cases import set_once
 from abbe.service.runs.columns import load_run
@@ -18,13 +19,17 @@ from abbe.service.storage.store import Store
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store. ``doc``: its campaign object."""
+    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store. ``doc``: its campaign object.
+
+    ``removed``: the table whose side effects were removed from the readings; None: none were.
+    """
 
     name: str
     site: Site
     runs: list[dict[str, Any]]
     folder: Path | None
     doc: dict[str, Any] = field(default_factory=dict)
+    removed: TableTakenOut | None = None
 
     def without(self, labels: list[str]) -> Campaign:
         """The campaign without some of its runs.
@@ -38,7 +43,7 @@ class Campaign:
         missing = [n for n in labels if n not in names]
         if missing:
             raise CampaignRefused(f"campaign {self.name} has no run {missing[0]}", f"it has {', '.join(names)}")
-        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder, self.doc)
+        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder, self.doc, self.removed)
 
 
 def is_folder(campaign: str) -> bool:

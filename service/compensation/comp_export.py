@@ -17,6 +17,7 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES, Machine
+from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.errors import FileFormatError, FormatRefused, TableFileError
 from abbe.service.files import NotPlainError, read_plain
 from abbe.service.formats.choice import FormatChoice, best_of, choices, rounded
@@ -56,7 +57,7 @@ def identified(doc: dict[str, Any]) -> Identified:
             raise FileFormatError(f"the solution holds no {what} (key {key!r})", "solve the campaign again: abbe solve")
     try:
         machine = machine_from_doc(doc["machine"])
-        terms, coefficients, _ = stored_prediction(doc["prediction"])
+        terms, coefficients, _ = stored_prediction(StoredPrediction.read(doc["prediction"]))
         told = doc.get("parameters", {})
         lost = {a: told.get(f"backlash_{a}", {}) for a in AXES}
         seen = {a: float(v["value"]) for a, v in lost.items() if v and v["status"] != "not observable"}

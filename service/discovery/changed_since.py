@@ -20,6 +20,7 @@ from abbe.service.campaign_data.provenance import machine_digest
 from abbe.service.discovery.changed_words import proved
 from abbe.service.domain.finding import ChangedSince, ChangeRival, EffectFound, GapUm, MotionChange
 from abbe.service.domain.results import SolutionRecord
+from abbe.service.domain.solution_file import stored_solution
 from abbe.service.effects.known_effects import LASTING, applies
 from abbe.service.effects.model_book import version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
@@ -85,16 +86,20 @@ def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
     digest = machine_digest(campaign.site.machine)
     for one in reversed([c for c in mine if c.id < at]):
         for record in reversed(store.solutions.all(one.id)):
-            doc = record.doc
-            if str(doc.get("model", "")).startswith("rigid21") and (doc.get("inputs") or {}).get("machine") == digest:
+            try:
+                solution = stored_solution(record.doc, record.id)
+            except Unusable:  # a commissioning, or stored by a version that kept less
+                continue
+            if solution.model.startswith("rigid21") and solution.inputs.machine == digest:
                 yield record
 
 
 def _before_of(store: Store, record: SolutionRecord) -> _Before:
-    book = record.doc.get("machine_model") or {}
-    taken = frozenset(book.get("taken_out", []))
-    number = int(book["version"]) if taken else None
-    return _Before(record.id, stored_field(store, record).known, _acting(_tables_of(store, record)), number, taken)
+    book = stored_solution(record.doc, record.id).machine_model
+    known, crc = stored_field(store, record).known, _acting(_tables_of(store, record))
+    if book is None or not book.taken_out:
+        return _Before(record.id, known, crc, None, frozenset())
+    return _Before(record.id, known, crc, book.version, frozenset(book.taken_out))
 
 
 def _tables_of(store: Store, record: SolutionRecord) -> list[Doc]:

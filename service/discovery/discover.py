@@ -36,7 +36,7 @@ from abbe.service.effects.known_effects import applies, readings_of, without
 from abbe.service.effects.model_book import grown
 from abbe.service.errors import NotObservable
 from abbe.service.identification.solve import ALL_READINGS
-from abbe.service.identification.table_removal import NO_TABLE, TABLE_OUT, TableThen, as_left, table_line
+from abbe.service.identification.table_removal import NO_TABLE, TableThen, as_left, table_line
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.observations import run_data
 
@@ -122,7 +122,7 @@ def prepare(
     """
     flags = _checked(campaign)
     left = as_left(campaign, table.table)
-    flags += [table_line(left.doc[TABLE_OUT])] if TABLE_OUT in left.doc else [table.why] if table.why else []
+    flags += [table_line(left.removed)] if left.removed is not None else [table.why] if table.why else []
     runs = thin(left.runs)
     hidden = thinning(left.runs, runs)
     table_mm = {} if left is campaign else _between(thin(campaign.runs), runs)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from abbe.service.compensation.proposals import Made
 from abbe.service.domain.results import SolutionRecord
+from abbe.service.domain.solution_file import stored_solution
+from abbe.service.errors import Unusable
 from abbe.service.storage.store import Store
 
 NAMES = {
@@ -18,7 +19,6 @@ NAMES = {
     "A0Z": "squareness of Y and Z",
 }
 COVERAGE = 2.0
-Means = dict[str, dict[str, Any]]
 
 
 def linear_words(store: Store, made: Made) -> str:
@@ -27,16 +27,15 @@ def linear_words(store: Store, made: Made) -> str:
     Only solutions that were measured with the same table in force are compared. What both share (the laser's wavelength) counts twice in U.
     """
     new = store.solutions.get(made.proposed.solution_id)
-    means: Means = new.doc.get("mean_over_volume") or {}
-    known = {k: v for k, v in means.items() if k in NAMES and v.get("value") is not None and v.get("u") is not None}
+    known = {k: v for k, v in stored_solution(new.doc, new.id).mean_over_volume.items() if k in NAMES}
     if not known:
         return ""
     old = _before(store, new)
     if old is None:
-        first = max(known, key=lambda k: abs(known[k]["value"]))
-        return f"; largest linear error: {NAMES[first]} {_size(known[first]['value'], known[first]['u'])}"
-    then: Means = old.doc["mean_over_volume"]
-    changes = {k: (v["value"] - then[k]["value"], math.hypot(v["u"], then[k]["u"])) for k, v in known.items() if k in then}
+        first = max(known, key=lambda k: abs(known[k].value))
+        return f"; largest linear error: {NAMES[first]} {_size(known[first].value, known[first].u)}"
+    then = stored_solution(old.doc, old.id).mean_over_volume
+    changes = {k: (v.value - then[k].value, math.hypot(v.u, then[k].u)) for k, v in known.items() if k in then}
     name = largest_sure(changes)
     if name is None:
         return f"; since solution {old.id} no scale and no squareness has changed by more than U"
@@ -55,8 +54,14 @@ def _size(value: float, u: float) -> str:
 
 def _before(store: Store, new: SolutionRecord) -> SolutionRecord | None:
     """The last solution of the same machine, geometry included, that is comparable."""
-    machine = new.doc["inputs"]["machine"]
+    inputs = stored_solution(new.doc, new.id).inputs
     same = [c.id for c in store.campaigns.all() if c.machine_id == store.campaigns.find(new.campaign_id).machine_id]
-    found = [s for number in same for s in store.solutions.all(number) if s.id < new.id and s.doc.get("mean_over_volume")]
-    found = [s for s in found if s.doc["inputs"]["machine"] == machine and s.doc["inputs"].get("tables") == new.doc["inputs"].get("tables")]
-    return max(found, key=lambda s: s.id, default=None)
+    earlier = [s for number in same for s in store.solutions.all(number) if s.id < new.id and s.kind == new.kind]
+    for one in sorted(earlier, key=lambda s: s.id, reverse=True):
+        try:
+            old = stored_solution(one.doc, one.id)
+        except Unusable:  # stored by a version that kept less
+            continue
+        if old.mean_over_volume and old.inputs.machine == inputs.machine and old.inputs.tables == inputs.tables:
+            return one
+    return None

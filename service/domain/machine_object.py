@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -45,7 +45,18 @@ Point = tuple[float, float, float]
 class FileObject(BaseModel):
     """Base of everything in an exchange file: unknown keys are kept, numbers are finite, text is no number."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True, frozen=True)
+
+    @classmethod
+    def read(cls, doc: object) -> Self:
+        """A JSON object that was read already: there lists stand for tuples.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            The object has another form.
+        """
+        return cls.model_validate(doc, strict=False)
 
 
 class Strokes(FileObject):

@@ -1,12 +1,13 @@
-"""The document of a solution (``abbe-solution/1``) as pydantic models: what `abbe solve --json` prints and the store keeps."""
+"""A solution (``abbe-solution/1``): what `abbe solve --json` prints, the store keeps and every reader of a stored solution works with."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from abbe.service.domain.machine_object import FileObject, MachineObject, Point
+from abbe.service.errors import Unusable
 
 Status = Literal["observed", "weak", "not observable"]
 Digest = str
@@ -287,3 +288,17 @@ class SolutionFile(FileObject):
     solution_id: int | None = None
     run_ids: list[int] | None = None
     same_as: list[int] | None = None
+
+
+def stored_solution(doc: object, number: int) -> SolutionFile:
+    """The document of a stored solution.
+
+    Raises
+    ------
+    Unusable
+        It has another form: a version before this one stored it.
+    """
+    try:
+        return SolutionFile.read(doc)
+    except ValidationError:
+        raise Unusable(f"solution {number} was stored in another form than abbe-solution/1", "solve the campaign again") from None

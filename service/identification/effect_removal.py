@@ -12,10 +12,11 @@ from abbe.models.effects.effect import Effect
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import changed, machine_digest
 from abbe.service.domain.finding import EffectSize
+from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.known_effects import applies, readings_of
 from abbe.service.effects.model_book import current, no_table_lines
-from abbe.service.identification.table_removal import TABLE_OUT, TableThen, as_left
+from abbe.service.identification.table_removal import TableThen, as_left
 from abbe.service.runs.cases import case_of
 from abbe.service.storage.store import Store
 
@@ -34,13 +35,13 @@ class TakenOut:
     labels: tuple[str, ...]
     lines: tuple[str, ...]
     version: int | None
-    in_force: dict[str, Any] | None = None
+    in_force: TableTakenOut | None = None
     not_taken: str = ""
 
     @property
     def doc(self) -> dict[str, Any]:
         """For the document of a solution; empty without a book and without a table."""
-        told: dict[str, Any] = {} if self.in_force is None else {TABLE_OUT: self.in_force}
+        told: dict[str, Any] = {} if self.in_force is None else {"table_taken_out": self.in_force.model_dump(mode="json")}
         told |= {"table_not_taken_out": self.not_taken} if self.not_taken else {}
         if self.version is None:
             return told
@@ -61,7 +62,7 @@ def taken_out(store: Store, campaign: Campaign, then: TableThen, effects: tuple[
         The book knows an effect that this catalogue does not.
     """
     left = as_left(campaign, then.table)
-    return replace(_less_known(store, left, effects), in_force=left.doc.get(TABLE_OUT), not_taken=then.why)
+    return replace(_less_known(store, left, effects), in_force=left.removed, not_taken=then.why)
 
 
 def _less_known(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None) -> TakenOut:

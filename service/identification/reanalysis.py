@@ -9,6 +9,7 @@ from typing import Any
 
 from abbe.models.solvers.joint import Model
 from abbe.service.campaign_data.campaign_folder import from_store, keep
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import AbbeError
 from abbe.service.identification.effect_removal import taken_out
 from abbe.service.identification.executors import Executor
@@ -75,4 +76,6 @@ def row(answer: Reanalysed) -> tuple[str, str, str, str]:
     """Return the cells of `HEADINGS`."""
     if answer.doc is None:
         return (answer.campaign, "", "refused", answer.refused)
-    return (answer.campaign, str(len(answer.doc["inputs"]["runs"])), answer.doc["verdict"]["word"], answer.doc["verdict"]["text"])
+    solution = SolutionFile.read(answer.doc)
+    word, text = ("", "") if solution.verdict is None else (solution.verdict.word, solution.verdict.text)
+    return (answer.campaign, str(len(solution.inputs.runs)), word, text)

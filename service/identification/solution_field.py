@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from abbe.models.uncertainty.coverage import apart_from_zero
 from abbe.models.uncertainty.known_field import KnownField, field_map
 from abbe.models.volumetric import volume_grid
 from abbe.service.domain.results import SolutionRecord
+from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotObservable, Unusable
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
@@ -92,17 +92,17 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
     Unusable
         It was stored by a version that did not keep the covariance.
     """
-    doc: dict[str, Any] = record.doc
-    if "prediction" not in doc:
+    solution = stored_solution(record.doc, record.id)
+    if solution.prediction is None:
         raise Unusable(f"solution {record.id} does not hold its covariance: a version before it was kept stored it", "solve again")
-    terms, coefficients, covariance = stored_prediction(doc["prediction"])
+    terms, coefficients, covariance = stored_prediction(solution.prediction)
     machine = machine_from_doc(store.machines.get(store.campaigns.find(record.campaign_id).machine_id).doc)
-    motions: Mapping[str, Mapping[str, Any]] = doc.get("motions") or {}
-    statuses = {name: str(told.get("status", "")) for name, told in motions.items()}
-    means = {name: (float(m["value"]), float(m["u"])) for name, m in (doc.get("mean_over_volume") or {}).items()}
-    hidden = {name: str(told.get("reason") or HIDDEN) for name, told in motions.items() if told.get("status") == HIDDEN}
-    scatter_mm = float(doc["prediction"].get("scatter_mm", 0.0))
-    return StoredField(record.id, KnownField(machine, terms, coefficients, covariance, scatter_mm), hidden, statuses, means)
+    motions = solution.motions
+    statuses = {name: m.status for name, m in motions.items()}
+    means = {name: (m.value, m.u) for name, m in solution.mean_over_volume.items()}
+    hidden = {name: m.reason or HIDDEN for name, m in motions.items() if m.status == HIDDEN}
+    known = KnownField(machine, terms, coefficients, covariance, solution.prediction.scatter_mm)
+    return StoredField(record.id, known, hidden, statuses, means)
 
 
 def node_map(stored: StoredField, nodes: int, motions: Sequence[str] = ()) -> NodeMap:

@@ -1,13 +1,13 @@
-"""What is said about a solution: the stored document (`abbe-solution/1`), and lines for people. Every figure has its uncertainty."""
+"""A solution as it is stored (`abbe-solution/1`), and as lines for people. Every figure has its uncertainty."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal, cast
 
 import numpy as np
 
-from abbe.models.arrays import F2
+from abbe.models.arrays import F1, F2
 from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
 from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
@@ -18,12 +18,35 @@ from abbe.models.uncertainty.prediction import Budget, BudgetLine, Prediction, b
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 from abbe.models.volumetric import volume_grid
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, versions
+from abbe.service.domain.document import Doc
+from abbe.service.domain.machine_object import Point
+from abbe.service.domain.solution_file import (
+    BudgetLineValue,
+    CorrelationValue,
+    Inputs,
+    MeanValue,
+    MotionValue,
+    NoiseFound,
+    ObservabilityNumber,
+    OutlierFound,
+    ParameterValue,
+    Rank,
+    ResidualTestResult,
+    RunResult,
+    SolutionFile,
+    TableInForce,
+    Uncertainty,
+    VerdictValue,
+    Versions,
+    WorstPoint,
+)
 from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
 from abbe.service.identification.solve_verdict import Verdict, layout_line, verdict
-from abbe.service.identification.stored_prediction import prediction_doc
+from abbe.service.identification.stored_prediction import prediction_of
 from abbe.service.tables.measured_with import distinct
 
-FORMAT = "abbe-solution/1"
+FORMAT: Literal["abbe-solution/1"] = "abbe-solution/1"
+Word = Literal["good", "usable with care", "mostly assumption"]
 HIDDEN_NOTE = "not observable by itself: for this tool only"
 NODES = 6
 """Nodes per axis of the grid over the strokes on which the uncertainty is stated."""
@@ -33,7 +56,7 @@ LISTED = 20
 
 @dataclass(frozen=True)
 class Account:
-    """A solution and everything that is said about it. ``prediction`` is over the whole volume, best-fit rigid motion removed."""
+    """A solution with its observability, uncertainty and budget. ``prediction`` is over the whole volume, best-fit rigid motion removed."""
 
     solved: Solved
     observability: Observability
@@ -81,32 +104,59 @@ def not_observable(found: Account) -> list[str]:
     return [g.text for g in found.observability.hidden]
 
 
-def solution_doc(solved: Solved | Account) -> dict[str, Any]:
+def solution_of(solved: Solved | Account) -> SolutionFile:
     """The solution as it is stored: parameters with uncertainty in SI-like units, what is not observable, tests, versions, digests."""
     found = solved if isinstance(solved, Account) else account(solved)
-    joint = found.joint
+    joint, o, e = found.joint, found.observability, found.joint.estimate
     key = model_key(joint)
-    return {
-        "format": FORMAT,
-        "model": key,
-        "order": joint.order,
-        "versions": versions(),
-        "verdict": _verdict(found),
-        "inputs": _inputs(found, key.partition("/")[0]),
-        **_parameters(found),
-        **_observability(found),
-        **_residuals(found.solved),
-        "flags": [f.line for f in found.solved.flags],
-        "uncertainty": _uncertainty(found),
-        "prediction": prediction_doc(found.sources),
-        "ten_parameter_helix": {
-            label: {n: {"value": h.estimate.value(n), "u": h.estimate.u(n)} for n in h.estimate.names}
+    return SolutionFile(
+        format=FORMAT,
+        model=key,
+        order=joint.order,
+        versions=Versions(**versions()),
+        verdict=_verdict(found),
+        inputs=_inputs(found, key.partition("/")[0]),
+        parameters={
+            p.name: ParameterValue(value=p.value, u=p.u, data_share=p.share, status=p.status) for p in o.parameters if p.value is not None
+        },
+        mean_over_volume={p.name: MeanValue(value=p.value, u=p.u) for p in found.mean},
+        mean_over_volume_note=f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
+        motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
+        rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.seen.effective_rank),
+        not_observable=not_observable(found),
+        advice=[a.text for a in o.advice],
+        observability=ObservabilityNumber(
+            number=o.number.value, median=o.number.median, verdict=cast(Word, o.number.verdict), text=o.number.text
+        ),
+        correlations=[CorrelationValue(first=c.first, second=c.second, r=c.r) for c in o.correlations[:LISTED]],
+        chi2=e.chi2,
+        dof=e.dof,
+        variance_factor=e.variance_factor,
+        runs=_runs(joint),
+        noise=_noise(joint),
+        outliers=_outliers(found.solved),
+        residual_tests=_residual_tests(joint),
+        flags=[f.line for f in found.solved.flags],
+        uncertainty=_uncertainty(found),
+        prediction=prediction_of(found.sources),
+        ten_parameter_helix={
+            label: {n: MeanValue(value=h.estimate.value(n), u=h.estimate.u(n)) for n in h.estimate.names}
             for label, h in found.solved.helices.items()
         },
-        "ten_parameter_helix_note": HELIX_NOTE,
-        "step_diagonals": found.solved.step_totals,
-        "step_diagonals_note": STEP_NOTE,
-    }
+        ten_parameter_helix_note=HELIX_NOTE,
+        step_diagonals=found.solved.step_totals,
+        step_diagonals_note=STEP_NOTE,
+    )
+
+
+def solution_doc(solved: Solved | Account) -> Doc:
+    """`solution_of` as JSON."""
+    return as_doc(solution_of(solved))
+
+
+def as_doc(solution: SolutionFile) -> Doc:
+    """A solution as JSON; what was never stated is left out."""
+    return solution.model_dump(mode="json", exclude_unset=True)
 
 
 def judged(found: Account) -> Verdict:
@@ -115,105 +165,81 @@ def judged(found: Account) -> Verdict:
     return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
 
 
-def _verdict(found: Account) -> dict[str, Any]:
-    told = judged(found)
-    return {"word": told.word, "text": told.text, "reasons": list(told.reasons), "layout": layout_line(found.observability.number)}
+def _verdict(found: Account) -> VerdictValue:
+    own = judged(found)
+    layout = layout_line(found.observability.number)
+    return VerdictValue(word=cast(Word, own.word), text=own.text, reasons=list(own.reasons), layout=layout)
 
 
-def _inputs(found: Account, model: str) -> dict[str, Any]:
+def _inputs(found: Account, model: str) -> Inputs:
     machine = machine_digest(found.joint.machine)
-    return {
-        "digest": campaign_digest(found.solved.digests, "\n".join([model, *found.solved.taken]), machine),
-        "machine": machine,
-        "runs": found.solved.digests,
-        "tables": distinct(found.solved.tables.values()),
-    }
+    return Inputs(
+        digest=campaign_digest(found.solved.digests, "\n".join([model, *found.solved.taken]), machine),
+        machine=machine,
+        runs=found.solved.digests,
+        tables=[TableInForce(**table) for table in distinct(found.solved.tables.values())],
+    )
 
 
-def _parameters(found: Account) -> dict[str, Any]:
-    return {
-        "parameters": {
-            p.name: {"value": p.value, "u": p.u, "data_share": p.share, "status": p.status} for p in found.observability.parameters
-        },
-        "mean_over_volume": {p.name: {"value": p.value, "u": p.u} for p in found.mean},
-        "mean_over_volume_note": f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
-        "motions": {m.name: {"status": m.status, "u": m.u, "data_share": m.share, "reason": m.reason} for m in found.observability.motions},
-    }
-
-
-def _observability(found: Account) -> dict[str, Any]:
-    o = found.observability
-    return {
-        "rank": {"rank": o.rank, "of": len(o.terms), "effective_rank": o.seen.effective_rank},
-        "not_observable": not_observable(found),
-        "advice": [a.text for a in o.advice],
-        "observability": {"number": o.number.value, "median": o.number.median, "verdict": o.number.verdict, "text": o.number.text},
-        "correlations": [{"first": c.first, "second": c.second, "r": c.r} for c in o.correlations[:LISTED]],
-    }
-
-
-def _residuals(solved: Solved) -> dict[str, Any]:
-    joint, e = solved.joint, solved.joint.estimate
+def _runs(joint: JointSolution) -> dict[str, RunResult]:
     counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
     return {
-        "chi2": e.chi2,
-        "dof": e.dof,
-        "variance_factor": e.variance_factor,
-        "runs": {
-            r.label: {
-                "readings": r.residual_mm.size,
-                "rms_um": r.rms_mm * 1e3,
-                "expected_um": r.expected_mm * 1e3,
-                "outliers": counts[r.label],
-            }
-            for r in joint.runs
-        },
-        "noise": {
-            kind: {"sigma_um": sigma * 1e3, "repeats_um": None if repeats is None else repeats * 1e3}
-            for kind, sigma in joint.noise_mm.items()
-            for repeats in [joint.noise_repeats_mm.get(kind)]
-        },
-        "outliers": [
-            {"run": o.run, "index": o.index, "rows": _rows(solved, o), "t_s": _time(joint, o), "size_sigma": o.size, "weight": o.weight}
-            for o in joint.outliers
-        ],
-        "residual_tests": [
-            {
-                "run": t.run,
-                "test": t.name,
-                "statistic": t.statistic,
-                "p": t.p,
-                "p_adjusted": t.p_adjusted,
-                "flagged": t.flagged,
-                "text": t.text,
-            }
-            for t in joint.residual_tests
-        ],
+        r.label: RunResult(readings=r.residual_mm.size, rms_um=r.rms_mm * 1e3, expected_um=r.expected_mm * 1e3, outliers=counts[r.label])
+        for r in joint.runs
     }
 
 
-def _uncertainty(found: Account) -> dict[str, Any]:
-    p, at = found.prediction, worst_point(found.prediction)
+def _noise(joint: JointSolution) -> dict[str, NoiseFound]:
     return {
-        "frame": "best-fit rigid motion over the strokes removed",
-        "worst_point": {
-            "at_mm": [float(v) for v in p.points_mm[at]],
-            "deviation_um": [float(v) for v in p.deviation_mm[at] * 1e3],
-            "u_um": [float(v) for v in p.u_mm[at] * 1e3],
-            "expanded_um": [float(v) for v in p.expanded_mm[at] * 1e3],
-            "expanded_vector_um": float(p.expanded_vector_mm[at]) * 1e3,
-        },
-        "rms_um": float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
-        "budget": [_budget_line(found, line) for line in found.budget.lines],
-        "compensable_share": found.mask.share,
+        kind: NoiseFound(sigma_um=sigma * 1e3, repeats_um=None if repeats is None else repeats * 1e3)
+        for kind, sigma in joint.noise_mm.items()
+        for repeats in [joint.noise_repeats_mm.get(kind)]
     }
 
 
-def _budget_line(found: Account, line: BudgetLine) -> dict[str, Any]:
-    """A source with the type of its evaluation and its degrees of freedom; null: stated, or the allowance for them."""
+def _outliers(solved: Solved) -> list[OutlierFound]:
+    joint = solved.joint
+    return [
+        OutlierFound(run=o.run, index=o.index, rows=_rows(solved, o), t_s=_time(joint, o), size_sigma=o.size, weight=o.weight)
+        for o in joint.outliers
+    ]
+
+
+def _residual_tests(joint: JointSolution) -> list[ResidualTestResult]:
+    return [
+        ResidualTestResult(run=t.run, test=t.name, statistic=t.statistic, p=t.p, p_adjusted=t.p_adjusted, flagged=t.flagged, text=t.text)
+        for t in joint.residual_tests
+    ]
+
+
+def _uncertainty(found: Account) -> Uncertainty:
+    p, at = found.prediction, worst_point(found.prediction)
+    return Uncertainty(
+        frame="best-fit rigid motion over the strokes removed",
+        worst_point=WorstPoint(
+            at_mm=point(p.points_mm[at]),
+            deviation_um=point(p.deviation_mm[at] * 1e3),
+            u_um=point(p.u_mm[at] * 1e3),
+            expanded_um=point(p.expanded_mm[at] * 1e3),
+            expanded_vector_um=float(p.expanded_vector_mm[at]) * 1e3,
+        ),
+        rms_um=float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
+        budget=[_budget_line(found, line) for line in found.budget.lines],
+        compensable_share=found.mask.share,
+    )
+
+
+def point(values: F1) -> Point:
+    """Three numbers of an array."""
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _budget_line(found: Account, line: BudgetLine) -> BudgetLineValue:
+    """A source with the type of its evaluation and its degrees of freedom; None: stated, or the allowance for them."""
     source = found.sources.source(line.name)
     dof = float(source.dof) if np.isfinite(source.dof) else None
-    return {"source": line.name, "words": line.words, "u_um": line.u_mm * 1e3, "share": line.share, "type": source.evaluation, "dof": dof}
+    return BudgetLineValue(source=line.name, words=line.words, u_um=line.u_mm * 1e3, share=line.share, type=source.evaluation, dof=dof)
 
 
 def worst_line(found: Account) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -14,21 +13,22 @@ from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from abbe.models.uncertainty.frame import volume_frame
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from abbe.models.uncertainty.prediction import worst_point
+from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
-from abbe.service.identification.solve_report import Account, judged
+from abbe.service.identification.solve_report import Account, judged, point
 
 Say = Callable[[str], None]
 GRID_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,u_dx_um,u_dy_um,u_dz_um,compensated"
 SEED, TRIALS = 101, 400_000
 
 
-def table_rows(found: Account, lsb_mm: float) -> list[dict[str, Any]]:
+def table_rows(found: Account, lsb_mm: float) -> list[TableRow]:
     """What every kind of table leaves of the errors of distances, µm, with standard uncertainties; rounded to the machine's unit."""
     out = []
     for row in achievable(found.joint, lsb_mm=lsb_mm, sources=found.sources):
         d = row.distances
         figures = {k: getattr(d, k.replace("_um", "_mm")) * 1e3 for k in ("rms_um", "u_rms_um", "q95_um", "u_q95_um", "max_um", "u_max_um")}
-        out.append({"kind": row.kind, "entries": row.entries} | figures | {"unknown_um": d.unknown_mm * 1e3})
+        out.append(TableRow(kind=row.kind, entries=row.entries, unknown_um=d.unknown_mm * 1e3, **figures))
     return out
 
 
@@ -64,7 +64,7 @@ def grid_text(table: GridTable) -> str:
     return "\n".join([GRID_HEADER, *lines]) + "\n"
 
 
-def monte_carlo(found: Account, say: Say) -> dict[str, Any]:
+def monte_carlo(found: Account, say: Say) -> MonteCarloCheck:
     """GUM Supplement 1 at the worst known point: the stated 95 % intervals against trials of all inputs, limits as rectangular."""
     p, at = found.prediction, worst_point(found.prediction)
     trials = campaign_trials(found.sources, p.points_mm[at : at + 1], frame=volume_frame(found.joint.machine), distributions=LIMITS)
@@ -85,12 +85,12 @@ def monte_carlo(found: Account, say: Say) -> dict[str, Any]:
         word = "the stated uncertainty is right to one digit"
     else:
         word = "the stated uncertainty is larger than needed" if (stated >= half)[~valid].all() else "the stated uncertainty is too small"
-    return {
-        "trials": drawn.trials,
-        "at_mm": [float(v) for v in p.points_mm[at]],
-        "stated_um": [float(v) for v in stated],
-        "found_um": [float(v) for v in half],
-        "valid": [bool(v) for v in valid],
-        "settled": bool(drawn.settled.all()),
-        "text": f"Monte Carlo (GUM Supplement 1, {drawn.trials} trials) at the worst known point, 95 % intervals in µm: {figures}: {word}.",
-    }
+    return MonteCarloCheck(
+        trials=drawn.trials,
+        at_mm=point(p.points_mm[at]),
+        stated_um=point(stated),
+        found_um=point(half),
+        valid=[bool(v) for v in valid],
+        settled=bool(drawn.settled.all()),
+        text=f"Monte Carlo (GUM Supplement 1, {drawn.trials} trials) at the worst known point, 95 % intervals in µm: {figures}: {word}.",
+    )

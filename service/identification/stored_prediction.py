@@ -7,18 +7,18 @@ Deviation at points = field @ coefficients, covariance = field @ covariance @ fi
 from __future__ import annotations
 
 import base64
-from typing import Any
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
 from abbe.models.uncertainty.sources import ErrorSources
+from abbe.service.domain.solution_file import PackedMatrix, StoredPrediction
 
 ENCODING = "base64 of float64, little endian, lower triangle by rows"
 
 
-def prediction_doc(sources: ErrorSources) -> dict[str, Any]:
+def prediction_of(sources: ErrorSources) -> StoredPrediction:
     """Terms (motion, order, axis, component), coefficients in mm and rad, and their covariance from all sources."""
     total = np.zeros((len(sources.terms), len(sources.terms)))
     for s in sources.sources:
@@ -26,19 +26,19 @@ def prediction_doc(sources: ErrorSources) -> dict[str, Any]:
         if s.less is not None:
             total -= s.less @ s.less.T
     lower = total[np.tril_indices(len(total))]
-    return {
-        "terms": [[t.motion, t.order, t.axis, t.component] for t in sources.terms],
-        "coefficients": [float(v) for v in sources.coefficients],
-        "covariance": {"encoding": ENCODING, "shape": list(total.shape), "data": base64.b64encode(lower.astype("<f8").tobytes()).decode()},
-        "scatter_mm": float(np.sqrt(sum(s.scatter_mm**2 for s in sources.sources))),
-    }
+    data = base64.b64encode(lower.astype("<f8").tobytes()).decode()
+    return StoredPrediction(
+        terms=[(t.motion, t.order, t.axis, t.component) for t in sources.terms],
+        coefficients=[float(v) for v in sources.coefficients],
+        covariance=PackedMatrix(encoding=ENCODING, shape=list(total.shape), data=data),
+        scatter_mm=float(np.sqrt(sum(s.scatter_mm**2 for s in sources.sources))),
+    )
 
 
-def stored_prediction(doc: dict[str, Any]) -> tuple[tuple[Term, ...], F1, F2]:
-    """Terms, coefficients and covariance of a stored document's ``prediction``."""
-    n = int(doc["covariance"]["shape"][0])
+def stored_prediction(stored: StoredPrediction) -> tuple[tuple[Term, ...], F1, F2]:
+    """Terms, coefficients and covariance of a stored solution's ``prediction``."""
+    n = stored.covariance.shape[0]
     out = np.zeros((n, n))
-    out[np.tril_indices(n)] = np.frombuffer(base64.b64decode(doc["covariance"]["data"]), dtype="<f8")
+    out[np.tril_indices(n)] = np.frombuffer(base64.b64decode(stored.covariance.data), dtype="<f8")
     out = out + np.tril(out, -1).T
-    terms = tuple(Term(*t) for t in doc["terms"])
-    return terms, np.asarray(doc["coefficients"], dtype=np.float64), out
+    return tuple(Term(*t) for t in stored.terms), np.asarray(stored.coefficients, dtype=np.float64), out

@@ -20,6 +20,7 @@ from abbe.models.solvers.joint import solve_joint
 from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import changed
+from abbe.service.domain.solution_file import LostMotion, TableTakenOut
 from abbe.service.errors import TableMismatch
 from abbe.service.runs.observations import beam_of, run_data
 from abbe.service.site import Site
@@ -29,8 +30,6 @@ from abbe.service.tables.nine_tables import tables_from_image
 
 Runs = list[dict[str, Any]]
 NOTHING = AppliedTables(np.zeros_like)
-TABLE_OUT = "table_taken_out"
-"""Key in a campaign's document and in a solution's: what was taken out of the readings."""
 STAYS = "what it did beyond smooth corrections, with the lost motion above all, is still in the readings"
 
 
@@ -75,7 +74,7 @@ def table_then(store: Store, campaign: Campaign) -> TableThen:
 def as_left(campaign: Campaign, table: NineTables | None) -> Campaign:
     """The campaign as if every axis had followed smooth corrections by ``table``, in force while it was measured; None for none.
 
-    Its document says then, under `TABLE_OUT`, which table that was and how well the lost motion is known that was reckoned with. Runs that
+    Its ``removed`` says then which table that was and how well the lost motion is known that was assumed. Runs that
     were measured with another table than those that identify, or with none, stay as they are.
 
     Raises
@@ -89,10 +88,10 @@ def as_left(campaign: Campaign, table: NineTables | None) -> Campaign:
     refuse(check_files(campaign.site.doc, used))  # a run that cannot be what it says is one line, and no trouble of a solver
     lost = _lost(campaign.site, used, table)
     crc = (used[0].get("table") or {}).get("crc")
-    told = {"crc": crc, "lost_motion_mm": {axis: {"value": v, "u": u} for axis, (v, u) in lost.items()}}
+    removed = TableTakenOut(crc=crc, lost_motion_mm={axis: LostMotion(value=v, u=u) for axis, (v, u) in lost.items()})
     out = taken(table, np.array([v for v, _ in lost.values()]))
     runs = [_less(run, out) if _with(run, crc) else run for run in campaign.runs]
-    return replace(campaign, runs=runs, doc=campaign.doc | {TABLE_OUT: told})
+    return replace(campaign, runs=runs, removed=removed)
 
 
 def _with(run: dict[str, Any], crc: int | None) -> bool:
@@ -100,10 +99,10 @@ def _with(run: dict[str, Any], crc: int | None) -> bool:
     return told.get("crc") == crc and told.get("acting") is not False
 
 
-def table_line(told: dict[str, Any]) -> str:
-    """What was taken out (`TABLE_OUT`), for people."""
-    lost = ", ".join(f"{axis} {one['value'] * 1e3:.1f} µm (u {one['u'] * 1e3:.1f})" for axis, one in told["lost_motion_mm"].items())
-    which = "" if told["crc"] is None else f" {told['crc']:08X}"
+def table_line(removed: TableTakenOut) -> str:
+    """What was taken out, for people."""
+    lost = ", ".join(f"{axis} {one.value * 1e3:.1f} µm (u {one.u * 1e3:.1f})" for axis, one in removed.lost_motion_mm.items())
+    which = "" if removed.crc is None else f" {removed.crc:08X}"
     return f"table{which} was in force: what it did beyond smooth corrections is taken out of the readings, with lost motion {lost}"
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from abbe.service.campaign_data.campaign_folder import Campaign
+    from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.identification.solve import Solved
     from abbe.service.identification.solve_report import Account
     from abbe.service.storage.store import Store
@@ -71,6 +72,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     A folder's result is stored only if --db or --machine names a database. A run that cannot be what it says is refused (exit code 2).
     """
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, keep
+    from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.identification.effect_removal import taken_out
     from abbe.service.identification.table_removal import table_then
     from abbe.service.rendering.document_page import form_of
@@ -99,7 +101,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     if as_json:
         print_json(doc)
         return
-    _print(told, doc)
+    _print(told, SolutionFile.read(doc))
     for name, target in (("report", report), ("grid", grid)):
         if target is not None:
             typer.echo(f"{name}: {target}")
@@ -139,7 +141,7 @@ def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[st
     from abbe.service.cli.progress import display
     from abbe.service.domain.progress import Progress
     from abbe.service.identification.solve import solve_runs
-    from abbe.service.identification.solve_report import account, solution_doc
+    from abbe.service.identification.solve_report import account, as_doc, solution_of
 
     with display() as sink:
         stages = iter(range(1, STAGES))
@@ -150,7 +152,8 @@ def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[st
         solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, say=say)
         say("what these runs cannot tell, and how well the volume is known")
         told = account(solved)
-        doc = {"campaign": campaign.name, "machine": campaign.site.doc} | solution_doc(told) | _more(told, wanted, say)
+        solution = solution_of(told).model_copy(update=_more(told, wanted, say))
+        doc = {"campaign": campaign.name, "machine": campaign.site.doc} | as_doc(solution)
         sink(Progress("solve", float(STAGES), float(STAGES), 0.0, "done"))
     return told, doc
 
@@ -186,34 +189,35 @@ def _write_report(store: Store | None, campaign: Campaign, told: Account, doc: d
     write_document(solution_report(store, campaign, SolutionResult(doc, doc.get("solution_id"), told), made, rules), target)
 
 
-def _print(told: Account, doc: dict[str, Any]) -> None:
+def _print(told: Account, solution: SolutionFile) -> None:
     from abbe.service.identification.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
-    from abbe.service.identification.table_removal import TABLE_OUT, table_line
+    from abbe.service.identification.table_removal import table_line
 
-    typer.echo(f"campaign {doc['campaign']}: model {doc['model']}, {len(doc['runs'])} runs")
-    _lines("look at these runs:", doc["flags"])
+    typer.echo(f"campaign {solution.campaign}: model {solution.model}, {len(solution.runs)} runs")
+    _lines("look at these runs:", solution.flags)
     _parameters(told)
     _comparison(told)
     o = told.observability
-    typer.echo(f"{doc['verdict']['word'].capitalize()}. {doc['verdict']['text']}")
-    typer.echo(doc["verdict"]["layout"])
+    if solution.verdict is not None:
+        typer.echo(f"{solution.verdict.word.capitalize()}. {solution.verdict.text}")
+        typer.echo(solution.verdict.layout)
     typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.seen.effective_rank} of them well.")
     typer.echo(worst_line(told))
-    _tables(doc)
-    if TABLE_OUT in doc:
-        typer.echo(table_line(doc[TABLE_OUT]))
-    if "table_not_taken_out" in doc:
-        typer.echo(f"look at this: {doc['table_not_taken_out']}")
-    if "machine_model" in doc:
-        _lines("model book, not for tables (taken out of the readings where it lasts):", doc["machine_model"]["not_for_tables"])
+    _tables(solution)
+    if solution.table_taken_out is not None:
+        typer.echo(table_line(solution.table_taken_out))
+    if solution.table_not_taken_out is not None:
+        typer.echo(f"look at this: {solution.table_not_taken_out}")
+    if solution.machine_model is not None:
+        _lines("model book, not for tables (taken out of the readings where it lasts):", solution.machine_model.not_for_tables)
     _lines("noise found:", noise_lines(told.joint))
     _lines("outliers:", outlier_lines(told.solved))
     _lines("residuals that are not noise:", residual_lines(told.joint))
-    _lines("these runs cannot tell:", doc["not_observable"])
-    _lines("what would show more:", doc["advice"])
-    if "solution_id" in doc:
-        again = ", the same readings and model as solution " + ", ".join(map(str, doc["same_as"])) if doc["same_as"] else ""
-        typer.echo(f"stored: solution {doc['solution_id']}{again}")
+    _lines("these runs cannot tell:", solution.not_observable)
+    _lines("what would show more:", solution.advice)
+    if solution.solution_id is not None:
+        same = ", ".join(map(str, solution.same_as or ()))
+        typer.echo(f"stored: solution {solution.solution_id}" + (f", the same readings and model as solution {same}" if same else ""))
 
 
 def _lines(heading: str, lines: list[str]) -> None:
@@ -265,14 +269,16 @@ def _figure(value: float) -> str:
     return f"{value:.2f}".replace("-0.00", "0.00") if abs(value) < 0.005 else f"{value:.2f}"
 
 
-def _tables(doc: dict[str, Any]) -> None:
-    rows = doc.get("tables") or []
-    if rows:
+def _tables(solution: SolutionFile) -> None:
+    if solution.tables:
         headings = ["left of errors of distances (± U, k = 2)", "numbers", "rms (µm)", "95 % below (µm)", "largest (µm)"]
-        keys = ("rms_um", "q95_um", "max_um")
-        print_table(headings, [[r["kind"], str(r["entries"]), *(f"{r[k]:.2f} ± {2 * r[f'u_{k}']:.2f}" for k in keys)] for r in rows])
-    if doc.get("monte_carlo"):
-        typer.echo(doc["monte_carlo"]["text"])
+        rows = []
+        for t in solution.tables:
+            figures = ((t.rms_um, t.u_rms_um), (t.q95_um, t.u_q95_um), (t.max_um, t.u_max_um))
+            rows.append([t.kind, str(t.entries), *(f"{value:.2f} ± {2 * u:.2f}" for value, u in figures)])
+        print_table(headings, rows)
+    if solution.monte_carlo is not None:
+        typer.echo(solution.monte_carlo.text)
 
 
 def _helix_unit(name: str) -> tuple[float, str]:

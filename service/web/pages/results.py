@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -13,7 +12,9 @@ from abbe.models.arrays import F1, F2
 from abbe.models.machine import Machine
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.models.volumetric import volume_grid
+from abbe.service.domain.document import Doc
 from abbe.service.domain.results import SolutionRecord
+from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction, stored_solution
 from abbe.service.errors import AbbeError
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.queries.reader import Reader
@@ -68,17 +69,16 @@ class Ranked:
         return Contribution(self.name, self.value_um, self.u_um)
 
 
-def ranking(prediction: Mapping[str, Any], motions: Mapping[str, Mapping[str, Any]], machine: Machine) -> list[Ranked]:
+def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], machine: Machine) -> list[Ranked]:
     """Every motion of a stored solution, largest contribution first.
 
     Parameters
     ----------
-    prediction, motions : mapping
-        ``prediction`` and ``motions`` of the solution's document.
+    prediction, motions : of the solution.
     machine : Machine
         Nominal geometry of the machine that was measured.
     """
-    terms, coefficients, covariance = stored_prediction(dict(prediction))
+    terms, coefficients, covariance = stored_prediction(prediction)
     points = volume_grid(machine.stroke_mm, NODES)
     design = field(machine, terms, points, None, volume_frame(machine))
     out = []
@@ -87,8 +87,9 @@ def ranking(prediction: Mapping[str, Any], motions: Mapping[str, Mapping[str, An
         part = design[:, :, at]
         mean_square = np.einsum("mik,mil->kl", part, part) / len(points)
         value, u = _size(mean_square, coefficients[at], covariance[np.ix_(at, at)])
-        told = motions.get(name, {})
-        out.append(Ranked(name, value * 1e3, u * 1e3, str(told.get("status", "")), str(told.get("reason") or "")))
+        known = motions.get(name)
+        status, reason = ("", "") if known is None else (known.status, known.reason)
+        out.append(Ranked(name, value * 1e3, u * 1e3, status, reason))
     return sorted(out, key=lambda r: -r.value_um)
 
 
@@ -165,30 +166,29 @@ def _line(record: SolutionRecord, campaign: str) -> SolutionLine:
 
 def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
     """A solution with what contributes most to the machine's error."""
-    doc, campaign = record.doc, store.campaigns.find(record.campaign_id)
-    ranked = _ranked(doc, store.machines.get(campaign.machine_id).doc)
+    solution, campaign = stored_solution(record.doc, record.id), store.campaigns.find(record.campaign_id)
+    ranked = _ranked(solution, store.machines.get(campaign.machine_id).doc)
     shown = [r.contribution for r in ranked if not r.hidden]
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
     picture = Markup(contribution_bars(shown, unit=current().drawn())) if shown else Markup("")  # noqa: S704
-    runs = doc.get("runs") or {}
     return ResultScreen(
         _line(record, campaign.name),
-        str((doc.get("verdict") or {}).get("text", "")),
+        "" if solution.verdict is None else solution.verdict.text,
         ranked,
         picture,
-        [str(v) for v in doc.get("not_observable") or []],
-        [str(v) for v in doc.get("advice") or []],
-        [(str(b["words"]), plain(b["u_um"], 2), f"{b['share']:.0%}") for b in (doc.get("uncertainty") or {}).get("budget") or []],
-        [(str(k), str(r["readings"]), plain(r["rms_um"]), plain(r["expected_um"]), str(r["outliers"])) for k, r in runs.items()],
-        [str(v) for v in doc.get("flags") or []],
+        solution.not_observable,
+        solution.advice,
+        [(b.words, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.uncertainty.budget],
+        [(k, str(r.readings), plain(r.rms_um), plain(r.expected_um), str(r.outliers)) for k, r in solution.runs.items()],
+        solution.flags,
     )
 
 
-def _ranked(doc: dict[str, Any], machine: dict[str, Any]) -> list[Ranked]:
-    if "prediction" not in doc:
+def _ranked(solution: SolutionFile, machine: Doc) -> list[Ranked]:
+    if solution.prediction is None:
         return []  # stored by a version that did not keep the covariance
     geometry: Machine = machine_from_doc(machine)
-    return ranking(doc["prediction"], doc.get("motions") or {}, geometry)
+    return ranking(solution.prediction, solution.motions, geometry)
 
 
 def discovery_screen(reader: Reader, number: int, rules: Rules) -> DiscoveryScreen:

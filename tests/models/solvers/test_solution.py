@@ -9,6 +9,7 @@ from abbe.models.paths.lines import DIAGONALS
 from abbe.models.solvers.observations import RunData
 from abbe.service.cli.results.solve import _print
 from abbe.service.devices.session import DeviceUrls
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import InstrumentsDisagree
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import account, solution_doc
@@ -65,7 +66,7 @@ def test_every_step_diagonal_figure_has_its_uncertainty_and_says_what_is_not_in_
 
 def test_words_on_the_screen_say_the_same(solved, capsys):
     told = account(solved)
-    _print(told, {"campaign": "c1"} | solution_doc(told))
+    _print(told, SolutionFile.read({"campaign": "c1"} | solution_doc(told)))
     text = " ".join(capsys.readouterr().out.split())
     for words in ("about that sphere only", "Tilt of the mirrors", "temperature", "step diagonals XYZ", "one tool length"):
         assert words in text

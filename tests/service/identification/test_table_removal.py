@@ -22,7 +22,7 @@ from abbe.service.discovery.simulate import simulate
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
-from abbe.service.identification.table_removal import NO_TABLE, STAYS, TABLE_OUT, RemovedTable, as_left, less, table_line, table_then
+from abbe.service.identification.table_removal import NO_TABLE, STAYS, RemovedTable, as_left, less, table_line, table_then
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import table_image
@@ -120,7 +120,8 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
         then = table_then(store, before)
         left = as_left(before, then.table)
         job = prepare(before, catalogue(), None, table=then)
-        assert job.flags[-1] == table_line(left.doc[TABLE_OUT])
+        assert left.removed is not None
+        assert job.flags[-1] == table_line(left.removed)
         assert [r["columns"]["deviation_mm"] for r in job.runs] == [r["columns"]["deviation_mm"] for r in left.runs]
         assert job.campaign is before
         gap = np.array(before.runs[0]["columns"]["deviation_mm"]) - left.runs[0]["columns"]["deviation_mm"]
@@ -141,9 +142,7 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
     told = SolutionFile.model_validate_json(capsys.readouterr().out).table_taken_out
     assert told is not None
     assert told.crc == crc32(image)
-    assert {axis: one.value for axis, one in told.lost_motion_mm.items()} == {
-        axis: one["value"] for axis, one in left.doc[TABLE_OUT]["lost_motion_mm"].items()
-    }
+    assert told.lost_motion_mm == left.removed.lost_motion_mm
     x = told.lost_motion_mm["X"]
     assert abs(x.value - WIDTH_MM) < 4.0 * x.u + 1e-3
     assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6"]) == 0

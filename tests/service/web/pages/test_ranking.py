@@ -10,6 +10,8 @@ import pytest
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
 from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.domain.document import Doc
+from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
 from abbe.service.web.pages.results import NODES, Ranked, ranking
@@ -18,16 +20,23 @@ from tests.pages_world import solved_campaign
 POINTS_ALONE = ("EYY", "ECZ", "EXX", "C0Y")
 
 
+def found_in(doc: Doc) -> tuple[StoredPrediction, dict[str, MotionValue]]:
+    """Prediction and motions of a solution's document."""
+    solution = SolutionFile.read(doc)
+    assert solution.prediction is not None
+    return solution.prediction, solution.motions
+
+
 @pytest.fixture(scope="module")
 def known() -> tuple[Machine, dict[str, object], list[Ranked]]:
     site, _, _, doc = solved_campaign("m")
     machine = machine_from_doc(json.loads(json.dumps(site.doc)))
-    return machine, doc, ranking(doc["prediction"], doc["motions"], machine)
+    return machine, doc, ranking(*found_in(doc), machine)
 
 
 def test_the_contribution_is_the_rms_of_the_deviation_without_rigid_motion(known) -> None:
     machine, doc, ranked = known
-    terms, coefficients, _ = stored_prediction(doc["prediction"])
+    terms, coefficients, _ = stored_prediction(StoredPrediction.read(doc["prediction"]))
     points = volume_grid(machine.stroke_mm, NODES)
     reference = volume_grid(machine.stroke_mm, NODES)  # the frame of the product is fitted to another, coarser grid
     found = {r.name: r.value_um for r in ranked}
@@ -40,7 +49,7 @@ def test_the_contribution_is_the_rms_of_the_deviation_without_rigid_motion(known
 
 def test_the_uncertainty_is_the_scatter_of_solutions_drawn_at_random(known) -> None:
     machine, doc, ranked = known
-    terms, coefficients, covariance = stored_prediction(doc["prediction"])
+    terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
     points = volume_grid(machine.stroke_mm, 4)
     full = design(machine, terms, points)
     rng = np.random.default_rng(11)
@@ -66,5 +75,5 @@ def test_all_21_motions_largest_first_and_never_known_better_than_nothing(known)
 def test_a_motion_that_is_not_there_still_has_an_uncertainty(known) -> None:
     machine, doc, _ = known
     prediction = dict(doc["prediction"], coefficients=[0.0] * len(doc["prediction"]["coefficients"]))
-    zero = ranking(prediction, doc["motions"], machine)
+    zero = ranking(*found_in(doc | {"prediction": prediction}), machine)
     assert all(r.value_um == 0.0 and r.u_um > 0.0 for r in zero)

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from abbe.models.functions.motions import motion_names
 from abbe.models.uncertainty.frame import field, volume_frame
 from abbe.models.verification import U_REPEAT_MM
+from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
@@ -46,7 +47,7 @@ def test_the_interface_answers_the_map_with_the_whole_covariance(running: Served
     with as_user(running, "vera") as client:
         told = client.get(f"/api/v1/solutions/{number}/field", params={"nodes": 3}).json()
     doc = running.store.solutions.get(number).doc
-    terms, coefficients, covariance = stored_prediction(doc["prediction"])
+    terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
     machine = machine_from_doc(running.store.machines.all()[-1].doc | doc["machine"])
     points = np.array([[x, y, z] for x in told["x_mm"] for y in told["y_mm"] for z in told["z_mm"]])
     d = field(machine, terms, points, None, volume_frame(machine))

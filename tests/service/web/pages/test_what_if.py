@@ -21,6 +21,7 @@ from abbe.models.uncertainty.what_if import Forecast, check_figures, diagonal_fi
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
 from abbe.models.volumetric import remove_rigid, volume_grid
+from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
 from tests.pages_world import solved_campaign
@@ -31,7 +32,7 @@ def known() -> KnownField:
     site, _, solved, doc = solved_campaign("m")
     del solved
     machine = machine_from_doc(json.loads(json.dumps(site.doc)))
-    return KnownField(machine, *stored_prediction(doc["prediction"]), doc["prediction"]["scatter_mm"])
+    return KnownField(machine, *stored_prediction(StoredPrediction.read(doc["prediction"])), doc["prediction"]["scatter_mm"])
 
 
 def certain(known: KnownField) -> KnownField:
