@@ -17,9 +17,8 @@ from abbe.service.discovery.discovery_words import unit
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue, checked
-from abbe.service.rendering.discovery_page import render_discovery
-from abbe.service.rendering.page_file import write_page
-from abbe.service.report.discovery_pages import discovery_page, page_facts
+from abbe.service.rendering.document_page import write_document
+from abbe.service.report.report_discovery import found_report
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +48,15 @@ class DiscoveryAnswer:
     _finding: Finding
 
     def report(self, target: str | Path) -> None:
-        """Write the page that ``abbe discover --report`` writes.
+        """Write the report that ``abbe discover --report`` writes, as ``.html``, ``.pdf``, ``.csv`` or ``.json``.
 
         Raises
         ------
         FileFormatError
-            The file cannot be written.
+            Another ending, or the file cannot be written.
         """
-        facts, texts = page_facts(self._job, self._journal, datetime.now(UTC).isoformat(timespec="seconds"))
-        write_page(render_discovery(discovery_page(self._finding, self._job.runs, facts, texts)), Path(target))
+        made = datetime.now(UTC).isoformat(timespec="seconds")
+        write_document(found_report(self._job, self._journal, self._finding, made), Path(target))
 
     def __repr__(self) -> str:
         return f"<abbe.Answer: {self.verdict}, {', '.join(self.effects) or 'no effect'}>"

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from abbe.service.demo.demo import DemoResult
-    from abbe.service.demo.demo_hidden import HiddenDemo
 
 DEFAULT_FOLDER = "abbe-demo"
 
@@ -77,30 +76,23 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     from abbe.service.cli.running import run_job
     from abbe.service.demo.demo_hidden import run_hidden_demo
     from abbe.service.demo.demo_hidden_words import hidden_json, story
-    from abbe.service.rendering.page_file import write_page
+    from abbe.service.rendering.document_page import write_document
+    from abbe.service.report.report_discovery import found_report
 
     folder = _folder(keep)
     with display() as sink, work_folder(folder, keep) as work:
         result = run_job(run_hidden_demo(["--hidden", str(seed)], speed, work, sink))
     report = folder / "discovery.html"
-    write_page(hidden_page(result), report)
+    assert result.job is not None
+    assert result.journal is not None
+    # The truth is not in the report: at a real machine there is none.
+    write_document(found_report(result.job, result.journal, result.finding, result.started_utc), report)
     if as_json:
         sys.stdout.write(json.dumps({"seed": seed, "speed": speed} | hidden_json(result), indent=2) + "\n")
     else:
         for line in story(result):
             typer.echo(line)
     Console(stderr=True).print(f"report: {report}")
-
-
-def hidden_page(result: HiddenDemo) -> str:
-    """The report of what was found, as HTML; the truth is not in it, nobody at a real machine has one."""
-    from abbe.service.rendering.discovery_page import render_discovery
-    from abbe.service.report.discovery_pages import discovery_page, page_facts
-
-    assert result.job is not None
-    assert result.journal is not None
-    facts = page_facts(result.job, result.journal, result.started_utc)
-    return render_discovery(discovery_page(result.finding, result.job.runs, *facts))
 
 
 def _folder(keep: Path | None) -> Path:

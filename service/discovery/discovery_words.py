@@ -205,7 +205,7 @@ def next_of(finding: Finding) -> list[str]:
         return [f"measure next: {what}, and once more later: what comes back belongs to the machine, what does not to that session"]
     if finding.verdict == "none":
         again = "measure next: repeat the runs that were never fitted and do not agree, some of them with the role identify"
-        return ([again] if disagreeing(finding) else []) + _unseen_lines(finding)
+        return ([again] if disagreeing(finding) else []) + unseen_lines(finding)
     return [f"no test on offer tells it from {', '.join(finding.confounded_with)}"] if finding.confounded_with else []
 
 
@@ -218,7 +218,7 @@ def _next_lines(test: NextTest) -> list[str]:
     return [f"measure next: {what}{between} (about {test.minutes:.0f} min{well})"] + ([f"  {test.why}"] if test.why else [])
 
 
-def _unseen_lines(finding: Finding) -> list[str]:
+def unseen_lines(finding: Finding) -> list[str]:
     """What these runs could not have shown, whether it is there or not, and what would; empty: nothing of the kind is known."""
     return [f"could not be seen: {u.what}, because {u.because}; what would show it: {ADDS.get(u.adds, u.adds)}" for u in finding.unseen]
 

@@ -111,3 +111,32 @@ class Correlations:
 
     names: Sequence[str]
     matrix: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Measured minus simulated along one run, before and after. All three of shape (n,); ``why`` this one is shown."""
+
+    label: str
+    x_label: str
+    x: NDArray[np.float64]
+    before_um: NDArray[np.float64]
+    after_um: NDArray[np.float64]
+    noise_um: float
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceMap:
+    """Where in one plane of the volume the gap lives.
+
+    ``x_mm``, ``y_mm``: centres of cells that were measured, shape (n,); ``times_noise``: rms of the gap there over its noise; ``spot``:
+    what was located, centre and radius.
+    """
+
+    x_axis: str
+    y_axis: str
+    x_mm: NDArray[np.float64]
+    y_mm: NDArray[np.float64]
+    times_noise: NDArray[np.float64]
+    spot: tuple[float, float, float] | None = None

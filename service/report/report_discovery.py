@@ -1,25 +1,72 @@
-"""Report of a stored discovery: what the model lacks, how large it is, what proves it, what else it could be."""
+"""A discovery as a report: what the model lacks, how large it is, what proves it, what else it could be, what to do."""
 
 from __future__ import annotations
 
-from abbe.service.campaign_data.campaign_folder import from_store
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.campaign_data.decimation import thinned
+from abbe.service.discovery.changed_words import changed_lines, changed_words
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
+from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import stored_steps
-from abbe.service.discovery.discovery_words import book_lines, rival_lines, unit
-from abbe.service.domain.finding import Finding
+from abbe.service.discovery.discovery_words import (
+    ROLES,
+    book_lines,
+    next_of,
+    parameter_text,
+    rival_lines,
+    size_text,
+    unit,
+    unseen_lines,
+    verdict_of,
+    where_lines,
+)
+from abbe.service.domain.finding import EffectFound, Finding
+from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import StoreError
-from abbe.service.rendering.discovery_model import DiscoveryPage
-from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
+from abbe.service.rendering.document import Block, Document, Facts, Figure, Lines, Picture, Section, Sign, TextTable
+from abbe.service.rendering.model import PlaceMap, Trace
 from abbe.service.rendering.numbers import NOT_AVAILABLE, plain
 from abbe.service.rendering.plots.gap import gap_bars, place_plot, trace_plot
 from abbe.service.report import report_parts as parts
-from abbe.service.report.blocks import picture_section
-from abbe.service.report.discovery_pages import discovery_page
 from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 
+AXES = "XYZ"
+CELLS = 24
+"""Cells of the map along the longer side of what was measured."""
+FEWEST = 3
+"""Readings that a cell needs."""
+REJECTED = 40
 DECIDED = "How it was decided"
 SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
+STATEMENTS = (
+    "U of a named effect is that of its refit together with everything else that these runs leave free.",
+    "Gap: measured minus simulated; deviation = actual − nominal, tool relative to workpiece (ISO 230-1). Identify: fitted. Holdout: never "
+    "fitted, only judge. Sealed: predicted, their readings are unknown here.",
+)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A finding with the runs that were searched, what is odd about them, and the states of the search with their reasons."""
+
+    finding: Finding
+    campaign: Campaign
+    runs: Sequence[dict[str, Any]]
+    flags: Sequence[str]
+    states: Sequence[tuple[str, str]]
+
+    @property
+    def measured(self) -> dict[str, dict[str, Any]]:
+        """Runs whose readings are known, by name."""
+        return {r["run_id"]: r for r in self.runs if r["columns"]["deviation_mm"] is not None}
 
 
 def discovery_report(store: Store, number: int, rules: Rules) -> Document:
@@ -38,28 +85,145 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
         raise StoreError(f"discovery {number} has not ended", "give the same abbe discover command again: it goes on there")
     name = next(c.name for c in store.campaigns.all() if c.id == record.campaign_id)
     campaign = from_store(store, name)
-    states = [(step.state, step.why) for step in steps]
-    page = discovery_page(
-        finding, thinned(campaign.runs), {}, {"title": "", "flags": list(start.flags), "states": states, "provenance": {}}
-    )
+    found = _Found(finding, campaign, thinned(campaign.runs), start.flags, [(step.state, step.why) for step in steps])
+    ended = store.discoveries.steps(number)[-1].utc
+    about = {"Begun": record.created_utc, "Ended": ended, "State": steps[-1].state, "Present model": ", ".join(start.present_model)}
+    made = parts.provenance(parts.data_digest(campaign.runs), dict(start.source.versions)) | {"Search (SHA-256)": record.digest}
+    title = f"Discovery {number}: what the simulation of {campaign.site.name} lacks"
+    return _document(found, title, about, made, rules)
+
+
+def found_report(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, made_utc: str) -> Document:
+    """A discovery just made, stored or not; a working paper without signatures."""
+    title = f"Campaign {job.campaign.name} - what the simulation of {job.campaign.site.name} lacks"
+    return _document(_of_job(job, journal, finding), title, _about(job, made_utc), _provenance(job, journal), Rules(), signed=False)
+
+
+def simulation_report(job: DiscoveryJob, finding: Finding, verdict: tuple[str, str, str], made_utc: str) -> Document:
+    """Measured against simulated, nothing looked for. ``verdict``: sign, word and sentence."""
+    title = f"Campaign {job.campaign.name} - measured against simulated"
+    found = _of_job(job, DiscoveryJournal(), finding)
+    made = _provenance(job, DiscoveryJournal())
+    return _document(found, title, _about(job, made_utc), made, Rules(), verdict=verdict, signed=False)
+
+
+def _of_job(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> _Found:
+    return _Found(finding, job.campaign, job.runs, job.flags, [(step.state, step.why) for step in journal.steps])
+
+
+def _about(job: DiscoveryJob, made_utc: str) -> dict[str, str]:
+    out = {"Runs": str(len(job.campaign.runs)), "Made": made_utc, "Present model": ", ".join(sorted(job.case.includes))}
+    return out | {"Catalogue": f"{len(job.effects)} effects"}
+
+
+def _provenance(job: DiscoveryJob, journal: DiscoveryJournal) -> dict[str, str]:
+    out = parts.provenance(parts.data_digest(job.campaign.runs), {k: str(v) for k, v in job.source.versions.items()})
+    if journal.id is not None:
+        out["Stored"] = f"discovery {journal.id}" + (f", model version {journal.version}" if journal.version else "")
+    return out | {"Search (SHA-256)": job.digest}
+
+
+def _document(
+    found: _Found,
+    title: str,
+    about: Mapping[str, str],
+    provenance: Mapping[str, str],
+    rules: Rules,
+    *,
+    verdict: tuple[str, str, str] | None = None,
+    signed: bool = True,
+) -> Document:
+    finding, campaign = found.finding, found.campaign
+    sign, word, text = verdict or _verdict(finding)
     condition, remarks = parts.conditions(campaign.runs, rules)
-    sign, word, text = page.verdict
-    return Document(
-        kind="discovery",
-        title=f"Discovery {number}: what the simulation of {campaign.site.name} lacks",
-        about=parts.machine_facts(campaign.site.doc)
-        | {"Campaign": name, "Begun": record.created_utc, "Ended": store.discoveries.steps(number)[-1].utc, "State": steps[-1].state}
-        | {"Present model": ", ".join(start.present_model)},
+    document = Document(
+        kind="discovery" if verdict is None else "simulation",
+        title=title,
+        about=parts.machine_facts(campaign.site.doc) | {"Campaign": campaign.name} | dict(about),
         verdict=(SIGNS[sign], word, text),
+        remarks=[*found.flags, *book_lines(finding), *remarks],
+        sections=_sections(found),
         figures=_figures(finding),
+        statements=STATEMENTS,
+        not_observable=_open(finding),
         instruments=parts.instruments(campaign.runs, campaign.doc, rules),
         conditions=condition,
-        not_observable=_open(finding, page),
-        remarks=[*start.flags, *book_lines(finding), *remarks],
-        statements=["U of a named effect is that of its refit together with everything else that these runs leave free."],
-        provenance=parts.provenance(parts.data_digest(campaign.runs), dict(start.source.versions)) | {"Search (SHA-256)": record.digest},
-        appendix=[*picture_section(_pictures(page)), *_tables(page)],
+        appendix=_appendix(found),
+        provenance=provenance,
     )
+    return document if signed else replace(document, signatures=())
+
+
+def _verdict(finding: Finding) -> tuple[str, str, str]:
+    """The finding's, with what has changed where an earlier solution could be compared."""
+    sign, word, text = verdict_of(finding)
+    changes = changed_words(finding.changed)
+    return sign, word, f"{text} {changes[:1].upper()}{changes[1:]}." if changes else text
+
+
+def _sections(found: _Found) -> list[Section]:
+    finding = found.finding
+    out = [Section(f"{e.words}: {size_text(e)}", [Facts(_card(e))]) for e in finding.effects]
+    if changed := changed_lines(finding.changed):
+        out.append(Section("What has changed", [Lines([line.strip() for line in changed])]))
+    if located := where_lines(finding.where):
+        out.append(Section("Where the gap lives", [Lines(located)]))
+    out.append(Section("The gap before and after", [gap_table(finding), *_pictures(found)]))
+    following = next_of(finding)
+    if following or finding.effects:
+        words = Lines([line.strip() for line in following]) if following else "Nothing is needed to tell suspects apart."
+        out.append(Section("What to measure next", [words]))
+    return out
+
+
+def _card(effect: EffectFound) -> dict[str, str]:
+    """What to do about a named effect, how it looks, what else it could be."""
+    there = "; ".join(where_lines(effect.where))
+    out = {"What to do": effect.remedy_text, "Who takes it out": REMEDIES[effect.remedy]}
+    out |= ({"Where": there} if there else {}) | {"How it looks": effect.signature, "What else it could be": "; ".join(rival_lines(effect))}
+    out |= {name.replace("_", " ").capitalize(): parameter_text(p) for name, p in effect.parameters.items()}
+    out["Evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much more likely the readings are with it, after its price)"
+    if effect.forms:
+        out["Form"] = "not quite the textbook's: " + ", ".join(effect.forms)
+    return out | {"Source": effect.source}
+
+
+def gap_table(finding: Finding) -> TextTable:
+    """The gap by role; sealed runs are only counted: their readings are unknown here."""
+    only_scatter = bool(finding.effects) and not entering(finding)  # closes no gap, and need not
+    by = "" if finding.effects or not _what(finding) else f" by {_what(finding)}"
+    head = ("Runs", "Before (µm)", "After (µm)", "Noise floor (µm)", f"Gap closed{by}", "What they are for")
+    rows: list[tuple[str, ...]] = []
+    for role, g in finding.gaps.items():
+        closed = NOT_AVAILABLE if only_scatter or g.closed is None else f"{100.0 * g.closed:.0f} %"
+        rows.append((role, plain(g.before_um), plain(g.after_um), plain(g.floor_um), closed, ROLES.get(role, "")))
+    sealed = sum(r.role == "sealed" for r in finding.runs.values())
+    if sealed:
+        rows.append(("sealed", *[NOT_AVAILABLE] * 4, f"{sealed} runs predicted, their readings are unknown here"))
+    return TextTable(head, rows)
+
+
+def _what(finding: Finding) -> str:
+    """What the gap after is with; empty where before and after are one."""
+    return {"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict]
+
+
+def _pictures(found: _Found) -> list[Block]:
+    finding = found.finding
+    out: list[Block] = []
+    if finding.runs:
+        words = "Measured minus simulated, run by run. Where the lower bar ends at the dashed tick, nothing but noise is left."
+        out.append(Picture(words, [gap_bars(finding.runs)], "wide"))
+    traces = [trace_plot(t, key=f"trace-{i}") for i, t in enumerate(_traces(found))]
+    if traces:
+        what = _what(finding)
+        words = f"The run that shows most, simulated without and with {what}" if what else "The run with the largest gap; nothing was added"
+        out.append(Picture(f"{words}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
+    places = [place_plot(p, key=f"place-{i}") for i, (a, b) in enumerate(((0, 1), (0, 2))) if (p := _place(found, a, b)) is not None]
+    if places:
+        words = "Gap before, cell by cell of what was measured, over the noise of one reading. A ring marks what was located."
+        out.append(Picture(words, places))
+    return out
 
 
 def _figures(finding: Finding) -> list[Figure]:
@@ -71,40 +235,93 @@ def _figures(finding: Finding) -> list[Figure]:
     for role, gap in finding.gaps.items():
         group = f"Gap of the {role} runs"
         out.append(Figure(group, "before", "measured minus simulated, rms", gap.before_um, None, "µm"))
-        out.append(Figure(group, "after", "the same with what was found", gap.after_um, None, "µm"))
+        if what := _what(finding):
+            out.append(Figure(group, "after", f"the same with {what}", gap.after_um, None, "µm"))
         out.append(Figure(group, "floor", "noise", gap.floor_um, None, "µm"))
     return out
 
 
-def _open(finding: Finding, page: DiscoveryPage) -> list[str]:
+def _open(finding: Finding) -> list[str]:
     out = ["these runs cannot tell it from: " + ", ".join(finding.confounded_with)] if finding.confounded_with else []
     out += [f"{e.words} could also be: {line}" for e in finding.effects for line in rival_lines(e)]
-    return out + list(page.next_test)
+    return out + unseen_lines(finding)
 
 
-def _tables(page: DiscoveryPage) -> list[Section]:
-    runs = [(r.label, r.test, r.role, str(r.readings), plain(r.before_um), plain(r.after_um), plain(r.floor_um)) for r in page.runs]
+def _appendix(found: _Found) -> list[Section]:
+    finding = found.finding
+    runs = [
+        (label, r.test, r.role, str(r.readings), plain(r.rms_before_um), plain(r.rms_after_um), plain(r.floor_um))
+        for label, r in finding.runs.items()
+    ]
     out = [Section("Runs", [TextTable(("Run", "Test", "Role", "Readings", "Before, µm", "After, µm", "Noise, µm"), runs)])]
-    out.append(Section(DECIDED, [TextTable(("State", "Why"), page.states)]))
-    if page.changed:
-        out.append(
-            Section(
-                "What has changed", [TextTable(("Compared with the solution from before",), [(line.strip(),) for line in page.changed])]
-            )
-        )
-    if page.effects:
-        cards = [(c.name, c.where or NOT_AVAILABLE, c.do) for c in page.effects]
-        out.append(Section("What to do", [TextTable(("Effect", "Where", "What to do at the machine"), cards)]))
-    if page.rejected:
-        out.append(Section("Looked at and rejected", [TextTable(("Effect", "Why"), page.rejected)]))
+    if finding.where.table:
+        tests = [(t.kind, t.value, plain(t.statistic), f"{t.p:.2g}") for t in finding.where.table]
+        table = TextTable(("Against", "Which", "Statistic", "p (all tests together)"), tests)
+        out.append(Section(f"Tests of where the gap lives: {len(tests)}", [table], folded=True))
+    if rejected := finding.rejected[:REJECTED]:
+        out.append(Section(f"What was tried and why not: {len(rejected)}", [TextTable(("Effect", "Why"), rejected)], folded=True))
+    return [*out, Section(DECIDED, [TextTable(("State", "Why"), found.states)])]
+
+
+def telling_run(finding: Finding) -> str | None:
+    """The run in which most of the gap closes, against its noise; where nothing was found, the one with the largest gap."""
+    shows = {}
+    for label, run in finding.runs.items():
+        if run.rms_before_um is not None and run.rms_after_um is not None:
+            after_um = run.rms_after_um if finding.effects else 0.0
+            shows[label] = (run.rms_before_um**2 - after_um**2) / run.floor_um**2
+    return max(shows, key=lambda label: shows[label], default=None)
+
+
+def _traces(found: _Found) -> list[Trace]:
+    """The run that shows most: along time and, where an axis is named, against its position."""
+    finding, label = found.finding, telling_run(found.finding)
+    if label is None:
+        return []
+    columns, series = found.measured[label]["columns"], finding.series[label]
+    if series.before is None or series.after is None:
+        return []
+    before, after = series.before.values_mm * 1e3, series.after.values_mm * 1e3
+    noise, why = finding.runs[label].floor_um, "the gap shows most here"
+    t = np.asarray(columns["t_s"], dtype=np.float64)
+    out = [Trace(label, "time of the session in s", t, before, after, noise, why)]
+    key = finding.effects[0].key if finding.effects else "".join(finding.where.axes[:1])
+    if key[-1:] in AXES and key:
+        x = np.asarray(columns[f"{key[-1].lower()}_mm"], dtype=np.float64)
+        if float(np.ptp(x)) > 0.0:
+            out.append(Trace(label, f"position of {key[-1]} in mm", x, before, after, noise, why))
     return out
 
 
-def _pictures(page: DiscoveryPage) -> list[Picture]:
-    out = [Picture("Gap of every run before and after, against its noise.", [gap_bars(page.runs)], "wide")] if page.runs else []
-    for i, t in enumerate(page.traces):
-        out.append(Picture(f"Run {t.label} against {t.x_label}: {t.why}.", [trace_plot(t, key=f"trace-{i}")], "wide"))
-    for i, p in enumerate(page.places):
-        words = f"Where the gap lives, {p.x_axis}{p.y_axis}: rms over the noise."
-        out.append(Picture(words, [place_plot(p, key=f"place-{i}")]))
-    return out
+def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
+    """Cells of one plane with the rms of the gap before over its noise."""
+    points, ratio = _points(found)
+    if not len(points):
+        return None
+    x, y = points[:, a], points[:, b]
+    side = max(float(np.ptp(x)), float(np.ptp(y))) / CELLS
+    if side <= 0.0:
+        return None
+    cells, which = np.unique(np.floor(np.column_stack([x, y]) / side), axis=0, return_inverse=True)
+    count = np.bincount(which.ravel())
+    keep = count >= FEWEST
+    times = np.sqrt(np.bincount(which.ravel(), weights=ratio**2) / count)[keep]
+    centre = (cells[keep] + 0.5) * side
+    spot, where = None, found.finding.where
+    if where.position_mm is not None:
+        spot = (where.position_mm[a], where.position_mm[b], where.radius_mm or 0.0)
+    return PlaceMap(AXES[a], AXES[b], centre[:, 0], centre[:, 1], times, spot)
+
+
+def _points(found: _Found) -> tuple[F1, F1]:
+    """Where every judged reading was taken, shape (n, 3), and its gap over the noise, shape (n,)."""
+    places, ratios = [np.zeros((0, 3))], [np.zeros(0)]
+    for label, run in found.measured.items():
+        columns, before = run["columns"], found.finding.series[label].before
+        if before is None:
+            continue
+        gap = before.values_mm * 1e3 / found.finding.runs[label].floor_um
+        keep = np.isfinite(gap)
+        places.append(np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])[keep])
+        ratios.append(gap[keep])
+    return np.concatenate(places), np.concatenate(ratios)

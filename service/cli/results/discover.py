@@ -30,7 +30,10 @@ def discover(  # noqa: PLR0913 - one argument for each option
         Path | None,
         typer.Option("--json", metavar="FILE", help="Also write the answer (abbe-discovery/1); - is stdout.", show_default=False),
     ] = None,
-    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
+    ] = None,
     db: DbOption = None,
     machine: MachineOption = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
@@ -42,6 +45,10 @@ def discover(  # noqa: PLR0913 - one argument for each option
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
     only if --db or --machine names a database. Stopped with Ctrl-C, the same command goes on where it was.
     """
+    from abbe.service.rendering.document_page import form_of
+
+    if report is not None:
+        form_of(report)  # before the work
     if live:
         _live_needs(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
@@ -190,16 +197,16 @@ def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, jso
     """Files that were asked for, each whole or not at all."""
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discovery_answer import answer_doc
-    from abbe.service.rendering.discovery_page import render_discovery
+    from abbe.service.rendering.document_page import write_document
     from abbe.service.rendering.page_file import write_page
-    from abbe.service.report.discovery_pages import discovery_page, page_facts
+    from abbe.service.report.report_discovery import found_report
 
     if json_file is not None:
         text = json.dumps(answer_doc(finding), ensure_ascii=False) + "\n"
         typer.echo(text, nl=False) if str(json_file) == "-" else write_page(text, json_file)
     if report is not None:
         made = SystemClock().utc().isoformat(timespec="seconds")
-        write_page(render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, made))), report)
+        write_document(found_report(job, journal, finding, made), report)
 
 
 def _print(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> None:

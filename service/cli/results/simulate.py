@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 def simulate(
     campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
     as_json: JsonOption = False,
-    report: Annotated[Path | None, typer.Option("--report", metavar="FILE.html", help="Also write a report.", show_default=False)] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
+    ] = None,
     db: DbOption = None,
     machine: MachineOption = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
@@ -35,7 +38,10 @@ def simulate(
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
     from abbe.service.identification.table_removal import NO_TABLE, table_then
+    from abbe.service.rendering.document_page import form_of
 
+    if report is not None:
+        form_of(report)  # before the work
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
         sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
         base, table = (None, NO_TABLE) if store is None else (current(store, found.site.name), table_then(store, found))
@@ -55,16 +61,13 @@ def simulate(
 
 def _write_report(job: DiscoveryJob, simulation: Simulation, target: Path) -> None:
     from abbe.service.clock import SystemClock
-    from abbe.service.discovery.discover import DiscoveryJournal
     from abbe.service.discovery.simulate import simulated_finding, verdict_line
-    from abbe.service.rendering.discovery_page import render_discovery
-    from abbe.service.rendering.page_file import write_page
-    from abbe.service.report.discovery_pages import discovery_page, page_facts
+    from abbe.service.rendering.document_page import write_document
+    from abbe.service.report.report_discovery import simulation_report
 
-    facts, said = page_facts(job, DiscoveryJournal(), SystemClock().utc().isoformat(timespec="seconds"))
     finding = simulated_finding(job, simulation)
-    said |= {"title": f"Campaign {job.campaign.name} - measured against simulated", "verdict": verdict_line(finding)}
-    write_page(render_discovery(discovery_page(finding, job.runs, facts, said)), target)
+    made = SystemClock().utc().isoformat(timespec="seconds")
+    write_document(simulation_report(job, finding, verdict_line(finding), made), target)
 
 
 def _print(job: DiscoveryJob, simulation: Simulation) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
+from abbe.service.domain.finding import RunFit
 from abbe.service.rendering.axes import Panel, data_range
-from abbe.service.rendering.discovery_model import Array, PlaceMap, RunGap, Trace
+from abbe.service.rendering.model import PlaceMap, Trace
 from abbe.service.rendering.numbers import COVERAGE, plain
 from abbe.service.rendering.svg import Svg
 
@@ -21,22 +23,26 @@ STEPS = (1.5, 2.5, 4.0, 7.0)
 """Limits between the five colours of a place: rms of the gap over the noise."""
 
 
-def gap_bars(runs: Sequence[RunGap], *, key: str = "gap") -> str:
+def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
     """One row a run: gap before (hollow) and after (filled), and the noise floor as a tick. Runs whose readings are sealed are left out."""
-    rows = [r for r in runs if r.before_um is not None and r.after_um is not None]
-    words = "; ".join(f"{r.label} {plain(r.before_um)} to {plain(r.after_um)} µm, noise {plain(r.floor_um)} µm" for r in rows)
+    rows = [
+        (label, r, r.rms_before_um, r.rms_after_um)
+        for label, r in runs.items()
+        if r.rms_before_um is not None and r.rms_after_um is not None
+    ]
+    words = "; ".join(f"{label} {plain(before)} to {plain(after)} µm, noise {plain(r.floor_um)} µm" for label, r, before, after in rows)
     svg = Svg(WIDE, TOP + ROW * max(len(rows), 1) + BOTTOM, key, "Gap of every run before and after", words or "no run was judged")
     svg.text((10.0, 18.0), "rms of measured minus simulated, every run", "t-head")
     svg.legend((LABELS, 38.0), [("s-c1", "before"), ("s-c2", "after"), ("band-edge", "noise floor")])
-    values = [v for r in rows for v in (r.before_um, r.after_um, r.floor_um)]
+    values = [v for _, r, before, after in rows for v in (before, after, r.floor_um)]
     panel = Panel(LABELS, TOP, WIDE - LABELS - 16.0, ROW * max(len(rows), 1), (0.0, data_range(values, zero=True)[1]), (0.0, 1.0))
     panel.draw_x(svg, "rms in µm")
-    for i, row in enumerate(rows):
+    for i, (label, row, before, after) in enumerate(rows):
         y = TOP + ROW * i
-        svg.text((LABELS - 8.0, y + 14.0), f"{row.label} {row.role}"[:30], "" if row.role == "identify" else "t-soft", anchor="end")
-        tip = f"{row.label}, {row.test}, {row.role}: {plain(row.before_um)} → {plain(row.after_um)} µm, noise {plain(row.floor_um)} µm"
-        svg.rect((LABELS, y + 2.0), (panel.x(row.before_um or 0.0) - LABELS, 7.0), "f-c1", tip)
-        svg.rect((LABELS, y + 10.0), (panel.x(row.after_um or 0.0) - LABELS, 7.0), "f-c2", tip)
+        svg.text((LABELS - 8.0, y + 14.0), f"{label} {row.role}"[:30], "" if row.role == "identify" else "t-soft", anchor="end")
+        tip = f"{label}, {row.test}, {row.role}: {plain(before)} → {plain(after)} µm, noise {plain(row.floor_um)} µm"
+        svg.rect((LABELS, y + 2.0), (panel.x(before) - LABELS, 7.0), "f-c1", tip)
+        svg.rect((LABELS, y + 10.0), (panel.x(after) - LABELS, 7.0), "f-c2", tip)
         at = panel.x(row.floor_um)
         svg.line((at, y), (at, y + ROW - 1.0), "band-edge")
     panel.draw_frame(svg)
@@ -94,7 +100,7 @@ def place_plot(place: PlaceMap, *, key: str) -> str:
     return svg.render()
 
 
-def _thinned(y: Array) -> Sequence[int]:
+def _thinned(y: NDArray[np.float64]) -> Sequence[int]:
     """Every so-many-th point, and of each bin the largest, so that no spike is lost."""
     if y.size <= MAX_POINTS:
         return range(y.size)
@@ -103,6 +109,6 @@ def _thinned(y: Array) -> Sequence[int]:
     return sorted(keep)
 
 
-def _rms(y: Array) -> float:
+def _rms(y: NDArray[np.float64]) -> float:
     good = y[np.isfinite(y)]
     return float(np.sqrt(np.mean(good**2))) if good.size else math.nan

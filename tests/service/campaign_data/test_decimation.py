@@ -16,8 +16,8 @@ from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.rendering.discovery_page import render_discovery
-from abbe.service.report.discovery_pages import discovery_page, page_facts
+from abbe.service.rendering.document_page import document_html
+from abbe.service.report.report_discovery import found_report
 from tests.service.discovery.discovery_bench import Search, circle, write_case
 
 
@@ -137,7 +137,7 @@ def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, m
     assert DiscoveryFile.model_validate_json(json.dumps(answer)).thinning is not None
     assert (answer["thinning"]["readings"], answer["thinning"]["readings_per_value"]) == (360, 2)
     assert len(answer["thinning"]["not_seen"]) == 3
-    page = render_discovery(discovery_page(finding, job.runs, *page_facts(job, journal, "now")))
+    page = document_html(found_report(job, journal, finding, "now"))
     assert "every 2 of them became one mean" in page
     assert "could not be seen, which does not say that it is absent" in page
 

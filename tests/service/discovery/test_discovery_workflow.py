@@ -31,7 +31,8 @@ from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
 from abbe.service.errors import CampaignRefused, NotObservable, StoreError, Unusable
-from abbe.service.report.discovery_pages import discovery_page, gap_rows
+from abbe.service.rendering.document_data import shown
+from abbe.service.report.report_discovery import found_report, gap_table
 from abbe.service.storage.store import Store
 from tests.service.discovery.discovery_bench import Search, write_case
 
@@ -131,8 +132,10 @@ def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: 
     assert "Something is missing that the catalogue does not explain" in verdict_of(bad)[1]
     assert "Suspected: backlash" in verdict_of(bad)[2]
     assert not any("enter the width" in line for line in lines_of(bad))  # no remedy for what is not confirmed
-    page = discovery_page(bad, job.runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
-    assert (page.effects, page.rejected[0][0]) == ([], "backlash:X")
+    page = shown(found_report(job, DiscoveryJournal(), bad, "now"))
+    assert not any("What to do" in str(section) for section in page["sections"])
+    rejected = next(t for t in page["tables"] if t["title"].startswith("What was tried and why not"))
+    assert rejected["rows"][0][0] == "backlash:X"
 
 
 def test_the_answer_says_what_is_proved_and_by_which_rule(folder: Path) -> None:
@@ -177,9 +180,9 @@ def test_scatter_is_told_without_a_gap_that_it_cannot_close(folder: Path) -> Non
     assert "closed" not in verdict_of(alone)[2]
     assert "no model takes scatter out" in told
     assert "what else it could be: no rival was tried" in told
-    assert {row.closed for row in gap_rows(alone)} == {None}
+    assert {row[4] for row in gap_table(alone).rows} == {"n/a"}
     assert "fits these runs as well" in rival_lines(replace(finding.effects[0], alternatives=()))[0]
-    assert gap_rows(finding)[0].closed is not None
+    assert gap_table(finding).rows[0][4].endswith(" %")
 
 
 def gapped(search: Search, **gaps: Gap) -> Any:
@@ -253,8 +256,8 @@ def test_kin_that_explains_nearly_all_but_costs_more_is_listed_with_its_odds(fol
     (line,) = rival_lines(finding.effects[0])
     assert line.endswith("(10^11 times less likely, but slightly bent it would look the same)")
     assert any(line in told for told in lines_of(finding))
-    page = discovery_page(finding, from_folder(folder).runs, {}, {"title": "", "flags": [], "states": [], "provenance": {}})
-    assert page.effects[0].rivals == [line]
+    card = shown(found_report(job_of(folder), DiscoveryJournal(), finding, "now"))["sections"][0]["blocks"][0]
+    assert {"name": "What else it could be", "value": line} in card["items"]
     near = discover(job_of(folder), DiscoveryJournal(), Search(ahead=4.2), ignore_progress)
     assert rival_lines(near.effects[0])[0].endswith("(67 times less likely)")
 
