@@ -25,7 +25,7 @@ from abbe.service.storage.store import Store
 
 
 def create(path: Path, content: bytes) -> None:
-    """Write a new file aside and link it: whoever is second finds the first one's, whole."""
+    """Write a new file aside and link it: a second process finds the file of the first, complete."""
     aside = Path(f"{path}.{secrets.token_hex(4)}")
     file = private_file(aside)
     try:
@@ -297,7 +297,7 @@ def place(store: Store | None, url: str) -> str | None:
 
 
 def _anchor(line: str) -> Anchor | None:
-    """A kept head; None for a line that a power cut has torn. Whoever tears lines on purpose could as well remove them."""
+    """A kept head; None for a line that a power cut has torn. An attacker who tears lines could as well remove them."""
     parts = line.split(" ")
     if len(parts) == 3 and parts[0].isdigit() and [len(part) for part in parts[1:]] == [64, 64] and len(parts[0]) < 18:
         return Anchor(int(parts[0]), parts[1], parts[2])

@@ -26,7 +26,7 @@ def key_name(key: bytes) -> str:
 
 
 def mac_of(key: bytes, digest: str) -> str:
-    """Seal of a record: without the key nobody makes a chain anew."""
+    """Seal of a record: without the key no chain can be forged."""
     return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""`abbe backup`: database, samples that it does not have yet and audit, as of one moment, while the service goes on."""
+"""`abbe backup`: database, samples that it does not have yet and audit, as of one moment, while the service runs."""
 
 from __future__ import annotations
 
@@ -87,7 +87,8 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     utcnow : callable
         Clock.
     with_key : bool
-        Whether the audit's key goes along. Without it, whoever has the backup cannot make an audit up, and `restore` asks for it.
+        Whether the backup includes the audit's key. Without it the holder of the backup cannot forge an audit, and `restore`
+        asks for the key.
 
     Returns
     -------
@@ -114,9 +115,9 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     finally:
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(source.url) as store:
-        told = {"made_utc": doc["made_utc"], "key": "with" if with_key else "without"}
+        options = {"made_utc": doc["made_utc"], "key": "with" if with_key else "without"}
         AuditBook(store, source.url).write(
-            AuditEvent(who=this_account(), action="abbe backup", target=str(target), outcome="done", doc=told)
+            AuditEvent(who=this_account(), action="abbe backup", target=str(target), outcome="done", doc=options)
         )
     return doc
 

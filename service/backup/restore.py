@@ -74,7 +74,7 @@ def restore(
     Raises
     ------
     BackupRefused
-        The backup is damaged or of a newer version, its audit was changed, there is a database already, or somebody uses it.
+        The backup is damaged or of a newer version, its audit was changed, there is a database already, or it is in use.
     StoreError
         The copied database is damaged.
     """
@@ -95,9 +95,9 @@ def restore(
     finally:
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(into.url) as store:
-        told = {"from": str(folder), "made_utc": str(backup.doc["made_utc"]), "aside": ", ".join(map(str, aside))}
+        options = {"from": str(folder), "made_utc": str(backup.doc["made_utc"]), "aside": ", ".join(map(str, aside))}
         AuditBook(store, into.url).write(
-            AuditEvent(who=this_account(), action="abbe restore", target=str(database), outcome="done", doc=told)
+            AuditEvent(who=this_account(), action="abbe restore", target=str(database), outcome="done", doc=options)
         )
     return Restored(backup, database, records, len(backup.segments), aside)
 
@@ -117,18 +117,18 @@ def _free(into: BackupSource, database: Path, *, replace: bool) -> _Places:
     return places
 
 
-def _proved(part: Path, told: Path) -> int:
+def _proved(part: Path, backup: Path) -> int:
     """Prove a copied backup; return the number of the audit's records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
-        raise BackupRefused(f"{told} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")
+        raise BackupRefused(f"{backup} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")
     key = part / KEY
     records, found = audit_faults(part / DATABASE, part / HEADS, key if key.exists() else None)
     if records and not key.exists():
-        raise BackupRefused(f"{told} has no key of the audit, so its {records} records prove nothing", "give --audit-key FILE")
+        raise BackupRefused(f"{backup} has no key of the audit, so its {records} records prove nothing", "give --audit-key FILE")
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise BackupRefused(f"the audit in {told} is broken: {found[0]}{more}", "take another backup, or the key that belongs to it")
+        raise BackupRefused(f"the audit in {backup} is broken: {found[0]}{more}", "take another backup, or the key that belongs to it")
     return records
 
 
@@ -165,6 +165,6 @@ def _placed(part: Path, places: _Places) -> None:
 
 
 def _given_to(path: Path, owner: os.stat_result) -> None:
-    """Restored by root, a database belongs to whoever has its folder: the service could not write it otherwise."""
+    """A database that root restores gets the owner of its folder: else the service could not write it."""
     if os.geteuid() == 0:
         os.chown(path, owner.st_uid, owner.st_gid)

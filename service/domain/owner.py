@@ -1,6 +1,6 @@
-"""Who writes a run: a process, named so that nobody else is taken for it, also after a restart of process or computer.
+"""The process that writes a run, named so that no other is mistaken for it, not even after a restart of process or computer.
 
-A pid alone is reused by the operating system, hence the start time, and start times count from boot, hence the boot id.
+The operating system reuses pids, hence the start time; start times count from boot, hence the boot id.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 UNKNOWN = "?"
-"""Since when a process runs that lives, where nobody can tell. Where a process says it of itself, pids must do."""
+"""Start time of a living process where the system does not show it. A process that has this start time is known by its pid alone."""
 _START_TIME_FIELD = 22 - 3
 """Field 22 of /proc/PID/stat, counted after the command name (field 2), which may itself hold blanks."""
 
@@ -28,7 +28,7 @@ class Owner:
     pid : int
         Process id.
     start : str
-        Boot id and start time of the process; empty where the system does not tell.
+        Boot id and start time of the process; empty where the system does not show them.
     """
 
     host: str
@@ -36,13 +36,7 @@ class Owner:
     start: str
 
     def is_gone(self) -> bool:
-        """Tell whether this process certainly does not run any more.
-
-        Returns
-        -------
-        bool
-            False also when it cannot be known, i.e. for processes of another computer.
-        """
+        """Whether this process certainly no longer runs; False also when that cannot be known: on another computer."""
         if self.host != platform.node():
             return False
         now = process_start(self.pid)
@@ -50,17 +44,9 @@ class Owner:
 
 
 def process_start(pid: int) -> str:
-    """Read boot id and start time of a process.
+    """Boot id and start time of a process, ``"boot_id/ticks"``.
 
-    Parameters
-    ----------
-    pid : int
-        Process id.
-
-    Returns
-    -------
-    str
-        ``"boot_id/ticks"``; empty if there is no such process; `UNKNOWN` if it lives and /proc does not tell since when.
+    Empty if there is no such process; `UNKNOWN` if it lives and /proc does not show since when.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -73,13 +59,7 @@ def process_start(pid: int) -> str:
 
 
 def this_process() -> Owner:
-    """Name the running process.
-
-    Returns
-    -------
-    Owner
-        Host, pid and start.
-    """
+    """The running process."""
     pid = os.getpid()
     return Owner(platform.node(), pid, process_start(pid))
 

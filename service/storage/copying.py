@@ -1,4 +1,4 @@
-"""A copy of a SQLite database while others write it, proved whole before anybody relies on it; and who has a database open."""
+"""Copies of a SQLite database while others write it, checked to be whole; and which processes have a database open."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PAGES = 1024
 RESTARTS = 5
 """A database that is written all the time makes SQLite begin again and again; then it is copied in one step, and writers wait."""
 LOCKED_S = 60.0
-"""So long is waited for whoever holds the database."""
+"""How long a copy waits for a process that holds the database, s."""
 FAULTS_SHOWN = 3
 
 
@@ -39,7 +39,7 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
     target : Path
         A file that does not exist. On return it is on the disk; after an error it may be there in part.
     locked_s : float
-        Patience with somebody who holds the database.
+        How long to wait for a process that holds the database, s.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
 
 
 def _watch(locked_s: float, restarts: int | None) -> Callable[[int, int, int], None]:
-    """What SQLite calls after each step: ends a copy that makes no progress."""
+    """SQLite calls this after each step: it ends a copy that makes no progress."""
     seen = {"left": -1, "restarts": 0}
     moved_s = [time.monotonic()]
 
@@ -113,7 +113,7 @@ def prove_copy(path: Path) -> str:
 
 
 def rows_of(path: Path, query: str) -> list[tuple[Any, ...]]:
-    """Rows of a copied database that nobody writes.
+    """Rows of a copied database that no process writes.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def users_of(path: Path) -> list[int]:
     for link in Path("/proc").glob("[0-9]*/fd/*"):
         try:
             one = link.stat()
-        except OSError:  # gone meanwhile, or not ours to see
+        except OSError:  # it ended meanwhile, or belongs to another account
             continue
         if (one.st_dev, one.st_ino) == (wanted.st_dev, wanted.st_ino):
             found.add(int(link.parts[2]))
@@ -145,7 +145,7 @@ def users_of(path: Path) -> list[int]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether somebody is in the middle of reading or writing a SQLite database."""
+    """Whether a process is in the middle of reading or writing a SQLite database."""
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, timeout=0.0)) as probe:
             probe.isolation_level = None

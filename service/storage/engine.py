@@ -1,4 +1,4 @@
-"""How the database is opened: URL, SQLite's safety settings, and database errors in the words of this product."""
+"""How the database is opened: URL, SQLite's safety settings, and database errors as errors of this product."""
 
 from __future__ import annotations
 
@@ -26,36 +26,18 @@ _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
 def wal_is_safe(version: str = sqlite3.sqlite_version) -> bool:
-    """Tell whether this SQLite has the fix of the WAL-reset bug, which loses committed data (sqlite.org/wal.html).
+    """Whether a SQLite of this version has the fix of the WAL-reset bug, which loses committed data (sqlite.org/wal.html).
 
-    Parameters
-    ----------
-    version : str
-        SQLite version, e.g. ``"3.51.3"``.
-
-    Returns
-    -------
-    bool
-        True for 3.51.3 and later, and for the repaired 3.44.6+ and 3.50.7+.
+    It is in 3.51.3 and later, and in the repaired 3.44.6+ and 3.50.7+.
     """
     number = tuple(int(part) for part in version.split("."))
     return number >= (3, 51, 3) or (number[:2] == (3, 44) and number >= (3, 44, 6)) or (number[:2] == (3, 50) and number >= (3, 50, 7))
 
 
 def resolve_url(url: str, base: Path | None = None) -> str:
-    """Make a relative SQLite path relative to a folder (the machine file's) instead of to wherever the command was started.
+    """Make a relative SQLite path relative to ``base``, the folder of the machine file, instead of to the working directory.
 
-    Parameters
-    ----------
-    url : str
-        Database URL.
-    base : Path, optional
-        Folder; default: leave the URL as it is.
-
-    Returns
-    -------
-    str
-        The URL, absolute for SQLite files if ``base`` is given.
+    Without ``base`` the URL stays as it is.
     """
     parsed = parse_url(url)
     if base is None or not _is_sqlite_file(parsed) or Path(str(parsed.database)).is_absolute():
@@ -64,22 +46,12 @@ def resolve_url(url: str, base: Path | None = None) -> str:
 
 
 def parse_url(url: str) -> URL:
-    """Understand a database URL, or say what one looks like.
-
-    Parameters
-    ----------
-    url : str
-        As the user wrote it.
-
-    Returns
-    -------
-    URL
-        SQLAlchemy's URL; PostgreSQL always with the psycopg driver.
+    """Parse a database URL; PostgreSQL always gets the psycopg driver.
 
     Raises
     ------
     StoreError
-        If it is not a URL of SQLite or PostgreSQL.
+        It is not a URL of SQLite or PostgreSQL; the remedy shows what one looks like.
     """
     try:
         parsed = make_url(url)
@@ -98,20 +70,12 @@ _URL_HELP = "write e.g. sqlite:///abbe.sqlite3 or postgresql://user@host/name"
 def make_engine(url: str) -> Engine:
     """Create the engine with this product's settings. Nothing is opened yet.
 
-    Parameters
-    ----------
-    url : str
-        Database URL.
-
-    Returns
-    -------
-    Engine
-        Transactions of it start with BEGIN IMMEDIATE on SQLite unless the connection has the option ``READ_ONLY_OPTION``.
+    Its transactions start with BEGIN IMMEDIATE on SQLite unless the connection has the option ``READ_ONLY_OPTION``.
 
     Raises
     ------
     StoreError
-        If the URL is wrong, the file is not a database, its folder is missing, or the driver is not installed.
+        The URL is wrong, the file is not a database, its folder is missing, or the driver is not installed.
     """
     parsed = parse_url(url)
     options: dict[str, Any] = {"json_serializer": _to_json}
@@ -134,18 +98,7 @@ def make_engine(url: str) -> Engine:
 
 @contextmanager
 def translated(url: str) -> Iterator[None]:
-    """Turn database errors into one StoreError that names the database and hides its password.
-
-    Parameters
-    ----------
-    url : str
-        Database URL.
-
-    Raises
-    ------
-    StoreError
-        In place of any SQLAlchemy error.
-    """
+    """Turn any SQLAlchemy error into one StoreError that names the database and hides its password."""
     where = mask_secrets(url)
     try:
         yield

@@ -25,32 +25,21 @@ _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after
 
 @cache
 def known_revisions() -> tuple[str, ...]:
-    """Every schema revision that this program can bring up to date, oldest first. Each has a file, ``rNNNN_what.py``; they are one line.
+    """Every schema revision that this program can upgrade, oldest first. Each has a file, ``rNNNN_what.py``; they form one line.
 
-    Alembic would say the same and is not asked: it takes a quarter of a second to import, and nearly every database is up to date.
+    Alembic knows them too, but takes a quarter of a second to import, and nearly every database is up to date.
     """
     names = sorted(entry.name for entry in files(_VERSIONS).iterdir() if entry.name.startswith("r") and entry.name.endswith(".py"))
     return tuple(name[1:5] for name in names)
 
 
 def head_revision() -> str:
-    """Name the schema revision of this program."""
+    """The schema revision of this program."""
     return known_revisions()[-1]
 
 
 def current_revision(engine: Engine) -> str | None:
-    """Read the schema revision of a database.
-
-    Parameters
-    ----------
-    engine : Engine
-        The database.
-
-    Returns
-    -------
-    str or None
-        None for an empty database.
-    """
+    """The schema revision of a database; None for an empty one."""
     with engine.begin() as connection:
         return revision_of(connection)
 
@@ -64,19 +53,12 @@ def revision_of(connection: Connection) -> str | None:
 
 
 def upgrade(engine: Engine, target: str = "head") -> None:
-    """Upgrade the schema; nothing happens if it is up to date.
-
-    Parameters
-    ----------
-    engine : Engine
-        The database.
-    target : str
-        Revision to reach.
+    """Upgrade the schema to a revision; nothing happens if it is up to date.
 
     Raises
     ------
     StoreError
-        If the database was written by a newer version of Abbe, or by one from before the first release.
+        The database was written by a newer version of Abbe, or by one from before the first release.
     """
     before = current_revision(engine)
     if before == head_revision() and target == "head":
@@ -92,15 +74,7 @@ def upgrade(engine: Engine, target: str = "head") -> None:
 
 
 def downgrade(engine: Engine, target: str = "base") -> None:
-    """Take schema changes back; data of removed tables are lost.
-
-    Parameters
-    ----------
-    engine : Engine
-        The database.
-    target : str
-        Revision to reach; ``"base"`` removes every table.
-    """
+    """Undo schema changes down to a revision; data of removed tables are lost. ``"base"`` removes every table."""
     from alembic import command
 
     with engine.begin() as connection:

@@ -29,7 +29,7 @@ def private_file(path: Path) -> int:
 
 
 def seen_by_others(path: Path) -> str:
-    """A warning if others than its owner may read or write a file; empty: nobody else, no such file, or no such rights on this system."""
+    """A warning if others than its owner may read or write a file; empty: they may not, or there is no such file or no such rights."""
     try:
         rights = stat.S_IMODE(path.stat().st_mode)
     except OSError:

@@ -11,7 +11,7 @@ FREE = 5
 FREE_OF_ADDRESS = 20
 FIRST_S, LONGEST_S = 2.0, 900.0
 LONGEST_OF_ACCOUNT_S = 60.0
-"""All strangers together wait no longer than this for one account: whoever guesses from ever new addresses gets one try a minute, and its
+"""All strangers together wait no longer than this for one account: guesses from ever new addresses get one try a minute, and its
 owner in a new place is not kept out by the quarter of an hour."""
 FORGET_S = 3600.0
 MOST = 10_000
@@ -26,9 +26,9 @@ class Came:
     address : str
         Of the visitor.
     device : str
-        Name of his browser, if this account has logged in with it before; empty: a stranger.
+        Name of the browser, if this account has logged in with it before; empty: a stranger.
     here : bool
-        He sits at the service's own computer.
+        The login comes from the service's own computer.
     """
 
     address: str
@@ -58,7 +58,7 @@ class Lockout:
     """Counts failures by account and place, and by address.
 
     A browser or an address from which the account has logged in before, and the service's own computer, are places of their own: guesses
-    from elsewhere do not make anybody wait there. All other places of an account also wait together, so that ever new addresses are no more
+    from elsewhere do not delay logins there. All other places of an account also wait together, so that ever new addresses are no more
     guesses. A known browser does not even wait for others at its own address: behind a proxy all may have the same.
 
     Parameters
@@ -100,7 +100,7 @@ class Lockout:
             if rule.key[0]:
                 self._counts.pop(rule.key, None)
             elif count is not None:
-                # Of the address only this try was none: whoever has one account could guess at all others for ever.
+                # Of the address only this try is not counted: the owner of one account could guess at all others for ever.
                 count.failures = max(count.failures - 1, 0)
                 count.until_s, count.last_s = count.before
         self._known[(_fold(account), _net(came.address))] = None

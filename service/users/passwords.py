@@ -13,7 +13,7 @@ from argon2.exceptions import InvalidHashError, VerifyMismatchError
 from abbe.service.errors import PasswordRefused
 
 AT_A_TIME = 2
-"""Each hash takes 19 MiB and a processor for tens of milliseconds: whoever asks for many may not starve the capture."""
+"""Each hash takes 19 MiB and a processor for tens of milliseconds: many requests for one must not starve the capture."""
 SHORTEST, LONGEST = 12, 256
 LEAST_DIFFERENT = 5
 T = TypeVar("T")

@@ -28,14 +28,14 @@ TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 
 @dataclass(frozen=True, slots=True)
 class Principal:
-    """Who asks, and what he may do.
+    """The account behind a request, and its permissions.
 
     Parameters
     ----------
     name : str
         ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``; so it stands in the audit.
     role : Role or None
-        None: nobody.
+        None: no account.
     permissions : frozenset of Permission
         What is allowed.
     by : str
@@ -100,20 +100,20 @@ class People:
         return user
 
     def set_role(self, name: str, role: str) -> None:
-        """Give a user another role; his sessions end, so that none goes on with the old rights."""
+        """Give a user another role; the user's sessions end, so that none keeps the old rights."""
         user, new = self.get(name), role_of(role)
         if new is not Role.ADMIN:
             self._keep_an_admin(user)
         self._store.people.change(user.id, role=new)
 
     def set_password(self, name: str, password: str) -> None:
-        """Give a user another password; his sessions end."""
+        """Give a user another password; the user's sessions end."""
         user = self.get(name)
         check_new(name, password)
         self._store.people.change(user.id, password=self.passwords.hash(password))
 
     def disable(self, name: str, *, enable: bool = False) -> None:
-        """Shut a user out, sessions and tokens with him, or let him in again. He is never deleted: the audit names him."""
+        """Disable a user with all sessions and tokens, or enable the user again. Users are never deleted: the audit names them."""
         user = self.get(name)
         if not enable:
             self._keep_an_admin(user)
@@ -125,7 +125,7 @@ class People:
             raise UserRefused(f"{user.name!r} is the only admin", "make somebody else admin first: abbe user role")
 
     def check(self, name: str, password: str) -> UserRecord | None:
-        """The user, if the password is his and he is not disabled. Takes as long for one that does not exist."""
+        """The user, if the password is right and the user is not disabled. It takes as long for a user that does not exist."""
         user = self._store.people.find(name) if NAME.fullmatch(name) else None
         right = self.passwords.verify(None if user is None else user.password, password)
         if not right or user is None or user.disabled_utc is not None:
@@ -151,7 +151,7 @@ class People:
     def by_session(self, secret: str, *, in_use: bool = True) -> Principal:
         """Who has this secret; `NOBODY` if the session has ended, was idle or is too old, or its user is disabled.
 
-        ``in_use`` False: this question is no use of the session, it goes on being idle.
+        ``in_use`` False: this request does not count as use of the session, which stays idle.
         """
         digest = digest_of(secret)
         found = self._store.people.session(digest)
@@ -168,7 +168,7 @@ class People:
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
 
     def device_of(self, name: str, cookie: str) -> str:
-        """Which browser this is, if this user has logged in with it since he has this password; else empty.
+        """Name of the browser, if this user has logged in with it since the password was set; else empty.
 
         The cookie is not kept: its seal is made with the hash of the user's password, which leaves the database nowhere.
         """
@@ -237,7 +237,7 @@ class People:
         return Principal(f"token:{user.name}/{token.name}", role, ALLOWED[role] & scopes, "token")
 
     def anybody(self) -> bool:
-        """Tell whether there is a user, also a disabled one: then nobody looks on without a name."""
+        """Whether there is a user, even a disabled one: then reading needs a login."""
         return bool(self._store.people.all())
 
 

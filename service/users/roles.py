@@ -35,7 +35,7 @@ ALLOWED: dict[Role, frozenset[Permission]] = {
     Role.VIEWER: frozenset({Permission.READ}),
     Role.OPERATOR: _OPERATOR,
     Role.METROLOGIST: _OPERATOR | {Permission.SOLVE, Permission.PROPOSE},
-    # He judges what others propose; who also measures and proposes would judge himself.
+    # Approvers judge what others propose: one who also measures and proposes would judge their own work.
     Role.APPROVER: frozenset({Permission.READ, Permission.ACKNOWLEDGE, Permission.APPROVE, Permission.AUDIT}),
     # Gives rights and keeps the settings. Neither proposes nor approves a table.
     Role.ADMIN: frozenset({Permission.READ, Permission.CONFIGURE, Permission.AUDIT, Permission.USERS}),

@@ -101,7 +101,7 @@ class Chunks(Repository):
         except StoreError as error:
             if not isinstance(error.__cause__, IntegrityError):
                 raise
-            return self._db.commit(work)  # somebody put the same in between our look and our insert (PostgreSQL): look again
+            return self._db.commit(work)  # another process put the same in between our look and our insert (PostgreSQL): look again
 
     def of_run(self, run_id: int, channel: str | None = None) -> list[ChunkRecord]:
         """Read a run's samples (of one channel), in order of channel and seq, and check that they are as they were written.

@@ -377,7 +377,6 @@ import os, signal, sys
 from pathlib import Path
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.storage.repositories.discoveries import Discoveries
-from abbe.service.storage.repositories.discoveries import Discoveries
 from abbe.service.storage.store import Store
 from abbe.service.discovery.discover import discover
 from abbe.service.discovery.discovery_store import journal_of
