@@ -1,26 +1,34 @@
 """The demonstration of a discovery judges itself against the sealed truth, and says so when it was wrong."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from abbe.models.discovery.answer import Significance, Where
 from abbe.service.campaign_data.decimation import picked
 from abbe.service.demo.demo_hidden import HiddenDemo
 from abbe.service.demo.demo_hidden_words import hidden_json, judged, truth_lines
-from abbe.service.discovery.new_measurement import NewGap, NewMeasurement
+from abbe.service.discovery.new_measurement import NewMeasurement
+from abbe.service.domain.finding import EffectFound, Finding, GapUm
 from abbe.service.effects.known_effects import _usual
 
 PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}
 SURGE = {"name": "counterbalance_surge", "key": "", "parameters": {"strength": 4.0}, "wild": 0}
 
 
+def effect(label, family="structure"):
+    name, _, key = label.partition(":")
+    size = {"strength": 6.0, "u_strength": 0.1, "unit": "um", "remedy": "mechanics", "remedy_text": "adjust"}
+    return EffectFound(label=label, name=name, key=key, title=name, family=family, kind="mean", **size)
+
+
 def demo(hidden, verdict, *labels):
-    told = {"strength": 6.0, "u_strength": 0.1, "unit": "um", "remedy": "mechanics", "remedy_text": "adjust"}
-    effects = [told | {"label": n, "name": n.split(":")[0], "key": n.split(":")[1]} for n in labels]
-    finding = {"verdict": verdict, "effects": effects, "where": {"axes": ["X"], "table": [1]}, "gaps": {}}
-    gap = NewGap(2.0, 0.5, 0.5)
+    where = Where(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
+    finding = Finding(verdict=verdict, effects=tuple(effect(n) for n in labels), where=where)
+    gap = GapUm(before_um=2.0, after_um=0.5, floor_um=0.5)
     return HiddenDemo(
         [], None, Path(), "", finding, None, SimpleNamespace(version=1), NewMeasurement(gap, {"a": gap}),
         truth={} if hidden is None else {"hidden": hidden},
@@ -58,7 +66,7 @@ def test_the_truth_is_told_with_its_size_and_shape():
 def test_json_has_the_answer_and_the_truth_apart():
     doc = hidden_json(demo(PLAY, "named", "lateral_play:EYX"))
     assert (doc["hidden"], doc["right"], doc["effects"][0]["label"]) == (PLAY, True, "lateral_play:EYX")
-    assert doc["where"] == {"axes": ["X"]}
+    assert doc["where"] == {"axes": ("X",)}
     assert doc["anew"]["gap"] == {"before_um": 2.0, "after_um": 0.5, "floor_um": 0.5}
 
 
@@ -77,8 +85,8 @@ def test_picked_readings_are_real_ones_and_lasers_stay():
 
 
 def test_a_new_set_up_of_an_instrument_is_expected_to_be_like_the_others_where_these_agree():
-    entry = {"family": "instrument", "forms": []}
+    entry = effect("dead_path:X", "instrument")
     assert _usual(entry, np.array([2.0, 4.0])) == 3.0
     assert _usual(entry, np.array([2.0, -4.0])) == 0.0
-    assert _usual(entry | {"family": "drive"}, np.array([2.0, 4.0])) == 0.0
+    assert _usual(replace(entry, family="drive"), np.array([2.0, 4.0])) == 0.0
     assert _usual(entry, np.array([2.0])) == 0.0
