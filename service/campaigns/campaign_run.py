@@ -121,8 +121,8 @@ class Item:
 
     ``test`` and ``first`` as planned (``first`` mounts the set-up that ``test`` uses); ``whole``: its steps in the present mounting, of
     which ``mounting`` is the number; ``left``: what is left of them from ``offset`` on; ``hand``: last step by hand that was done;
-    ``before``: where the machine stood when it began with what an earlier test left mounted; ``onward``: how its path goes on, if it was
-    broken off; ``kept_mm``: the farthest that it was ever read.
+    ``before``: where the machine stood when it began with what an earlier test left mounted; ``remainder``: what is left of its path, if it
+    was broken off; ``kept_mm``: the farthest that it was ever read.
     """
 
     test: TestPlan
@@ -173,7 +173,7 @@ def mounted_anew(item: Item, mounting: int) -> Item:
     )
 
 
-def gone_on(item: Item, hand: int | None, records: tuple[dict[str, Any], ...], so_far: SoFar | None = None) -> Item:
+def resumed_item(item: Item, hand: int | None, records: tuple[dict[str, Any], ...], so_far: SoFar | None = None) -> Item:
     """The test from its last checkpoint, in the present mounting."""
     hand = item.hand if hand is None else hand
     left, offset, resume_trail, remainder = rest_of(item.whole, hand, records, item.before, so_far)
@@ -297,7 +297,7 @@ class CampaignRun:
             It does not go on.
         """
         if isinstance(why, StretchDiffers) and (item.setup, item.mounting) not in self.used:
-            return gone_on(item, runner.hand, ())  # nothing is kept that the mounting could contradict
+            return resumed_item(item, runner.hand, ())  # nothing is kept that the mounting could contradict
         if isinstance(why, SetupDisturbed):
             return self.again_mounted(item)
         if isinstance(why, Interlock):
@@ -309,8 +309,8 @@ class CampaignRun:
         if runner.asked is not None:  # it is unknown how far the mounting has come
             return self.again_mounted(item)
         records = () if isinstance(why, BeamLost) else tuple(runner.records)
-        again = gone_on(item, runner.hand, records)
-        item = gone_on(item, runner.hand, records, so_far)
+        again = resumed_item(item, runner.hand, records)
+        item = resumed_item(item, runner.hand, records, so_far)
         if not touched or await self.untouched(item):
             return item
         return self.again_mounted(item) if (item.setup, item.mounting) in self.used else again

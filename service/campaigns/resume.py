@@ -15,13 +15,13 @@ from abbe.service.campaigns.campaign_run import (
     Confirm,
     Item,
     Resumed,
-    gone_on,
     halfway,
     in_mounting,
     items,
     mounted_anew,
     plan_hash,
     read_path,
+    resumed_item,
 )
 from abbe.service.devices.session import Session
 from abbe.service.domain.document import Doc
@@ -185,7 +185,7 @@ class _Finder:
                 asked = f"Set-up {setup} was left mounted and has complete runs. Has nobody touched it since?"
                 why = "" if await confirm(asked) else "nobody vouches for it, and runs of it are complete"
             elif item.remainder is not None and not await confirm(halfway(item)):
-                item = gone_on(item, item.hand, ())
+                item = resumed_item(item, item.hand, ())
         if why:
             said.append(f"set-up {setup} is mounted anew for {item.test.label}: {why}")
             self.mountings[setup] = number + 1
@@ -211,7 +211,7 @@ class _Finder:
             )
         hand = int(last["step"]) if last["test"] == label else None
         records = self._records(label, number) if await counting(session) else ()
-        return gone_on(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
+        return resumed_item(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
 
     def _records(self, label: str, number: int) -> tuple[dict[str, Any], ...]:
         """Laser records of the last run of a test in this mounting."""

@@ -64,8 +64,11 @@ class ResumeTrail:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """Which part of a test is run: ``test`` is its label in the plan, ``offset`` the number of the first step there, ``mounting`` the how
-    manieth of its set-up; ``run_id`` the run in the store."""
+    """Which part of a test is run.
+
+    ``test``: its label in the plan; ``offset``: number of its first step there; ``mounting``: number of the mounting of its set-up, from 1;
+    ``run_id``: the run in the store.
+    """
 
     test: str = ""
     setup: str = ""

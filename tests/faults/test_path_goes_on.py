@@ -84,7 +84,7 @@ async def broken(b: Bench, store: Store, plan: CampaignPlan, after_s: float) -> 
     freed(b)
 
 
-async def gone_on(b: Bench, store: Store, plan: CampaignPlan, confirm=yes, *, again_s: float | None = None) -> str:
+async def resumed_item(b: Bench, store: Store, plan: CampaignPlan, confirm=yes, *, again_s: float | None = None) -> str:
     """Resume; broken off once more after some seconds, if said. Gives what was said last."""
     found = await resume(b.session, store, b.site, plan, plan.name, confirm)
     control = None if again_s is None else After(plan, b, again_s, estop(b), step=1)
@@ -115,9 +115,9 @@ async def test_broken_twice_it_reads_what_it_reads_in_one_go(place):
     b, store = place
     plan = helix()
     await broken(b, store, plan, 9.0)
-    said = await gone_on(b, store, plan, again_s=6.0)
+    said = await resumed_item(b, store, plan, again_s=6.0)
     assert "test goes on at" in said
-    await gone_on(b, store, plan)
+    await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}
     pieces = load_run(store, runs(store)[-1].id)
@@ -146,7 +146,7 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
     with pytest.raises(Interlock):
         await measure(b.session, store, b.site, plan, manner=Manner(After(plan, b, 9.0, lambda: b.sim.world.ballbar.push(out=True))))
     b.sim.world.ballbar.push(out=False)
-    assert "test goes on at" in await gone_on(b, store, plan)
+    assert "test goes on at" in await resumed_item(b, store, plan)
     columns = load_run(store, runs(store)[-1].id)["columns"]
     assert all(columns["valid"])
 
@@ -155,7 +155,7 @@ async def test_going_on_costs_a_stretch_and_not_the_path(place):
     b, store = place
     plan = helix()
     await broken(b, store, plan, 15.0)
-    await gone_on(b, store, plan)
+    await resumed_item(b, store, plan)
     last = runs(store)[-1]
     driven_s = (last.end_doc["path_end_us"] - last.end_doc["path_start_us"]) * 1e-6
     assert driven_s < LONG_S - 15.0 + 3.0
@@ -165,7 +165,7 @@ async def test_nobody_vouches_and_it_begins_again(place):
     b, store = place
     plan = helix()
     await broken(b, store, plan, 9.0)
-    said = await gone_on(b, store, plan, decline)
+    said = await resumed_item(b, store, plan, decline)
     assert said.endswith("test begins again")
     assert "pieces" not in runs(store)[-1].start_doc["path"]
     assert [r.status for r in runs(store)] == ["failed", "complete"]
@@ -178,7 +178,7 @@ async def test_a_knocked_cup_is_seen_on_the_stretch_and_nothing_is_joined(place)
     bar = b.sim.world.ballbar
     outwards = b.sim.world.controller.position_mm - np.array([300.0, 250.0, 100.0])
     bar._cup_mm = bar._cup_mm + 0.004 * outwards / np.linalg.norm(outwards)
-    assert "test goes on at" in await gone_on(b, store, plan)
+    assert "test goes on at" in await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
     assert "otherwise than before the break" in runs(store)[1].reason
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}  # nothing is kept that the cup could contradict
@@ -199,7 +199,7 @@ async def test_a_box_restarted_in_a_pause_is_joined_to_nothing(place):
         await task
     assert "pieces" not in runs(store)[-1].start_doc["path"] or runs(store)[-1].status != "complete"
     await b.session.need_ballbar().identify()
-    assert (await gone_on(b, store, plan)).endswith("test begins again")
+    assert (await resumed_item(b, store, plan)).endswith("test begins again")
 
 
 async def test_a_pause_on_the_path_costs_a_stretch(place):
@@ -220,7 +220,7 @@ async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_pa
     b, store = place
     plan = helix()
     await broken(b, store, plan, 9.0)
-    await gone_on(b, store, plan)
+    await resumed_item(b, store, plan)
     folder = export_folder(store, plan.name, tmp_path / "out")
     with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as other:
         again = import_folder(other, folder)
@@ -239,7 +239,7 @@ async def test_a_box_that_was_restarted_begins_again(place):
     await broken(b, store, plan, 9.0)
     b.sim.box.restart(0xBA11)
     await b.session.need_ballbar().identify()  # as the next process does
-    said = await gone_on(b, store, plan)
+    said = await resumed_item(b, store, plan)
     assert said.endswith("test begins again")
     assert runs(store)[-1].status == "complete"
 
@@ -248,7 +248,7 @@ async def test_what_has_hardly_begun_begins_again(place):
     b, store = place
     plan = helix()
     await broken(b, store, plan, 0.3)
-    assert (await gone_on(b, store, plan)).endswith("test begins again")
+    assert (await resumed_item(b, store, plan)).endswith("test begins again")
 
 
 async def test_a_door_that_somebody_vouches_for_suspends_and_the_path_goes_on(place):

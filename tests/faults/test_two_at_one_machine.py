@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.campaigns.campaign_run import gone_on, items, mounted_anew
+from abbe.service.campaigns.campaign_run import items, mounted_anew, resumed_item
 from abbe.service.campaigns.measure import Manner, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.devices.machine_lock import lock_machine
@@ -43,7 +43,7 @@ async def place(tmp_path: Path):
 
 
 def test_before_a_bar_change_nothing_moves_and_the_place_is_looked_at():
-    item = gone_on(items(on_one_cup(100.0, 60.0))[1], None, ())
+    item = resumed_item(items(on_one_cup(100.0, 60.0))[1], None, ())
     end = end_of(on_one_cup(100.0, 60.0).tests[0])
     assert end is not None
     assert item.resume_trail.trail == (end,)
