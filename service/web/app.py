@@ -124,7 +124,7 @@ def create_app(
     hosts : sequence of str
         Names under which the page may be asked for: a foreign page must not reach it through a name of its own (DNS rebinding).
     auth : Authenticator, optional
-        Users and audit; without it everybody may look, and nobody may change anything.
+        Users and audit; without it every visitor may look and none may change anything.
     plant : FactsSource, optional
         What MTConnect documents tell; without it what the status says.
     parts : Parts, optional

@@ -46,16 +46,16 @@ class Body:
         self._taken: list[Message] = []
 
     async def refusal(self) -> Response | None:
-        """Take the body; say why it is not taken. One whose length is told in advance is refused unread."""
-        told = self._headers.get("content-length", "")
-        if told.isdigit() and int(told) > self._longest_b:
+        """Take the body; say why it is not taken. One whose Content-Length is too large is refused unread."""
+        length = self._headers.get("content-length", "")
+        if length.isdigit() and int(length) > self._longest_b:
             return self._too_long()
-        if told in {"", "0"} and "transfer-encoding" not in self._headers:
+        if length in {"", "0"} and "transfer-encoding" not in self._headers:
             return None  # there is none
         size_b, parts = 0, list[bytes]()
         while True:
             message = await self._receive()
-            if message["type"] != "http.request":  # gone: whoever reads the body finds out
+            if message["type"] != "http.request":  # the client left: the reader of the body sees that
                 self._taken = [{"type": "http.request", "body": b"".join(parts), "more_body": True}, message]
                 return None
             parts.append(message.get("body", b""))

@@ -69,7 +69,7 @@ class SecurityHeaders:
 Doc = dict[str, Any]
 REF = {"$ref": "#/components/schemas/Problem"}
 UNUSED = ("HTTPValidationError", "ValidationError")
-"""What FastAPI declares for 422, and nobody answers here."""
+"""What FastAPI declares for 422; no route answers it."""
 
 
 def complete(document: Doc, routes: Sequence[BaseRoute]) -> Doc:

@@ -88,7 +88,7 @@ class Frame:
 
     @property
     def who(self) -> str:
-        """Name of whoever is logged in with a session; empty otherwise."""
+        """Name of the person with this session; empty without one."""
         return self.visit.principal.name.partition(":")[2] if self.visit is not None and self.visit.secret else ""
 
     @property
@@ -97,11 +97,11 @@ class Frame:
         return csrf_token(self.visit.secret) if self.visit is not None and self.visit.secret else ""
 
     def may(self, need: Permission) -> bool:
-        """Whether whoever asks has a right."""
+        """Whether the visitor has a right."""
         return self.visit is not None and need in self.visit.principal.permissions
 
     def links(self, screens: Sequence[Screen] = SCREENS) -> list[Link]:
-        """Those of the screens that are there and that whoever asks may see."""
+        """The existing screens that the visitor may see."""
         shown = [one for one in screens if self.may(one[2]) and (self.there is None or one[0] in self.there)]
         return [Link(href, self.say(word), self.path in own) for href, word, _, own in shown]
 
@@ -134,7 +134,7 @@ class Frame:
         return language.say(self.lang, key, **values)
 
     def state(self, group: str, word: str) -> str:
-        """A stored state in the reader's language; as it is where nobody has translated it."""
+        """A stored state in the reader's language; as it is where it has no translation."""
         return language.known(self.lang, f"{group}.{word}", word)
 
 

@@ -108,7 +108,7 @@ def answered(core: CoreLine, answer: Answer) -> Response:
     if answer.outcome != "done":
         return problem(STATUS[answer.outcome], answer.text)
     found = _find(core, answer.job)
-    if found is None:  # so long ago that the core has forgotten it
+    if found is None:  # the core keeps the latest jobs only
         return problem(404, f"job {answer.job} is not known any more")
     return JSONResponse(json_value(found), 202, headers={"Location": f"/api/v1/jobs/{answer.job}"})
 

@@ -28,7 +28,7 @@ def catalogue(language: str) -> Mapping[str, str]:
 
 
 def say(language: str, key: str, **values: object) -> str:
-    """The text of a key with its places filled; KeyError for a key that nobody has written."""
+    """The text of a key with its places filled; KeyError for a key that no catalogue has."""
     text = catalogue(language)[key]
     return text.format(**values) if values else text
 

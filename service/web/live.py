@@ -1,5 +1,4 @@
-"""How things stand and what the running path reads, told as it changes, over WebSockets. The guard has looked at session and Origin
-before they open."""
+"""WebSockets that send status and readings as they change. The middleware checks session and Origin before they open."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Lengths as the reader wants them: µm, mm and mm/min, or µin, in and in/min. For the screens only; what is stored, the JSON, the CSV and
-the reports stay in SI, and so do addresses: a link means the same to whoever opens it.
+the reports stay in SI, and so do addresses: a link means the same to every reader.
 
 `shown` writes a number or one that was already rounded, `rounded` a number with its uncertainty, `drawn_in` tells a picture its unit;
 scripts get sign and size of the unit with their page. Not converted: pictures of reports (run, discovery, proposal: their axes say µm and

@@ -76,7 +76,7 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
     @app.post("/api/v1/proposals/{number}/reject", response_model=Decision, max_body_size=LONGEST_BODY)
     @needs(Permission.APPROVE)
     async def reject(request: Request, number: Number, body: RejectBody, key: Key) -> Response:
-        """Reject a proposal for good, with a reason: nobody can approve or push it any more."""
+        """Reject a proposal for good, with a reason: it cannot be approved or pushed any more."""
         name, account = _person(request)
         reason = body.reason.replace("\0", "\ufffd")  # the one character that not every database can keep
 
@@ -97,7 +97,7 @@ def _stored(sources: Sources, number: int) -> Iterator[None]:
 
 
 def _person(request: Request) -> tuple[str, str]:
-    """Who decides, and by which account: a token is its owner's, so nobody is two people by means of one."""
+    """Who decides, and by which account: a token counts as its owner, so it never makes one person two."""
     visit: Visit = request.state.visit
     account = visit.principal.name
     return account.partition(":")[2].partition("/")[0], account

@@ -1,4 +1,4 @@
-"""A core that says nothing: people get a screen that says so, programs a problem document. Nothing old is shown as if it were so now."""
+"""While the core does not answer, people get a screen that says so, programs a problem document. Old values are never shown as current."""
 
 from __future__ import annotations
 
@@ -25,6 +25,6 @@ def add_core_unavailable(app: FastAPI, env: Environment) -> None:
 
 
 def for_people(request: Request) -> bool:
-    """Whether a browser asks for a screen. The home page is one whoever asks: its script fetches it anew without saying what it takes."""
+    """Whether a browser asks for a screen. The home page always is one: its script fetches it again without an Accept header."""
     path = request.url.path
     return path == "/" or (not path.startswith("/api/") and "text/html" in request.headers.get("accept", ""))

@@ -1,4 +1,4 @@
-"""The latest lines of this process's log, for the diagnostics: kept in memory, so that nobody needs a way to the log files."""
+"""The latest lines of this process's log, for the diagnostics: kept in memory, so that no reader needs access to the log files."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ KEPT_FRAMES = 1200
 QUEUE = 40
 """So many frames wait for one browser; then the oldest go. The disk has had them all."""
 MOST_LISTENERS, MOST_EACH = 32, 12
-"""So many listen at once, and so many of one account: nobody can keep all others out."""
+"""Listeners at once, in all and of one account: one account cannot keep the others out."""
 _PATH = TypeAdapter(RecordedPath)
 
 

@@ -40,7 +40,7 @@ def needs(need: Need) -> Callable[[F], F]:
 
 
 def need_of(route: BaseRoute) -> Need | None:
-    """What a route needs; None: nobody has said."""
+    """What a route needs; None: it is not declared."""
     if isinstance(route, Mount):
         return MOUNTS.get(route.path)
     found = getattr(getattr(route, "endpoint", None), MARK, None)

@@ -76,7 +76,7 @@ class AuthMiddleware:
         body = Body(scope, receive, route) if changes else None
         try:
             refused = await self._refusal(request, need_of(route), visit, body)
-        except AbbeError as error:  # the store does not answer: then nobody is known
+        except AbbeError as error:  # without the store no visitor can be identified
             refused = problem(503, error.detail, error.code, {"Retry-After": "5"})
         if body is not None and self._auth is not None:
             await self._recorded(self._auth, route, visit, refused, (scope, body.receive, send))
@@ -169,7 +169,7 @@ class _Log:
         await self._write(f"{kind} {status}")
 
     async def broken(self, error: BaseException) -> None:
-        """Record that it ended in a defect, or was broken off; what that was is told by the service's log."""
+        """Record that it ended in a defect, or was broken off; the service's log has the details."""
         if self.unrecorded:
             return
         try:

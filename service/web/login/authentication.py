@@ -1,4 +1,4 @@
-"""What the guard of the routes asks: whose secret this is, whether he may try again, and where it is recorded."""
+"""What the middleware asks: whose secret this is, whether another try is allowed, and where it is recorded."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Authenticator:
         """Refusals of one address that are recorded: who floods the login must not fill the audit."""
 
     def cookie(self, *, tls: bool) -> str:
-        """Name of the cookie of a session. With TLS nobody but this host can set it."""
+        """Name of the cookie of a session. With TLS only this host can set it."""
         return f"__Host-{self._cookie}" if tls else self._cookie
 
     def device_cookie(self) -> str:

@@ -86,7 +86,7 @@ class PatientProtocol(H11Protocol):
         return self._waits_for is None and getattr(self.cycle, "response_complete", True) is False
 
     def let_go(self) -> None:
-        """Close at once: whoever does not read gets no farewell either."""
+        """Close at once: a client that does not read gets no closing message either."""
         self._stop_waiting()
         self._watch_reader(stopped=False)
         self.connections.discard(self)

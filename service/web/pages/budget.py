@@ -90,7 +90,7 @@ def budget_screen(store: Store, record: SolutionRecord, say: Say) -> BudgetScree
 
 
 def _name(b: Mapping[str, Any]) -> str:
-    """Short name of a source; as it is where nobody has translated it."""
+    """Short name of a source; as it is where it has no translation."""
     return current().state("source", str(b["source"]))
 
 

@@ -38,7 +38,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True)
 class DeviceLine:
-    """One device. ``url``: without passwords; ``certificate``: None for what is no instrument; ``firmware``: empty where nobody knows."""
+    """One device. ``url``: without passwords; ``certificate``: None for what is no instrument; ``firmware``: empty: not known."""
 
     device: DeviceStatus
     url: str
@@ -65,9 +65,10 @@ def device_screen(
     journal = [entry for campaign in latest for entry in store.checkpoints.of_campaign(campaign.id)]
     proof = next((one.doc for one in store.solutions.latest(KIND, PROOFS) if one.campaign_id in numbers), {})
     known = proof.get("identity") or {}
-    told = " ".join(str(known[k]) for k in ("model", "firmware") if known.get(k))
+    firmware = " ".join(str(known[k]) for k in ("model", "firmware") if known.get(k))
     lines = [
-        DeviceLine(d, mask_secrets(d.url), _certificate(d.role, until or {}, today), told if d.role == CONTROLLER else "") for d in devices
+        DeviceLine(d, mask_secrets(d.url), _certificate(d.role, until or {}, today), firmware if d.role == CONTROLLER else "")
+        for d in devices
     ]
     return DeviceScreen(lines, list(reversed(troubles(journal))), len(latest))
 

@@ -59,10 +59,10 @@ def blanked_doc(value: Any) -> Any:
 def blanked_line(line: str) -> str:
     """A line of a log: by its parts if it is JSON, else as text."""
     try:
-        told = json.loads(line)
+        parsed = json.loads(line)
     except ValueError:
         return blanked(line)
-    return json.dumps(blanked_doc(told), ensure_ascii=False) if isinstance(told, dict | list) else blanked(line)
+    return json.dumps(blanked_doc(parsed), ensure_ascii=False) if isinstance(parsed, dict | list) else blanked(line)
 
 
 def _holds(key: str, value: object) -> bool:
@@ -122,7 +122,7 @@ def megabytes(size_b: float) -> str:
 
 
 def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
-    """What the core has told this process of the machine file. Keys and passwords were never in it, but for those in URLs."""
+    """What this process knows of the machine file. Keys and passwords were never in it, but for those in URLs."""
     return {
         "machine": sources.reader.machine,
         "database": sources.reader.store.url,

@@ -16,7 +16,7 @@ from abbe.service.sequences.steps import CampaignPlan, MountBar, MountLaser, Tes
 from abbe.service.site import machine_from_doc
 
 CAMPAIGN = IDENTIFICATION
-"""The full campaign: whoever starts it is led through its set-ups."""
+"""The full campaign: its prompts guide a person through the set-ups."""
 
 
 @dataclass(frozen=True, slots=True)

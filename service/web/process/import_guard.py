@@ -1,4 +1,4 @@
-"""What the web process must never load: whoever takes it over shall find no way to a device in it."""
+"""What the web process must never load: an attacker who takes it over finds no way to a device in it."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Server(uvicorn.Server):
         if self.config.ssl is None or sockets is None:
             await super().startup(sockets)
             return
-        await super().startup([])  # all but the listening: uvicorn cannot be told how long a handshake may take
+        await super().startup([])  # all but the listening: uvicorn has no setting for how long a handshake may take
 
         def protocol() -> asyncio.Protocol:
             return PatientProtocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
