@@ -47,7 +47,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
 from abbe.service.scheduler.heartbeat import Heartbeat
-from abbe.service.scheduler.job import Checks
+from abbe.service.scheduler.job import CheckJobs
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
@@ -95,7 +95,7 @@ class Service:
         self._shelf = StoreShelf(store, clock, (setup.machine, store.machines.add(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
         alarms = self._make_alarms(book)
-        checks = Checks(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
+        checks = CheckJobs(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
         recipes = tuple(dict.fromkeys([*setup.recipes, *(parted(schedule.recipe)[0] for schedule in setup.schedules)]))
         self._jobs = JobRegistry(checks, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed, watchers)
         context = OrderContext(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, setup.control)

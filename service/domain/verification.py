@@ -55,3 +55,20 @@ class Verification:
         """Its figures, in their order."""
         found = self.values.items()
         return tuple(CheckFigure(name, value, self.uncertainties.get(name), self.limits.get(name)) for name, value in found)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """What a check found. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
+
+    verdict: Verdict
+    values: dict[str, float]
+    uncertainties: dict[str, float]
+    limits: dict[str, float]
+    run_labels: list[str]
+    campaign: str
+    started_utc: datetime
+    duration_s: float
+    text: str
+    comparable: bool = True
+    """Whether the figures can be put beside those of other checks: the air was within its limits, no certificate had ended."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -17,33 +16,17 @@ from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.config_schema import MachineFile
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.verification import CheckResult
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.needed import BALLBAR, LASER
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
-from abbe.service.verification.verify import COVERAGE, Verdict, figure_rows, figures, judge, overall
+from abbe.service.verification.verify import COVERAGE, figure_rows, figures, judge, overall
 
 MEASURED_WITH = {"body_diagonal_um": LASER, "helix_rms_um": BALLBAR}
 MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
-
-
-@dataclass(frozen=True, slots=True)
-class CheckResult:
-    """What a check found. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
-
-    verdict: Verdict
-    values: dict[str, float]
-    uncertainties: dict[str, float]
-    limits: dict[str, float]
-    run_labels: list[str]
-    campaign: str
-    started_utc: datetime
-    duration_s: float
-    text: str
-    comparable: bool = True
-    """Whether the figures can be put beside those of other checks: the air was within its limits, no certificate had ended."""
 
 
 async def run_check(

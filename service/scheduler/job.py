@@ -1,6 +1,6 @@
 """How every job runs: watchers follow it, its begin and its end are recorded, and a stop of the service is recorded too.
 
-Checks, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
+CheckJobs, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def failure(error: Exception) -> JobOutcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Checks:
+class CheckJobs:
     """Makes the check of a slot.
 
     Parameters
@@ -214,7 +214,7 @@ class _CheckJob(Job[Doc]):
 
     handles_abort = True
 
-    def __init__(self, checks: Checks, schedule: Schedule, slot_utc: datetime) -> None:
+    def __init__(self, checks: CheckJobs, schedule: Schedule, slot_utc: datetime) -> None:
         self.terms, self._checks = schedule, checks
         self._occasion = record.Occasion(checks.machine, schedule, slot_utc)
         self._started_utc, self._started_s = checks.clock.utc(), checks.clock.monotonic_s()

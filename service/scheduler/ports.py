@@ -2,71 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable
 from datetime import datetime
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.verification import CheckResult
 from abbe.service.sequences.control import Control
 
-Verdict = Literal["pass", "fail", "cannot tell"]
 Doc = dict[str, Any]
-
-
-class CheckResult(Protocol):
-    """What a check found."""
-
-    @property
-    def verdict(self) -> str:
-        """pass, fail or cannot tell."""
-        ...
-
-    @property
-    def values(self) -> Mapping[str, float]:
-        """Figures by name, the unit at the end of the name."""
-        ...
-
-    @property
-    def uncertainties(self) -> Mapping[str, float]:
-        """Expanded uncertainty (k = 2) of each figure."""
-        ...
-
-    @property
-    def limits(self) -> Mapping[str, float]:
-        """What each figure was judged against."""
-        ...
-
-    @property
-    def run_labels(self) -> Sequence[str]:
-        """Labels of the stored runs."""
-        ...
-
-    @property
-    def campaign(self) -> str:
-        """Name of the campaign the runs belong to."""
-        ...
-
-    @property
-    def started_utc(self) -> datetime:
-        """When the first device was opened."""
-        ...
-
-    @property
-    def duration_s(self) -> float:
-        """How long it took."""
-        ...
-
-    @property
-    def text(self) -> str:
-        """The verdict as one sentence."""
-        ...
-
-    @property
-    def comparable(self) -> bool:
-        """Whether the figures can be put beside those of other checks."""
-        ...
 
 
 Check = Callable[[str, ProgressSink, Control], Awaitable[CheckResult]]

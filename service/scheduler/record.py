@@ -9,8 +9,9 @@ from datetime import datetime
 
 from abbe.drivers.errors import DriverError
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.verification import CheckResult
 from abbe.service.errors import AbbeError
-from abbe.service.scheduler.ports import CheckResult, Doc
+from abbe.service.scheduler.ports import Doc
 
 SCHEMA = 1
 """Version of the documents. Raised when a key changes its meaning or goes; new keys do not raise it."""

@@ -27,13 +27,14 @@ from abbe.service.core.board import Board
 from abbe.service.devices.session import open_session
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.verification import CheckResult
 from abbe.service.errors import StoreError
-from abbe.service.jobs.check import CheckResult, run_check
+from abbe.service.jobs.check import run_check
 from abbe.service.push.limits import PushLimits
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
-from abbe.service.scheduler.job import Checks, Job, carry_out
+from abbe.service.scheduler.job import CheckJobs, Job, carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
@@ -88,7 +89,7 @@ class Shop:
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:
             return await run_check(self.config, self.store, recipe, progress, control=control)
 
-        checks = Checks("sim", check, shelf, clock, desk.checked)
+        checks = CheckJobs("sim", check, shelf, clock, desk.checked)
 
         async def run_job(job: Job[Any]) -> SlotState:
             return await carry_out(job, clock.utc(), Control(), [board])

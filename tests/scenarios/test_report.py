@@ -26,7 +26,7 @@ from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
 from abbe.service.domain.schedule import Schedule
-from abbe.service.jobs.check import CheckResult
+from abbe.service.domain.verification import CheckResult
 from abbe.service.push.operations import Verdict
 from abbe.service.rendering.numbers import with_uncertainty
 from abbe.service.runs.columns import load_run

@@ -65,7 +65,7 @@ def test_a_stop_in_the_middle_of_a_push(tmp_path: Path, open_: bool) -> None:
         print(f"ended {took_s:.2f} s after the signal")  # noqa: T201
         assert (code, span_s(running) < 5.0) == (0, True), running.lines
         assert axes_at_rest(sims)
-        (said,) = [json.loads(line) for line in running.lines if "the push was stopped with the service" in line]
+        (said,) = [json.loads(line) for line in running.lines if "the push was interrupted by the end of the service" in line]
         state, words, texts = told(tmp_path)
         if not open_:
             assert (state, said["word"], words) == ("ROLLED_BACK", "rolled back", ["rolled back"])

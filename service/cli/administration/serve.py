@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from abbe.service.core.setup import ServiceSetup
     from abbe.service.domain.job_state import JobOutcome
     from abbe.service.domain.progress import ProgressSink
+    from abbe.service.domain.verification import CheckResult
     from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
     from abbe.service.scheduler.alarm_manager import Duties
-    from abbe.service.scheduler.ports import Check, CheckResult
+    from abbe.service.scheduler.ports import Check
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site

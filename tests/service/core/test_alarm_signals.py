@@ -24,7 +24,7 @@ from abbe.service.jobs.investigate import Note
 from abbe.service.push.entries import GENESIS
 from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
-from abbe.service.scheduler.job import Checks, carry_out
+from abbe.service.scheduler.job import CheckJobs, carry_out
 from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
@@ -127,7 +127,7 @@ class Bench:
         duties = Duties(14.0, "identification", look_into, push_one if push else None)
         self.desk = AlarmManager(store, self.clock, "mill-7", [DAILY], duties, channels)
         shelf = StoreShelf(store, self.clock, ("mill-7", self.machine_id), TOPICS, lambda: None)
-        self.checks = Checks("mill-7", self._check, shelf, self.clock, self.desk.checked)
+        self.checks = CheckJobs("mill-7", self._check, shelf, self.clock, self.desk.checked)
 
     async def _check(self, recipe: str, progress: Any, control: Any) -> Result:
         if isinstance(self.outcome, Exception):

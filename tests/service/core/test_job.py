@@ -13,7 +13,7 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MeasurementFault
-from abbe.service.scheduler.job import Checks, carry_out
+from abbe.service.scheduler.job import CheckJobs, carry_out
 from abbe.service.sequences.control import Control
 from tests.service.core.fakes import STEP, FakeClock, FakeShelf, FakeWatcher, Result, settle, utc
 
@@ -30,7 +30,7 @@ class Bench:
 
     async def job(self) -> str:
         """Run the check of the slot."""
-        job = Checks("mill-7", self.check, self.shelf, FakeClock(SLOT))(SCHEDULE, SLOT)
+        job = CheckJobs("mill-7", self.check, self.shelf, FakeClock(SLOT))(SCHEDULE, SLOT)
         return await carry_out(job, SLOT, Control(), [self.watcher])
 
     async def given(self, recipe: str, progress: Callable[[Any], None], control: Control) -> Result:

@@ -12,7 +12,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.heartbeat import Heartbeat
-from abbe.service.scheduler.job import Checks, carry_out
+from abbe.service.scheduler.job import CheckJobs, carry_out
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
@@ -49,7 +49,7 @@ async def main() -> None:
 
         shelf = StoreShelf(store, clock, (name, machine_id), ("v", "a"), lambda: None)
         heartbeat = Heartbeat(name, "0", store.heartbeats, lambda: [], clock)
-        checks, ledger = Checks(name, check, shelf, clock), StoreLedger(store, clock, name)
+        checks, ledger = CheckJobs(name, check, shelf, clock), StoreLedger(store, clock, name)
         sys.stdout.write("ready\n")
         sys.stdout.flush()
         sys.stdin.readline()
