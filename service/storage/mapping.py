@@ -1,4 +1,7 @@
-"""How rows become records: a field of a record is the column of its name, unless its mapping names another column or a record inside."""
+"""How rows become records, and which table each record is made of.
+
+A field of a record is the column of its name, unless its mapping names another column or a record inside.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, Generic, TypeVar
 
-from sqlalchemy import Column, ColumnElement, FromClause, Row, Select, Table, select
+from sqlalchemy import Column, ColumnElement, FromClause, Row, Select, Table, func, null, select
+
+from abbe.service.domain import decisions, measured, people, results, service_records
+from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.owner import Owner
+from abbe.service.storage import tables as t
 
 R = TypeVar("R")
 
@@ -74,3 +82,46 @@ class RecordMapping(Generic[R]):
             elif isinstance(column, Column) and column.table is self.table and name not in without:
                 found[column.name] = getattr(record, name)
         return found
+
+
+def owner_of(table: Table) -> RecordMapping[Owner]:
+    """The process that a row belongs to."""
+    return RecordMapping(Owner, table, host=table.c.owner_host, pid=table.c.owner_pid, start=table.c.owner_start)
+
+
+MACHINE = RecordMapping(measured.MachineRecord, t.machines)
+CAMPAIGN = RecordMapping(measured.CampaignRecord, t.campaigns)
+RUN = RecordMapping(
+    measured.RunRecord,
+    t.runs,
+    t.runs.join(t.campaigns, t.campaigns.c.id == t.runs.c.campaign_id),
+    campaign=t.campaigns.c.name,
+    owner=owner_of(t.runs),
+)
+CHUNK = RecordMapping(measured.ChunkRecord, t.chunks)
+CHECKPOINT = RecordMapping(measured.CheckpointRecord, t.checkpoints)
+
+SOLUTION = RecordMapping(results.SolutionRecord, t.solutions)
+TABLE = RecordMapping(results.TableRecord, t.comp_tables)
+VERIFICATION = RecordMapping(results.VerificationRecord, t.verifications)
+DISCOVERY = RecordMapping(results.DiscoveryRecord, t.discoveries)
+STEP = RecordMapping(results.StepRecord, t.discovery_steps)
+MODEL = RecordMapping(results.ModelRecord, t.machine_models)
+
+PROPOSAL = RecordMapping(decisions.ProposalRecord, t.proposals)
+APPROVAL = RecordMapping(decisions.ProposalApproval, t.approvals)
+REJECTION = RecordMapping(decisions.ProposalRejection, t.rejections)
+PUSH_ENTRY = RecordMapping(decisions.PushEntryRecord, t.push_entries)
+PUSH_MARK = RecordMapping(decisions.PushEntryRecord, t.push_entries, doc=null())
+"""Without the document, which holds the images of tables."""
+
+ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries)
+SLOT = RecordMapping(service_records.SlotRecord, t.slots, reason=func.coalesce(t.slots.c.reason, ""))
+HEARTBEAT = RecordMapping(service_records.HeartbeatRecord, t.heartbeats, owner=owner_of(t.heartbeats))
+OUTBOX = RecordMapping(service_records.OutboxRecord, t.outbox)
+REPLY = RecordMapping(service_records.ReplyRecord, t.replies)
+
+USER = RecordMapping(people.UserRecord, t.users)
+SESSION = RecordMapping(people.SessionRecord, t.sessions)
+TOKEN = RecordMapping(people.TokenRecord, t.api_tokens)
+AUDIT = RecordMapping(AuditEvent, t.audit)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 
-from sqlalchemy import Engine, select
+from sqlalchemy import Connection, Engine, func, select, text
 
 from abbe.service.domain.service_records import StoreHealth
 from abbe.service.storage.database import Database
-from abbe.service.storage.health import health_of
+from abbe.service.storage.migrate import head_revision, revision_of
 from abbe.service.storage.repositories.alarms import Alarms
 from abbe.service.storage.repositories.audit import Audit
 from abbe.service.storage.repositories.checkpoints import Checkpoints
@@ -27,7 +28,7 @@ from abbe.service.storage.repositories.replies import Replies
 from abbe.service.storage.repositories.results import Solutions, Tables, Verifications
 from abbe.service.storage.repositories.runs import Runs
 from abbe.service.storage.repositories.slots import Slots
-from abbe.service.storage.tables import identity
+from abbe.service.storage.tables import identity, machines, outbox
 
 
 class Store(Database):
@@ -53,5 +54,23 @@ class Store(Database):
         return str(self.read(lambda connection: connection.execute(select(identity.c.uid)).scalar_one()))
 
     def health(self) -> StoreHealth:
-        """State of the database itself; nothing is written."""
-        return health_of(self)
+        """State of the database itself, for the diagnostics: schema, size, age, and how many messages wait; nothing is written."""
+        name = self.engine.url.database
+        file = str(name) if not self.is_postgresql and not self.in_memory and name else ""
+
+        def look(connection: Connection) -> StoreHealth:
+            waiting = select(func.count(), func.min(outbox.c.created_utc)).where(outbox.c.sent_utc.is_(None))
+            count, oldest = connection.execute(waiting).one()
+            since = connection.execute(select(func.min(machines.c.created_utc))).scalar()
+            revision = revision_of(connection) or ""
+            return StoreHealth(revision, head_revision(), file, _size_b(connection, file), since, int(count), oldest)
+
+        return self.read(look)
+
+
+def _size_b(connection: Connection, file: str) -> int:
+    if file:
+        return sum(os.path.getsize(path) for path in (file, f"{file}-wal") if os.path.exists(path))
+    if connection.dialect.name == "postgresql":
+        return int(connection.execute(text("select pg_database_size(current_database())")).scalar_one())
+    return int(connection.execute(text("select page_count * page_size from pragma_page_count, pragma_page_size")).scalar_one())

@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from abbe.service.domain.document import Doc
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import StoreError
-from abbe.service.storage.mappings import ALARM_ENTRY
+from abbe.service.storage.mapping import ALARM_ENTRY
 from abbe.service.storage.repositories.outbox import queue_message
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import alarm_entries

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from sqlalchemy import Connection, text
 
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.storage.mappings import AUDIT
+from abbe.service.storage.mapping import AUDIT
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import audit
 

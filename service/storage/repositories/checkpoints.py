@@ -6,7 +6,7 @@ from sqlalchemy import Connection, func, select
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import CheckpointRecord
-from abbe.service.storage.mappings import CHECKPOINT
+from abbe.service.storage.mapping import CHECKPOINT
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import checkpoints
 

@@ -10,7 +10,7 @@ from sqlalchemy.exc import IntegrityError
 
 from abbe.service.domain.measured import RUNNING, ChannelRecord, ChunkRecord
 from abbe.service.errors import CaptureConflict, NotStored, StoreError
-from abbe.service.storage.mappings import CHUNK
+from abbe.service.storage.mapping import CHUNK
 from abbe.service.storage.repository import Repository, given
 from abbe.service.storage.tables import campaigns, chunks, runs
 

@@ -8,7 +8,7 @@ from sqlalchemy.exc import IntegrityError
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import DiscoveryRecord, ModelRecord, NewVersion, StepRecord
 from abbe.service.errors import ModelMovedOn, StoreError
-from abbe.service.storage.mappings import DISCOVERY, MODEL, STEP
+from abbe.service.storage.mapping import DISCOVERY, MODEL, STEP
 from abbe.service.storage.repository import Repository, given, insert_row
 from abbe.service.storage.tables import discoveries, discovery_steps, machine_models
 

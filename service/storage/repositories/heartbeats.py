@@ -7,7 +7,7 @@ from sqlalchemy import Connection
 from abbe.service.domain.document import Doc
 from abbe.service.domain.owner import this_process
 from abbe.service.domain.service_records import HeartbeatRecord
-from abbe.service.storage.mappings import HEARTBEAT, owner_of
+from abbe.service.storage.mapping import HEARTBEAT, owner_of
 from abbe.service.storage.repository import Repository, dialect_insert
 from abbe.service.storage.tables import heartbeats
 

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, select
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import CampaignRecord, MachineRecord
 from abbe.service.errors import NotStored, StoreError
-from abbe.service.storage.mappings import CAMPAIGN, MACHINE
+from abbe.service.storage.mapping import CAMPAIGN, MACHINE
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import campaigns, heartbeats, machines
 

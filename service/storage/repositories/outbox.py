@@ -9,7 +9,7 @@ from sqlalchemy import Connection, delete, func, select, update
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.service_records import OutboxRecord
-from abbe.service.storage.mappings import OUTBOX
+from abbe.service.storage.mapping import OUTBOX
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import outbox
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abbe.service.domain.decisions import ProposalApproval, ProposalRecord, ProposalRejection
 from abbe.service.domain.document import Doc
-from abbe.service.storage.mappings import APPROVAL, PROPOSAL, REJECTION
+from abbe.service.storage.mapping import APPROVAL, PROPOSAL, REJECTION
 from abbe.service.storage.repository import Repository, given
 from abbe.service.storage.tables import approvals, proposals, rejections
 

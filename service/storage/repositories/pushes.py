@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, select
 
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.errors import StoreError
-from abbe.service.storage.mappings import PUSH_ENTRY, PUSH_MARK
+from abbe.service.storage.mapping import PUSH_ENTRY, PUSH_MARK
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import push_entries
 

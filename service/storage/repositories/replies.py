@@ -9,7 +9,7 @@ from sqlalchemy.exc import IntegrityError
 
 from abbe.service.domain.service_records import ReplyRecord
 from abbe.service.domain.utc import utc_text
-from abbe.service.storage.mappings import REPLY
+from abbe.service.storage.mapping import REPLY
 from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import replies
 

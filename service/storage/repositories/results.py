@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, select
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import SolutionRecord, TableRecord, VerificationRecord
-from abbe.service.storage.mappings import SOLUTION, TABLE, VERIFICATION
+from abbe.service.storage.mapping import SOLUTION, TABLE, VERIFICATION
 from abbe.service.storage.repositories.outbox import queue_message
 from abbe.service.storage.repository import Repository, given, insert_row
 from abbe.service.storage.tables import campaigns, comp_tables, machines, solutions, verifications

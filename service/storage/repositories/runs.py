@@ -11,7 +11,7 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import FINISHED, RUNNING, ChunkRecord, ImportedRun, RunRecord
 from abbe.service.domain.owner import this_process
 from abbe.service.errors import NotStored, StoreError
-from abbe.service.storage.mappings import RUN, owner_of
+from abbe.service.storage.mapping import RUN, owner_of
 from abbe.service.storage.repositories.chunks import insert_chunk, require_running
 from abbe.service.storage.repositories.machines import Campaigns, insert_campaign, machine_id_of
 from abbe.service.storage.repository import Repository, given, insert_row

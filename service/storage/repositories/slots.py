@@ -11,7 +11,7 @@ from abbe.service.domain.owner import Owner, this_process
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
-from abbe.service.storage.mappings import SLOT, owner_of
+from abbe.service.storage.mapping import SLOT, owner_of
 from abbe.service.storage.repository import Repository, dialect_insert
 from abbe.service.storage.tables import slots
 
