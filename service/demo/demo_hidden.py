@@ -69,7 +69,7 @@ async def run_hidden_demo(
     Parameters
     ----------
     world_args : list of str
-        What the simulators are told: ``--hidden SEED``, or a scenario file. Nobody here looks into it.
+        Arguments of the simulators: ``--hidden SEED``, or a scenario file, which stays unread here.
     folder : Path
         Keeps database and machine file.
     tables : bool

@@ -94,7 +94,7 @@ class Svg:
             self.line((x + side * dx - cx, y + side * dy - cy), (x + side * dx + cx, y + side * dy + cy), "whisker")
 
     def arrow(self, start: XY, end: XY, style: str, tip: str = "") -> None:
-        """Arrow with a filled head; shorter than a pixel it becomes a dot, because a head would claim a direction nobody can see.
+        """Arrow with a filled head; shorter than a pixel it becomes a dot, because a head would claim a direction that is invisible.
 
         Parameters
         ----------

@@ -75,7 +75,7 @@ def solution_report(store: Store | None, campaign: Campaign, solution: SolutionR
     Parameters
     ----------
     store : Store or None
-        Where the campaign is stored; its unfinished runs and its table are told then.
+        Where the campaign is stored; the report then names its unfinished runs and its table.
     campaign : Campaign
         The runs that were solved.
     made_utc : str
@@ -96,7 +96,7 @@ def _of_then(store: Store, found: Measured, created_utc: str, rules: Rules) -> D
 
 
 def folder_report(folder: Path, rules: Rules) -> Document:
-    """Report of a campaign folder that nobody has imported: figures of the standards; there is no solution with it."""
+    """Report of a campaign folder that is not imported: figures of the standards, without a solution."""
     return campaign_report(Measured(from_folder(folder)), rules)
 
 

@@ -222,7 +222,7 @@ def _run_table(found: Measured) -> TextTable:
 
 
 def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[str]:
-    """Runs that are in no figure; of one that was gone on with, where its readings are."""
+    """Runs that are in no figure; for a resumed one, the run that holds its readings."""
     whole = {piece["run"]: r["run_id"] for r in runs for piece in (r.get("timing") or {}).get("pieces", [])}
     short = {r["run_id"]: why for r in runs if (why := not_judged(r))}
     out = []

@@ -81,7 +81,7 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, words: Words, *, 
     panel.draw_x(svg, f"{'XYZ'[across]} {words.place.sign}", count=5)
     panel.draw_y(svg, f"{'XYZ'[up]} {words.place.sign}", count=5)
     actual = grid + data.deviation_um * 1e-3 * magnified / words.place.size
-    known = np.where(data.told[..., None], actual, np.nan)  # a line breaks where nobody knows where it runs
+    known = np.where(data.told[..., None], actual, np.nan)  # a line breaks where its course is unknown
     for nodes, style in ((grid, "hidden-edge"), (known, "s-c2 thin")):
         for line in (*nodes, *np.swapaxes(nodes, 0, 1)):
             svg.polyline([panel.at(float(p[across]), float(p[up])) for p in line], style)
