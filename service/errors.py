@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class AbbeError(Exception):
     """Something a person has to know: what is wrong, where, and what to do.
@@ -260,6 +262,15 @@ class TableRefused(AbbeError):
     """A table breaks a limit (value, step, change). Nothing was written."""
 
     code = "CMP-001"
+
+    def __init__(self, detail: str, remedy: str = "", reasons: Sequence[str] = ()) -> None:
+        super().__init__(detail, remedy)
+        self.reasons = tuple(reasons) or (detail,)
+
+    @classmethod
+    def because(cls, reasons: Sequence[str], remedy: str = "nothing was written") -> TableRefused:
+        """One refusal for all reasons."""
+        return cls("; ".join(reasons), remedy, reasons)
 
 
 class TableMismatch(AbbeError):

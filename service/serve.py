@@ -54,7 +54,7 @@ from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.storage.engine import parse_url
 from abbe.service.storage.private import database_seen_by_others
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import open_push
+from abbe.service.tables.push_journal import JournalView
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.listening import bind, check_certificate, check_exposure
@@ -308,7 +308,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
             for line in setup.warnings:
                 log.warning("machine file", text=line)
             log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
-            last_words.append(partial(open_push, store, setup.machine, setup.control))
+            last_words.append(lambda: JournalView.read(store, setup.machine, setup.control).open_push)
             return await Service(setup, store, listening, clock).run(stop, once=once)
         finally:
             await asyncio.to_thread(store.close)

@@ -31,6 +31,7 @@ async def as_if_pushed(
     table = store.tables.add(store.machines.add(machine, {"name": machine}), None, image, crc32(image), doc)
     known = {"table": table, "base_image": base.hex(), "base_crc": crc32(base), "base_bank": 0, "image": image.hex()}
     known |= {"crc": crc32(image), "target": 1, "base_meaning": "b", "meaning": "m", "owner": 0x00770000}
+    known |= {"boot": 0x7FFFFFFF, "gen": 1, "map": "", "limits": "", "level": 3, "attended": True, "chunk_words": 100}
     known |= {"machine": machine} | ({"control": control} if control else {})
     more = {S.SNAPSHOT: known, S.APPROVED: {"approved_by": "ann"}, S.VERIFIED: {"verify": "better"}, S.ROLLBACK: {"why": "worse"}}
     book = await StoreBook.new(store, machine, clock, control)

@@ -1,6 +1,6 @@
 """What each kind of table can do for this machine: the errors of distances that are left, with their uncertainty, side by side.
 
-All kinds are made from the same identified deviation; the part of it that nobody knows (`PredictedDistances.unknown_mm`) is in every row.
+All kinds are made from the same identified deviation; the part of it that is unknown (`PredictedDistances.unknown_mm`) is in every row.
 Judged over the inner 80 % of the strokes, first order, rigid motion not seen by distances.
 """
 

@@ -18,7 +18,7 @@ from abbe.models.machine import AXES
 
 TOLD = 3
 SEEN_MM = 0.003
-"""Less than this at the strongest place: a table with the sign turned over could not be told from drift within what is allowed."""
+"""Less than this at the strongest place: a table with the sign turned over could not be distinguished from drift within what is allowed."""
 
 
 @dataclass(frozen=True)

@@ -206,10 +206,11 @@ def correct(
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink)
-                said.append(await ready(context))
+                control = await ready(context)
+                said.append(control.hint)
                 runs = await verification_before(session, store, site, before, sink)
                 async with taken_back_when_safe(session, store, site, wait_s):
-                    return await work_correct(context, campaign, runs)
+                    return await work_correct(context, campaign, runs, control)
 
     with Store.open(loaded.database_url) as store:
         try:
@@ -267,7 +268,7 @@ def warn_of_open_push(url: str, site: Site) -> None:
     """
     from abbe.service.cli.common import open_store
     from abbe.service.errors import StoreError
-    from abbe.service.tables.push_outcome import open_pushes
+    from abbe.service.tables.push_journal import open_pushes
 
     try:
         store = open_store(url)

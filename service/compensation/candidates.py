@@ -15,15 +15,13 @@ from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock
-from abbe.service.push.book import read_entries
 from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence
-from abbe.service.push.entries import facts
-from abbe.service.push.states import PushState
 from abbe.service.push.validate import content_digest
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import tables_from_image
+from abbe.service.tables.push_journal import JournalView
 
 Runs = list[dict[str, Any]]
 SIGNER = "metrologist"
@@ -48,7 +46,7 @@ class Promise:
 
 
 def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: TableFormat) -> Candidate:
-    """A proposal as it is signed, by whoever ordered it.
+    """A proposal as it is signed by the one who ordered it.
 
     Parameters
     ----------
@@ -62,7 +60,7 @@ def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: Tab
 
 
 def _column(promise: Promise, a: int, i: int) -> Column:
-    values = promise.tables.correction_mm[a][:, i] + 0.0  # -0.0 is another number to whoever compares bytes
+    values = promise.tables.correction_mm[a][:, i] + 0.0  # -0.0 is another number where bytes are compared
     left = -promise.change.correction_mm[a][:, i] + 0.0
     return Column(AXES[a], AXES[i], tuple(promise.tables.position_mm[a].tolist()), tuple(values.tolist()), tuple(_plain(left)))
 
@@ -107,25 +105,21 @@ async def scene_of(
     site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
 ) -> CandidateContext:
     """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
-    last_s = await asyncio.to_thread(_last_push_s, store, site)
-    month_ago = {} if attended else _on_grid(await asyncio.to_thread(_month_ago, store, site, base, clock), grid)
+    journal = await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)
+    month_ago = {} if attended else _on_grid(_month_ago(journal, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
     return CandidateContext(
         site.name, mark_of([base.status.boot_id]), FORMAT_VERSION, form.lsb_nm, form.bank_registers, travel, {}, base.crc,
-        _on_grid(base.tables, grid), month_ago, clock.utc().timestamp(), attended=attended, last_push_s=last_s,
+        _on_grid(base.tables, grid), month_ago, clock.utc().timestamp(), attended=attended, last_push_s=journal.last_kept_s,
     )  # fmt: skip
 
 
-def _month_ago(store: Store, site: Site, base: Base, clock: Clock) -> NineTables | None:
+def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
     """The tables that were in force `MONTH` ago, as far as pushes tell; before the first push that of its base, else the present one."""
-    entries = read_entries(store, site.name, site.control)
-    then = clock.utc() - MONTH
-    kept = [e for e in entries if e.state is PushState.KEEP]
-    old = [e.push for e in kept if datetime.fromisoformat(e.utc) <= then]
-    number, key = (old[-1], "image") if old else (kept[0].push, "base_image") if kept else (0, "")
-    if not key:
+    kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
+    if not kept:
         return base.tables
-    return tables_from_image(bytes.fromhex(facts(tuple(e for e in entries if e.push == number))[key]))
+    return tables_from_image(old[-1].image if old else kept[0].base_image)
 
 
 def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str], tuple[float, ...]]:
@@ -137,8 +131,3 @@ def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str
         for n, i in enumerate(AXES):
             found[(a, i)] = tuple(np.interp(grid.position_mm[k], tables.position_mm[k], tables.correction_mm[k][:, n]).tolist())
     return found
-
-
-def _last_push_s(store: Store, site: Site) -> float:
-    kept = [e for e in store.pushes.entries(site.name, site.control) if e.state == "KEEP"]
-    return datetime.fromisoformat(kept[-1].utc).timestamp() if kept else float("-inf")

@@ -210,7 +210,7 @@ def _last(store: Store, site: Site) -> dict[str, Any] | None:
 
 
 async def check_commissioned(controller: Identity, store: Store, site: Site) -> None:
-    """Refuse a table for a control of which nobody knows what it does with one.
+    """Refuse a table for a control whose use of tables was never proved.
 
     Raises
     ------

@@ -15,17 +15,16 @@ from abbe.drivers.api import BankState, Controller
 from abbe.drivers.errors import Refused
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.level_trial import ID_WORD, Shown, Trial
-from abbe.service.compensation.level_trial_motion import while_moving
+from abbe.service.compensation.level_trial import ID_WORD, Shown, Trial, while_moving
 from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof
 from abbe.service.compensation.recover import recover
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableMismatch, UnsafeToMove
-from abbe.service.push.book import read_entries
 from abbe.service.push.levels import Capabilities
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
+from abbe.service.tables.push_journal import JournalView
 
 RESTART = "that a restart changes the boot id, and what it leaves in the banks: nobody restarted the controller"
 NOT_SHOWN = (
@@ -46,7 +45,7 @@ class Levels:
     solution_id: int
 
     def rows(self) -> list[tuple[str, bool, str]]:
-        """For people: flag, proved or not, how (or what spoke against it)."""
+        """For people: flag, proved or not, how (or the reason against it)."""
         found = flags_of(self.capabilities)
         return [(name, ok, how(self.shown, name)) for name, ok in found.items() if name != "can_disable"]
 
@@ -92,7 +91,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
 
 
 def how(shown: tuple[Shown, ...], flag: str) -> str:
-    """How a flag was proved, or what spoke against it."""
+    """How a flag was proved, or the reason against it."""
     of_it = [s for s in shown if s.flag == flag]
     return "; ".join(s.what for s in of_it if not s.ok) or "; ".join(s.what for s in of_it) or "it could not be tried"
 
@@ -105,7 +104,7 @@ def _keep(store: Store, site: Site, doc: Doc) -> int:
 
 def _earlier_boots(store: Store, site: Site) -> set[int]:
     """Boot ids that earlier pushes and commissionings of this machine have met."""
-    boots = {int(e.doc["boot"]) for e in read_entries(store, site.name, site.control) if "boot" in e.doc}
+    boots = {push.boot for push in JournalView.read(store, site.name, site.control, origins=False).bases()}
     last = last_proof(store, site)
     return boots | ({int(last["boot_id"])} if last else set())
 

@@ -121,7 +121,7 @@ def control_for(key: str) -> ControlModel:
 
 
 def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> FormatSettings:
-    """What the writers are told: reference, decimals of the control's unit, Fanuc's unit."""
+    """What the writers need to know: reference, decimals of the control's unit, Fanuc's unit."""
     x, y, z = (float(v) for v in reference_mm)
     return FormatSettings(
         reference_mm=(x, y, z),

@@ -15,7 +15,7 @@ from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.campaigns.measure import Manner, measure
-from abbe.service.compensation.gate import Admission, NotAdmitted, PushContext, admit, check_promise, ready
+from abbe.service.compensation.gate import Admission, PushContext, admit, check_promise, ready
 from abbe.service.compensation.proposal_checks import HoldReason
 from abbe.service.compensation.proposals import (
     Made,
@@ -27,12 +27,14 @@ from abbe.service.compensation.proposals import (
     make,
     solved_again,
 )
+from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.domain.progress import Progress
-from abbe.service.errors import AbbeError, TakenBack
+from abbe.service.errors import AbbeError, TableRefused, TakenBack
 from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import less, taken
 from abbe.service.push.operations import Verdict
+from abbe.service.push.validate import drift_reason
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.interlocks import Suspending
 from abbe.service.sequences.recipes.campaigns import verification
@@ -67,7 +69,9 @@ class Correction:
     proposal: int = 0
 
 
-async def correct(context: PushContext, campaign: str | int, before: list[dict[str, Any]]) -> Correction:
+async def correct(
+    context: PushContext, campaign: str | int, before: list[dict[str, Any]], control: LevelStatus | None = None
+) -> Correction:
     """Correct a machine from a measured identification campaign.
 
     Parameters
@@ -78,6 +82,8 @@ async def correct(context: PushContext, campaign: str | int, before: list[dict[s
         Identification campaign in the store.
     before : list of dict
         Verification runs measured with the present table, as ``abbe-run/1``.
+    control : LevelStatus, optional
+        From `abbe.service.compensation.gate.ready`, where that was asked before; default: it is asked now.
 
     Raises
     ------
@@ -89,40 +95,37 @@ async def correct(context: PushContext, campaign: str | int, before: list[dict[s
         An unverified table could not be taken back yet.
     """
     store, site = context.store, context.site
-    await ready(context)
+    control = control or await ready(context)
     gathered = await gather(context.session.controller, store, site, campaign)
     check_same_table(gathered.base, before)
     check_temperature(site, gathered.runs)
     figures(before)  # before anything is written: runs that are no verification are refused now
     made = await make(store, site, gathered, progress=context.progress, agree=lambda promised: check_promise(promised, site.limits))
-    return await _push(context, await admit(context, made.number), made, before)
+    return await _push(context, await admit(context, made.number, control), made, before)
 
 
-async def push(context: PushContext, number: int, before: list[dict[str, Any]]) -> Correction:
-    """Push a stored proposal: everything that was checked when it was made is checked again, then as `correct`.
+async def push(context: PushContext, admission: Admission, before: list[dict[str, Any]]) -> Correction:
+    """Push a stored proposal that the gate let pass (`abbe.service.compensation.gate.admit`), then as `correct`.
 
     Parameters
     ----------
     context : PushContext
         Devices, store and machine; who stops it, and whether a person attends.
-    number : int
+    admission : Admission
         Of the proposal.
     before : list of dict
         Verification runs measured with the present table, as ``abbe-run/1``.
 
     Raises
     ------
-    StoreError
-        There is no such proposal, or its row was changed.
     TableRefused, TableMismatch, StillActive
         As of `correct`.
     Stopped, Aborted
         Asked for; the old table is in force.
     """
-    admission = await admit(context, number)
     proposed = admission.held.proposed
     context.progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
-    made = Made(number, proposed, await solved_again(context.store, context.site, proposed.campaign, proposed.base_tables))
+    made = Made(admission.held.number, proposed, await solved_again(context.store, context.site, proposed.campaign, proposed.base_tables))
     await context.control.gate()
     return await _push(context, admission, made, before)
 
@@ -146,7 +149,7 @@ async def _push(context: PushContext, admission: Admission, made: Made, before: 
         bar = BarPlaces(session, store, site, context.progress, f"{SIGN} {number}", PLACES, context.control)
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
-    work = _Correcting(context, held, misfit_mm, bar, old)
+    work = _Correcting(context, admission, misfit_mm, bar, old)
     wanted = WantedTable(proposed.tables, held.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
     pushed, after, decision = await _push_and_verify(work, wanted)
     bank = pushed.bank if decision.keep else pushed.previous_bank
@@ -170,8 +173,9 @@ class _Correcting:
     """Answers the push machine's questions about one proposal: are there reasons against it, goes the tool where it says, is it better?"""
 
     context: PushContext
-    held: HoldReason
+    admission: Admission
     drift_mm: float | None
+    """What the solution leaves of the newest run, which it has not seen."""
     bar: BarPlaces | None
     before: VerificationFigures
     read_before: PlaceReadings | None = None
@@ -180,13 +184,21 @@ class _Correcting:
     verified_as: str = ""
     pushing: Pushing | None = None
 
+    @property
+    def held(self) -> HoldReason:
+        """The proposal as it was admitted."""
+        return self.admission.held
+
+    def drifted(self) -> list[str]:
+        """Why the machine is not what was measured any more, by a run that was not known when the proposal was admitted."""
+        if self.drift_mm is None:
+            return [UNSEEN]
+        return [reason] if (reason := drift_reason(self.drift_mm, self.context.site.limits)) else []
+
     def reasons(self) -> list[str]:
-        """Everything against it; asked again by the machine of the push, with what the controller says of itself by then."""
-        drift = [] if self.drift_mm is not None else [UNSEEN]
-        # Decisions are read anew: a person may have rejected it while the ball-bar was read.
-        number, store = self.held.number, self.context.store
-        now = replace(self.held, rejections=tuple(store.proposals.rejections(number)), approvals=tuple(store.proposals.approvals(number)))
-        return [*now.reasons(self.drift_mm), *drift]
+        """Everything against it, asked by the push machine: decisions and time as they are by then."""
+        now = self.held.renewed(self.context.store, self.context.clock.utc().timestamp())
+        return [*now.reasons(self.drift_mm), *([UNSEEN] if self.drift_mm is None else [])]
 
     async def probe(self) -> Verdict:
         """Sign, axis and unit of this table, physically; the bar is taken out afterwards, for the verification mounts its own."""
@@ -214,12 +226,13 @@ class _Correcting:
 async def _push_and_verify(work: _Correcting, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:
     """Push, prove the sign, measure again, keep or go back. Whatever stops it takes the old table back."""
     context = work.context
-    if against := work.reasons():
-        raise NotAdmitted(against)
+    if drifted := work.drifted():  # before the ball-bar is read
+        raise TableRefused.because(drifted)
     questions = Questions(work.reasons, work.held.by, work.probe, work.verify, work.held.approval(context.clock))
     work.pushing = pushing = Pushing(
-        context.session.controller, context.store, context.site, attended=context.attended, control=context.control
-    )
+        context.session.controller, context.store, context.site,
+        level=work.admission.level, attended=context.attended, control=context.control,
+    )  # fmt: skip
     if work.bar is None:
         await context.control.gate()
         pushed = await pushing.bring(wanted, questions)

@@ -16,7 +16,7 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 LIMIT_S = 600.0
-"""How long a command waits if nobody says otherwise."""
+"""How long a command waits by default."""
 POLL_S, REMIND_S, AGAIN_S = 0.1, 30.0, 2.0
 """How often the controller is asked; how often a person is reminded; pause after a try that the controller did not let through."""
 
@@ -55,7 +55,7 @@ async def finish_when_safe(controller: TableController, store: Store, site: Site
         return None
     port = ControllerPort(controller, no_actors(), clock)
     end_s = clock.monotonic_s() + limit_s
-    told, remind_s = "", 0.0
+    said, remind_s = "", 0.0
     while True:
         why, pause_s = _closed(await port.execute(Operation(OperationKind.LOOK), ())), POLL_S
         if not why:
@@ -64,9 +64,9 @@ async def finish_when_safe(controller: TableController, store: Store, site: Site
             except StillActive as error:
                 why, pause_s = str(error), AGAIN_S
         now_s = clock.monotonic_s()
-        if why != told or now_s >= remind_s:
+        if why != said or now_s >= remind_s:
             say(f"AN UNVERIFIED TABLE IS ACTIVE. Waiting for the machine, {max(end_s - now_s, 0.0):.0f} s more: {why}")
-            told, remind_s = why, now_s + REMIND_S
+            said, remind_s = why, now_s + REMIND_S
         if now_s >= end_s:
             raise StillActive(f"the unverified table is STILL ACTIVE after {limit_s:.0f} s of waiting: {why}", READY)
         await clock.sleep(min(pause_s, end_s - now_s))

@@ -1,4 +1,4 @@
-"""The one gate before a table is measured for or pushed: everything that speaks against it, at once.
+"""The one gate before a table is measured for or pushed: all reasons against it, at once.
 
 `ready` asks what holds for any table of this control, `admit` everything of one proposal. A push takes the `Admission` and cannot
 begin without it; only `admit` makes one.
@@ -15,11 +15,12 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposal_checks import HoldReason, hold
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proved_levels import check_level
+from abbe.service.compensation.proved_levels import LevelStatus, check_level
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
 from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.errors import TableRefused
+from abbe.service.push.levels import Capabilities
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.validate import promise_reason
 from abbe.service.sequences.control import Control
@@ -27,14 +28,6 @@ from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-
-
-class NotAdmitted(TableRefused):
-    """The gate is closed: nothing was written. ``reasons``: everything that speaks against it."""
-
-    def __init__(self, reasons: Sequence[str], remedy: str = "") -> None:
-        super().__init__("; ".join(reasons), remedy or "nothing was written")
-        self.reasons = tuple(reasons)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,65 +63,88 @@ class PushContext:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A proposal that nothing speaks against, held against controller, approvals and limits as they were then."""
+    """The token of a push: a proposal that had no reason against it, with what its controller and people said then.
+
+    ``level``: capability level of the controller (`abbe.service.push.levels`). ``hint``: what has to be said about the control; empty:
+    nothing.
+    """
 
     held: HoldReason
+    level: int
     hint: str
-    """What has to be said about the control; empty: nothing."""
 
 
-async def ready(context: PushContext) -> str:
-    """Make sure that a table could be pushed into this control and verified; return what has to be said about the control.
+async def ready(context: PushContext) -> LevelStatus:
+    """Make sure that a table could be pushed into this control and verified; return what its commissioning has proved.
 
     Raises
     ------
-    NotAdmitted
+    TableRefused
         It could not: its tables were never proved, it allows no such push.
     AbbeError, DriverError
         As of `recover` and `check_devices`.
     """
-    hint, reasons, remedy = await _control(context)
-    if reasons:
-        raise NotAdmitted(reasons, remedy)
-    return hint
+    level, refused = await _control(context)
+    if refused:
+        raise _refused(refused)
+    return level
 
 
-async def admit(context: PushContext, number: int) -> Admission:
-    """Let a stored proposal pass, if nothing speaks against it now. Nothing is written.
+async def admit(context: PushContext, number: int, control: LevelStatus | None = None) -> Admission:
+    """Let a stored proposal pass if there is no reason against it now. Nothing is written.
+
+    What can change until the table is written is asked once more by the push machine (`abbe.service.push.machine`): bank and generation
+    of the table in force, the decisions of people, the age of the measurement.
+
+    Parameters
+    ----------
+    context : PushContext
+        Devices, store and machine.
+    number : int
+        Of the proposal.
+    control : LevelStatus, optional
+        From `ready`, where that was asked before; default: it is asked now.
 
     Raises
     ------
-    NotAdmitted
+    TableRefused
         All reasons against it.
     StoreError
         There is no such proposal, or its row was changed.
     AbbeError, DriverError
         As of `ready`.
     """
-    hint, reasons, remedy = await _control(context)
+    level, refused = (control, []) if control is not None else await _control(context)
     proposed = await asyncio.to_thread(load, context.store, number)
     held = await hold(context.session.controller, context.store, context.site, number, proposed, context.clock, attended=context.attended)
-    reasons += held.reasons()
-    if reasons:
-        raise NotAdmitted(reasons, remedy)
-    return Admission(held, hint)
+    reasons = held.reasons()
+    if refused or reasons:
+        raise _refused(refused, reasons)
+    return Admission(held, level.level, level.hint)
 
 
-async def _control(context: PushContext) -> tuple[str, list[str], str]:
-    """What an earlier push left is finished first, and every device that a verification needs has answered."""
+async def _control(context: PushContext) -> tuple[LevelStatus, list[TableRefused]]:
+    """What the control was proved to do, and why it takes no table. What an earlier push left is finished first, and every device that a
+    verification needs has answered.
+    """
     session, store, site = context.session, context.store, context.site
-    await recover(session.controller, store, site)
+    if not session.recovered:
+        await recover(session.controller, store, site)
     await check_devices(session, verification(site.machine, rate_hz=context.rate_hz), air=site.watching.air_c is not None)
-    hint, refused = "", []
+    level, refused = LevelStatus(Capabilities(), ""), []
     try:
         await check_commissioned(session.controller, store, site)
     except TableRefused as no:
         refused.append(no)
     try:
-        hint = await check_level(session.controller, store, site, attended=context.attended)
+        level = await check_level(session.controller, store, site, attended=context.attended)
     except TableRefused as no:
         refused.append(no)
-    return hint, [no.detail for no in refused], refused[0].remedy if refused else ""
+    return level, refused
+
+
+def _refused(refused: Sequence[TableRefused], reasons: Sequence[str] = ()) -> TableRefused:
+    return TableRefused.because([*(no.detail for no in refused), *reasons], refused[0].remedy if refused else "nothing was written")
 
 
 def check_promise(predicted: Predicted, limits: PushLimits) -> None:

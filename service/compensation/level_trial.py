@@ -1,17 +1,29 @@
-"""The bench of `commission_levels`: tries one thing on a controller and notes whether it was refused."""
+"""The bench of `commission_levels`: tries one thing on a controller and notes whether it was refused.
+
+`while_moving` asks whether it refuses an activation while an axis moves: one slow move of a few millimetres, up if there is room, and back.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable
 from dataclasses import dataclass, field
 
-from abbe.drivers.api import BankState, CompStatus, Controller
+from abbe.drivers.api import BankState, CompStatus, Controller, ControllerStatus, Point
 from abbe.drivers.errors import DeviceFault, Refused
+from abbe.drivers.links.shielded import run_to_end
+from abbe.models.machine import AXES
 from abbe.service.clock import Clock
+from abbe.service.sequences.interlocks import tripped
+from abbe.service.site import Site
 from abbe.service.tables.base_table import Base
 
 LEASE_MS = 60_000
 ID_WORD = 4
+MOVE_MM, FEED_MM_MIN = 3.0, 60.0
+TRIES = 6
+MOVE_LIMIT_S, MOVES_WITHIN_S, POLL_S = 60.0, 5.0, 0.01
+FLAG = "interlocks"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +64,7 @@ class Trial:
         self.shown.append(Shown(flag, True, what))
 
     def fail(self, flag: str, what: str) -> None:
-        """Something speaks against a flag."""
+        """Note a reason against a flag."""
         self.shown.append(Shown(flag, False, what))
 
     def judge(self, flag: str, ok: bool, good: str, bad: str) -> None:
@@ -122,3 +134,75 @@ class Trial:
             owner=self.owner if owner is None else owner,
         )
         return await self.accepts(call)
+
+
+async def while_moving(t: Trial, site: Site) -> None:
+    """Try the right activation while an axis moves, there or back; in the end the axis stands where it was.
+
+    An answer that comes when the axis has arrived shows nothing: then it is tried again on the way back, `TRIES` times in all.
+    """
+    status = await t.controller.status()
+    trouble = tripped(status)
+    if trouble is not None:
+        t.fail(FLAG, f"it could not be tried, no axis may move: {trouble.detail}")
+        return
+    x, y, z = (round(v, 5) for v in status.position_mm)
+    home, there, why_not = (x, y, z), away(site, (x, y, z)), ""
+    try:
+        for k in range(TRIES):
+            why_not = await _on_the_way(t, home if k % 2 else there)
+            if not why_not:
+                break
+        else:
+            t.fail(FLAG, f"it could not be tried: {why_not}")
+        await t.controller.move(home, feed_mm_min=10.0 * FEED_MM_MIN, timeout_s=MOVE_LIMIT_S)
+    except (Refused, DeviceFault) as error:
+        t.fail(FLAG, f"the axis did not move as it was told: {error.detail}")
+
+
+async def _on_the_way(t: Trial, target: Point) -> str:
+    """One slow move, and what happens to an activation meanwhile; why nothing was shown, empty when something was."""
+    now = await t.sealed()
+    move = asyncio.ensure_future(t.controller.move(target, feed_mm_min=FEED_MM_MIN, timeout_s=MOVE_LIMIT_S))
+    try:
+        if not await _moves(t, move):
+            await move
+            return "the axis was not seen moving"
+        why = await t.activate(now)
+        still = (await t.controller.status()).moving
+        await move
+        if not still:  # taken or refused: whether it still moved then is not known
+            return "the axis had arrived before the answer"
+        t.refused(FLAG, why, "an activation while an axis moves")
+    finally:
+        await run_to_end(_stop(t, move))
+    return ""
+
+
+def away(site: Site, home: Point) -> Point:
+    """Where to move: along the upright axis in its positive sense, where the tool goes away from the table; down where it is at its top."""
+    axis = AXES.index(str(site.doc.get("vertical_axis", "Z")))
+    target = list(home)
+    room = float(site.machine.stroke_mm[axis, 1]) - home[axis]
+    target[axis] = round(home[axis] + (MOVE_MM if room >= MOVE_MM else -MOVE_MM), 5)
+    return target[0], target[1], target[2]
+
+
+async def _moves(t: Trial, move: asyncio.Future[ControllerStatus]) -> bool:
+    end_s = t.clock.monotonic_s() + MOVES_WITHIN_S
+    while not move.done() and t.clock.monotonic_s() < end_s:
+        if (await t.controller.status()).moving:
+            return True
+        await t.clock.sleep(POLL_S)
+    return False
+
+
+async def _stop(t: Trial, move: asyncio.Future[ControllerStatus]) -> None:
+    """Broken off in the middle: nothing moves on, and nothing waits for a release of the feed."""
+    if move.done():
+        if not move.cancelled():
+            move.exception()  # the one who broke off says why
+        return
+    move.cancel()
+    await asyncio.wait([move])
+    await t.controller.abort()

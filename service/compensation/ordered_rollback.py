@@ -16,8 +16,7 @@ from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED
-from abbe.service.tables.table_history import offered
+from abbe.service.tables.push_journal import STOPPED, JournalView
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +29,7 @@ class BackOrder:
 
 
 async def ordered_rollback(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> JobOutcome:
-    """Take the table back. What is returned is what was heard; which table is in force says the journal (`push_outcome.ordered`).
+    """Take the table back. What is returned is what was heard; which table is in force says the journal (`JournalView.of_order`).
 
     A refusal is an outcome, not an error: another process has the machine, the controller holds what the journal does not know, or the
     journal moved on since the order was given.
@@ -60,8 +59,8 @@ async def _heard(controller: TableController, store: Store, site: Site, order: B
         return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
     if back is None:
         return JobOutcome("refused", "the table from before is in force already; nothing was written")
-    told = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
-    return JobOutcome("kept", f"{told}; the machine is unverified now: run a quick check")
+    text = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
+    return JobOutcome("kept", f"{text}; the machine is unverified now: run a quick check")
 
 
 def check_unchanged(store: Store, machine: str, order: BackOrder, control: str = "") -> None:
@@ -72,7 +71,7 @@ def check_unchanged(store: Store, machine: str, order: BackOrder, control: str =
     TableRefused
         It was, or nothing can be taken back any more.
     """
-    now = offered(store, machine, control)
+    now = JournalView.read(store, machine, control).offer()
     if (now.push, now.crc) != (order.push, order.crc):
         raise TableRefused(
             f"the table in force is {now.crc:08X} of push {now.push}, ordered back was {order.crc:08X} of push {order.push}",

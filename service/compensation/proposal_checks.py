@@ -1,11 +1,11 @@
-"""What speaks against a stored proposal now: everything that was true when it was made is asked again before a register is written."""
+"""Reasons against a stored proposal now: all that was true when it was made is asked again before a register is written."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import Any
 
 from abbe.drivers.api import TableController
@@ -14,7 +14,6 @@ from abbe.service.compensation.candidates import scene_of, until_s
 from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.compensation.proposals import by_whom, login
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableRefused
 from abbe.service.push.candidate import Candidate, CandidateContext, EvidenceSeal
 from abbe.service.push.operations import Approval
@@ -28,7 +27,7 @@ from abbe.service.tables.base_table import Base, read_base
 class HoldReason:
     """A proposal held against its machine, its controller and its approvals as they are now.
 
-    ``attended``: whoever pushes it is a person; else an approval is needed even where two people are not demanded.
+    ``attended``: a person pushes it; else an approval is needed even where two people are not demanded.
     """
 
     number: int
@@ -59,6 +58,11 @@ class HoldReason:
             found = [f"PROPOSED: with {len(self.proposed.reasons)} reasons against it, which are gone now: propose again"]
         return found
 
+    def renewed(self, store: Store, now_s: float) -> HoldReason:
+        """The same with the decisions of people and the time as they are now; the controller is as it was read."""
+        approvals, rejections = tuple(store.proposals.approvals(self.number)), tuple(store.proposals.rejections(self.number))
+        return replace(self, approvals=approvals, rejections=rejections, scene=replace(self.scene, now_s=now_s))
+
     def _bound(self) -> Iterator[str]:
         p, now = self.proposed, self.base
         if p.machine != self.site.doc:
@@ -86,7 +90,7 @@ class HoldReason:
             yield f"APPROVAL: {why}"
 
     def approval(self, clock: Clock) -> Approval | None:
-        """The approval that the push machine checks against what it has read; None where whoever orders the push approves it."""
+        """The approval that the push machine checks against what it has read; None where the one who orders the push approves it."""
         if not self._needs_approval:
             return None
         found, why = valid_approval(self.proposed, self.approvals, clock.utc().timestamp(), two_people=self.site.two_people)
@@ -112,7 +116,7 @@ def valid_approval(
     """The last approval that holds now; else None and why there is none."""
     why = "nobody has approved it: abbe comp approve"
     for row in reversed(approvals):
-        if two_people and _same(row.name, proposed.by):
+        if two_people and same_person(row.name, proposed.by):
             why = f"{row.name} proposed it and cannot be the one who approves it"
         elif row.digest != proposed.binding(row.expiry):
             why = f"what {row.name} approved is not this table on this base under these limits"
@@ -123,53 +127,8 @@ def valid_approval(
     return None, why
 
 
-def approve(
-    store: Store, number: int, proposed: Proposed, name: str, hours: float, clock: Clock, account: str | None = None
-) -> ProposalApproval:
-    """Approve a proposal: exactly this table on exactly this base, for this machine, under these limits, for some hours.
-
-    The approval ends at the latest when the measurement becomes too old.
-
-    Parameters
-    ----------
-    account : str, optional
-        By which account; of this command line where nothing is said.
-
-    Raises
-    ------
-    TableRefused
-        There are reasons against it, its measurement is too old, or the approver is the proposer where two people are needed.
-    """
-    now = clock.utc()
-    if proposed.reasons:
-        raise TableRefused(f"proposal {number} has reasons against it and cannot be approved: {proposed.reasons[0]}", "propose again")
-    left_s = proposed.valid_until_s - now.timestamp()
-    if left_s <= 0.0:
-        raise TableRefused(f"the measurement of proposal {number} is older than {proposed.limits.age_h:g} h", "measure again")
-    if proposed.two_people and _same(name, proposed.by):
-        raise TableRefused(f"{name} proposed it: this machine needs a second person to approve", "let somebody else approve it")
-    expiry = utc_text(now + timedelta(seconds=min(hours * 3600.0, left_s)))
-    store.proposals.approve(
-        ProposalApproval(proposal_id=number, name=name, login=account or login(), digest=proposed.binding(expiry), expiry=expiry)
-    )
-    return store.proposals.approvals(number)[-1]
-
-
-def reject(store: Store, number: int, name: str, reason: str, account: str | None = None) -> ProposalRejection:
-    """Reject a proposal for good: it cannot be approved or pushed any more, whatever approvals it has. Tables have to be proposed anew.
-
-    Raises
-    ------
-    TableRefused
-        No reason is given.
-    """
-    if not reason.strip():
-        raise TableRefused(f"proposal {number} is not rejected without a reason", "say why; the proposer has to know")
-    store.proposals.reject(ProposalRejection(proposal_id=number, name=name, login=account or login(), reason=reason.strip()))
-    return store.proposals.rejections(number)[-1]
-
-
-def _same(one: str, other: str) -> bool:
+def same_person(one: str, other: str) -> bool:
+    """Whether two names are the same person's."""
     return one.strip().casefold() == other.strip().casefold()
 
 

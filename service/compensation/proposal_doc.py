@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
 
 from abbe.drivers.tables import encode
 from abbe.models.arrays import F2
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.errors import StoreError
-from abbe.service.push.approval import approval_digest
-from abbe.service.push.candidate import Candidate, Column, EvidenceSeal, TableEvidence
-from abbe.service.push.entries import Doc, canonical
+from abbe.service.push.candidate import Candidate
+from abbe.service.push.entries import Doc, approval_digest, canonical
 from abbe.service.push.limits import PushLimits
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image, tables_from_image
@@ -28,10 +28,14 @@ FORMAT = "abbe-proposal/1"
 class BaseMark:
     """The table in force when it was proposed, and the controller's generation and boot id then."""
 
-    image: bytes
+    image: Annotated[bytes, BeforeValidator(bytes.fromhex)]
     bank: int
     gen: int
     boot: int
+
+
+def _arrays(lists: object) -> tuple[F2, ...]:
+    return tuple(np.array(one, dtype=np.float64) for one in lists) if isinstance(lists, list | tuple) else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,16 +63,17 @@ class Proposed:
     by, utc : str
         Who proposed it (account), when.
     reasons : tuple of str
-        What spoke against it then.
+        The reasons against it then.
     not_for_tables : tuple of str
         Known effects that no table takes out.
     """
 
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
     machine: Doc
     campaign: str
-    solution_id: int
+    solution_id: Annotated[int, Field(alias="solution")]
     candidate: Candidate
-    u_mm: tuple[F2, F2, F2]
+    u_mm: Annotated[tuple[F2, F2, F2], BeforeValidator(_arrays)]
     base: BaseMark
     image_id: int
     limits: PushLimits
@@ -109,8 +114,8 @@ class Proposed:
 
     def binding(self, expiry: str) -> str:
         """What an approval until ``expiry`` binds: exactly this table on exactly this base, for this machine, under these limits."""
-        known = {"image": self.image.hex(), "base_image": self.base.image.hex(), "machine": self.candidate.machine}
-        return approval_digest(known | {"limits": self.limits.digest()}, expiry)
+        machine, limits = self.candidate.machine, self.limits.digest()
+        return approval_digest(self.image, base_image=self.base.image, machine=machine, limits=limits, expiry=expiry)
 
 
 def digest_of_doc(doc: Doc) -> str:
@@ -150,40 +155,11 @@ def _plain(value: Any) -> Any:
 
 
 def proposed_from(doc: Doc) -> Proposed:
-    """Read a document that `doc_of` wrote; KeyError, TypeError or ValueError where it is none."""
-    x, y, z = (np.array(u, dtype=np.float64) for u in doc["u_mm"])
-    b = doc["base"]
-    limits = {f.name: doc["limits"][f.name] for f in fields(PushLimits)}
-    low, high = limits["temperature_c"]
-    return Proposed(
-        dict(doc["machine"]), str(doc["campaign"]), int(doc["solution"]), _candidate(doc["candidate"]), (x, y, z),
-        BaseMark(bytes.fromhex(b["image"]), int(b["bank"]), int(b["gen"]), int(b["boot"])), int(doc["image_id"]),
-        PushLimits(**(limits | {"temperature_c": (low, high)})), bool(doc["two_people"]), str(doc["by"]), str(doc["utc"]),
-        tuple(doc["reasons"]), tuple(doc["not_for_tables"]),
-    )  # fmt: skip
+    """Read a document that `doc_of` wrote; ValueError where it is none."""
+    return _PROPOSED.validate_python(doc)
 
 
-def _column(doc: Doc) -> Column:
-    def curve(key: str) -> tuple[float, ...]:
-        return tuple(float(v) for v in doc[key])
-
-    return Column(
-        str(doc["moved"]), str(doc["corrected"]), curve("position_mm"), curve("correction_mm"), curve("left_mm"), curve("reverse_mm"),
-        float(doc["reversal_mm"]),
-    )  # fmt: skip
-
-
-def _candidate(doc: Doc) -> Candidate:
-    columns = tuple(_column(c) for c in doc["columns"])
-    e = doc["evidence"]
-    low, high = e["temperature_c"]
-    evidence = TableEvidence(
-        int(e["run_count"]), float(e["ended_s"]), (float(low), float(high)), float(e["drift_mm"]), float(e["u_mm"]), float(e["before_mm"]),
-        float(e["after_mm"]), str(e["machine_mark"]), tuple(float(s) for s in e["calibrated_until_s"]),
-        None if e.get("last_s") is None else float(e["last_s"]),
-    )  # fmt: skip
-    head = (doc["machine"], doc["map_version"], doc["lsb_nm"], doc["length_unit"])
-    return Candidate(*head, columns, doc["base_crc"], evidence, doc["digest"], EvidenceSeal(**doc["seal"]))
+_PROPOSED = TypeAdapter(Proposed)
 
 
 def load(store: Store, number: int) -> Proposed:
@@ -198,7 +174,7 @@ def load(store: Store, number: int) -> Proposed:
     try:
         sound = digest_of_doc(record.doc) == record.digest
         proposed = proposed_from(record.doc) if sound else None
-    except (KeyError, TypeError, ValueError):
+    except (TypeError, ValueError):
         proposed = None
     if proposed is None or (record.machine, record.solution_id) != (proposed.candidate.machine, proposed.solution_id):
         raise StoreError(f"proposal {number} in {store.url} was changed after it was stored: its content is not that of its digest",

@@ -1,4 +1,4 @@
-"""From an identification campaign to a stored proposal: what was measured with the table in force, solved, and what speaks against it.
+"""From an identification campaign to a stored proposal: what was measured with the table in force, solved, with the reasons against it.
 
 A machine that is measured while a table is active shows what that table has left. So the table that was active is read from the controller,
 must be the one all runs were measured with, and the new table is the old one plus what the runs still show. Nothing is written to it.
@@ -102,7 +102,7 @@ async def make(
     agree: Callable[[Predicted], None] = lambda _: None,
     by: str = "",
 ) -> Made:
-    """Solve, and store what follows as a proposal, with every reason that speaks against it now.
+    """Solve, and store what follows as a proposal, with every reason against it now.
 
     ``agree``: sees what is promised; what it raises is raised, and nothing is stored. ``by``: who proposes; default: whose process it is.
     """
@@ -203,7 +203,7 @@ def check_certificates(site: Site) -> None:
 
 
 def login() -> str:
-    """The account of whoever sits at this command line."""
+    """The account of the user of this command line."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a service account without a name

@@ -1,7 +1,7 @@
 """What a machine's controller was proved to do for a safe push, as the store keeps it beside the proof of its sign.
 
 A proof belongs to one controller with one firmware: after another was put in, nothing is proved any more. What was never proved counts
-as far as the protocol's status block shows it, and that is never enough for a push that nobody attends.
+as far as the protocol's status block shows it, and that is never enough for an unattended push.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ async def _visible(controller: Identity) -> Capabilities:
     return Capabilities(two_banks=banks, generation=now.gen != 0, boot_id=now.boot_id != 0)
 
 
-async def check_level(controller: Identity, store: Store, site: Site, *, attended: bool = True) -> str:
-    """Refuse before anything is measured for a table that could not be pushed; gives the hint that has to be said.
+async def check_level(controller: Identity, store: Store, site: Site, *, attended: bool = True) -> LevelStatus:
+    """Refuse before anything is measured for a table that could not be pushed; return what counts for a push.
 
     Raises
     ------
@@ -78,4 +78,4 @@ async def check_level(controller: Identity, store: Store, site: Site, *, attende
     no = objection(found.level, attended=attended)
     if no:
         raise TableRefused(no, "nothing was written")
-    return found.hint
+    return found

@@ -1,4 +1,4 @@
-"""A proposal that a person approved, pushed by the service where the machine file says so: the same one door, and nobody attends.
+"""A proposal that a person approved, pushed by the service where the machine file says so: through the same gate, unattended.
 
 Nobody attends means: the control was proved to level 3, the approval of a person holds (also where no second one is demanded), the last
 push is long enough ago, and the table has not walked away. The verification before is measured now.
@@ -30,14 +30,14 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED
+from abbe.service.tables.push_journal import STOPPED
 from abbe.service.verification.alarm_states import NO_ALARM, AlarmKind
 
 WAIT_S = 600.0
-"""So long a machine that does not let the old table back at once is watched; after that the service tries again and again, and says so."""
+"""How long to watch a machine that does not let the old table back at once; then the service retries, and reports it."""
 
 Begun = Callable[[], Awaitable[None]]
-"""Told, at least once, when the machine is ours and the try counts."""
+"""Called, at least once, when the machine is ours and the try counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Approved:
 
 @dataclass(frozen=True, slots=True)
 class PushOrder:
-    """One try: which proposal, whom it is told that it began, who hears of its progress, and who may stop it."""
+    """One try: which proposal, what to call when it has begun, who hears of its progress, and who may stop it."""
 
     proposal: int
     begun: Begun
@@ -62,7 +62,7 @@ class PushOrder:
 def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord], now_s: float) -> Approved | None:
     """The proposal that was approved last, if the service has not tried it yet with this approval; None: nothing waits.
 
-    Older ones that are approved as well are not tried in its place: whoever approved the last one wanted that.
+    Older approved ones are not tried in its place: the last approval is the one that is meant.
     """
     tried = {e.doc.get("approval") for e in entries if e.kind == AlarmKind.PUSHING}
     asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
@@ -72,7 +72,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
     approval, number = max(given)
     try:
         word = proposal_status(store, number, load(store, number), now_s).word
-    except StoreError:  # a row that was changed: it is told where it is looked at, and never pushed
+    except StoreError:  # a row that was changed: its screen says so, and it is never pushed
         return None
     if word == "approved" and approval not in tried:
         return Approved(number, approval, asked.get(number, NO_ALARM))
@@ -82,7 +82,7 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
 async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Clock, rate_hz: int = 100) -> JobOutcome:
     """Verify with the table in force, push, prove, verify again; keep or go back. A refusal is an outcome, not an error.
 
-    What is returned is what was heard; which table is in force says the journal (`push_outcome.by_journal`).
+    What is returned is what was heard; which table is in force says the journal (`JournalView.of_proposal`).
 
     Raises
     ------
@@ -117,8 +117,8 @@ async def _heard(context: PushContext, order: PushOrder) -> JobOutcome:
 
 async def _pushed(context: PushContext, order: PushOrder) -> JobOutcome:
     context.control.now(State.RUNNING)
-    await admit(context, order.proposal)  # before anything is measured for it
-    done = await push(context, order.proposal, await _before(context, order))
+    admission = await admit(context, order.proposal)  # before anything is measured for it
+    done = await push(context, admission, await _before(context, order))
     return JobOutcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
 
 

@@ -1,6 +1,6 @@
 """One table's way into a controller, as a job asks for it: the push machine (`abbe.service.push`) with this job's questions and errors.
 
-The machine runs in a task of its own: whoever is cancelled meanwhile waits until nothing unverified is in force, and is cancelled then.
+The machine runs in a task of its own: a job that is cancelled meanwhile waits until nothing unverified is in force, and ends then.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from abbe.service.domain.owner import this_process
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
 from abbe.service.push.adapter import ControllerPort, PushActors
-from abbe.service.push.approval import approval_digest
 from abbe.service.push.book import StoreBook
 from abbe.service.push.entries import Doc, Journal, facts
 from abbe.service.push.execute import Ended
@@ -36,16 +35,16 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import table_image
-from abbe.service.tables.push_history import STILL_ACTIVE, operator_needed, push_log
+from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed, push_log
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
 NOT_TO_BE_TRUSTED = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"
 PERHAPS = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
 AGAIN_S = 2.0
-"""So long after a push that was given up although its activation had been sent, the controller is asked once more what is in force."""
+"""How long after a push that was given up after its activation was sent the controller is asked again what is in force."""
 STILL_S, STILL_POLL_S, STILL_LIMIT_S = 1.2, 0.05, 15.0
-"""The axes have to stand for so long before a table may change; how often that is asked, and for how long."""
+"""How long the axes have to stand before a table may change; how often that is asked, and for how long."""
 
 _under_way: set[tuple[str, str]] = set()
 """Controls into which this process pushes now, by database and control (or name, where no address is given)."""
@@ -83,7 +82,7 @@ class Questions:
 
     ``validate``: reasons against the table, without touching the controller; ``approved_by``: who agreed to it. ``probe`` and ``verify``
     move the machine; what they raise leads back like a no, and is raised again afterwards. ``approval``: given before, for exactly this
-    image on exactly this base; None: whoever ordered the push approves it.
+    image on exactly this base; None: the one who ordered the push approves it.
     """
 
     validate: Callable[[], list[str]]
@@ -155,7 +154,7 @@ class Pushing:
         if key in _under_way:
             raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
         _under_way.add(key)
-        # First nobody can pause any more, then a pause of before is heard: none gets in between and holds what is in force unverified.
+        # First pauses are closed, then an earlier one is waited for: none can come between and hold an unverified table in force.
         self.control.hurry = "a table that nobody has verified may be in force: stop it, or let it end"
         try:
             await self.control.gate()
@@ -230,10 +229,10 @@ class Pushing:
         await self.clock.sleep(AGAIN_S)
         with suppress(DriverError):  # nothing was activated as far as the controller said; the next command looks again
             now = await self.controller.comp_status()
-            if now.bank_crc[now.active_bank] == known["crc"] != known["base_crc"]:
-                said = f"push {ended.journal[-1].push} was given up ({known.get('why', '')})"
+            if now.bank_crc[now.active_bank] == known.crc != known.base_crc:
+                said = f"push {ended.journal[-1].push} was given up ({known.why})"
                 why = f"{said}, and the control made its table active all the same"
-                raise TableMismatch(f"{why}: {STILL_ACTIVE} (CRC {known['crc']:08X})", NOT_TO_BE_TRUSTED)
+                raise TableMismatch(f"{why}: {STILL_ACTIVE} (CRC {known.crc:08X})", NOT_TO_BE_TRUSTED)
 
     def _told_to_stop(self) -> str:
         return self._stop or ("stopped by a person" if self.control.stopping or self.control.aborting else "")
@@ -251,9 +250,9 @@ class Pushing:
     def _people(self, wanted: WantedTable | WantedAgain, questions: Questions) -> PushActors:
         async def validate(journal: Journal) -> list[str]:
             known = facts(journal)
-            if known["base_crc"] != wanted.base.crc or bytes.fromhex(known["base_image"]) != wanted.base.image:
+            if known.base_crc != wanted.base.crc or known.base_image != wanted.base.image:
                 return ["BASE: the active table is not the one that was in force while this one was made"]
-            if (known["boot"], known["gen"]) != (wanted.base.status.boot_id, wanted.base.status.gen):
+            if (known.boot, known.gen) != (wanted.base.status.boot_id, wanted.base.status.gen):
                 return ["GENERATION: the controller restarted, or somebody wrote into a bank, since the base was read"]
             return questions.validate()
 
@@ -261,7 +260,7 @@ class Pushing:
             if questions.approval is not None:
                 return questions.approval
             expiry = (self.clock.utc() + timedelta(seconds=APPROVED_S)).isoformat(timespec="seconds")
-            digest = approval_digest(facts(journal), expiry)
+            digest = facts(journal).binding(expiry)
             return Approval(digest, questions.approved_by, expiry, self.clock.monotonic_s() + APPROVED_S)
 
         async def probe(journal: Journal) -> Verdict:
@@ -306,7 +305,7 @@ class Pushing:
             self._notes += getattr(error, "__notes__", [])
 
     def _outcome(self, ended: Ended) -> PushResult:
-        """What a job hears, with everything that its own error was told on its way."""
+        """What a job hears, with all notes of its own error."""
         try:
             return self._pushed(ended)
         except AbbeError as error:
@@ -318,7 +317,7 @@ class Pushing:
     def _pushed(self, ended: Ended) -> PushResult:
         """What a job hears."""
         known = facts(ended.journal)
-        why = str(known.get("why", ended.why))
+        why = known.why or ended.why
         detail = str(self._error) if self._error is not None else why
         if ended.state is not None and not ended.settled and ended.state is not PushState.ROLLBACK_PENDING:
             raise StillActive(f"{detail}: {ended.why}", MAKE_READY) from self._error
@@ -328,16 +327,15 @@ class Pushing:
                     raise self._error
                 last = ended.journal[-1]
                 return PushResult(
-                    last.push, int(known["table"]), int(known["target"]), int(known["crc"]), int(known["base_bank"]),
-                    int(known["base_crc"]), last.state is PushState.KEEP, why, push_log(ended.journal),
+                    last.push, known.table, known.target, known.crc, known.base_bank,
+                    known.base_crc, last.state is PushState.KEEP, why, push_log(ended.journal),
                 )  # fmt: skip
             case PushState.REJECTED:
-                reasons = list(known.get("reasons", []))
-                raise TableRefused("; ".join(reasons), "nothing was written")
+                raise TableRefused.because(known.reasons)
             case PushState.OPERATOR:
                 raise operator_needed(ended.journal, detail) from self._error
             case PushState.ROLLBACK_PENDING:
-                raise StillActive(f"{detail}; {STILL_ACTIVE} ({known.get('pending', '')})", MAKE_READY) from self._error
+                raise StillActive(f"{detail}; {STILL_ACTIVE} ({known.pending})", MAKE_READY) from self._error
         raise PushNotBegun(f"the table was not brought into force: {why}", "the old table is in force; look at the cause, then push again")
 
 
@@ -350,7 +348,7 @@ def _image(wanted: WantedTable | WantedAgain) -> tuple[bytes, str]:
 
 
 def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
-    """What whoever stopped it has to know."""
+    """What the one who stopped it has to know."""
     if ended is None:
         return f"{failed}; {'; '.join(getattr(failed, '__notes__', []))}"
     if ended.state is PushState.KEEP:
@@ -359,7 +357,7 @@ def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
         error = operator_needed(ended.journal)
         return str(error)
     if not ended.settled:
-        return f"{STILL_ACTIVE}: {facts(ended.journal).get('pending', ended.why)}; {MAKE_READY}"
+        return f"{STILL_ACTIVE}: {facts(ended.journal).pending or ended.why}; {MAKE_READY}"
     return "the old table is in force"
 
 

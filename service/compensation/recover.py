@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from abbe.drivers.api import BankState, TableController
+from abbe.drivers.api import BankState, Identity, TableController
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.capture.recovery import recover_segments
@@ -19,10 +19,9 @@ from abbe.service.push.entries import WORD, Journal, facts
 from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_history import operator_needed
+from abbe.service.tables.push_journal import operator_needed
 from abbe.service.tables.table_gate import accept_strange, check_in_force, said, vouch
 from abbe.service.tables.unverified import KnownState, known_tables
-from abbe.service.tables.whose_push import check_own, is_own
 
 READY = "make the machine ready (interlocks, link), then start again"
 
@@ -35,7 +34,7 @@ async def recover(controller: TableController, store: Store, site: Site, *, acce
     Parameters
     ----------
     accept_by : str
-        Who vouches for a table in force that this database did not push; empty: nobody does.
+        Who vouches for a table in force that this database did not push; empty: no person does.
 
     Raises
     ------
@@ -47,7 +46,7 @@ async def recover(controller: TableController, store: Store, site: Site, *, acce
         The controller holds a table that nothing has verified, under whatever name it was pushed, or that this database did not push: a
         person must look (`abbe accept-table`).
     StoreError, CaptureFault
-        The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only told.
+        The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only reported.
     """
     await store.write(store.machines.add, site.name, site.doc)  # the machine as it is described now
     # First: whatever is wrong with a segment, no unverified table stays active.
@@ -72,15 +71,15 @@ async def finish_push(
     MachineInUse, StillActive, TableMismatch
         As of `recover`.
     """
-    told = await _ended(controller, store, site, clock or SystemClock())
+    done = await _ended(controller, store, site, clock or SystemClock())
     try:
         accepted = await accept_strange(controller, store, site, accept_by) if accept_by else None
         await check_in_force(controller, store, site)
     except (AbbeError, DriverError) as error:
-        if told:
-            error.add_note(told)
+        if done:
+            error.add_note(done)
         raise
-    return "; ".join(filter(None, (told, accepted))) or None
+    return "; ".join(filter(None, (done, accepted))) or None
 
 
 async def _ended(controller: TableController, store: Store, site: Site, clock: Clock) -> str | None:
@@ -101,7 +100,7 @@ async def _ended(controller: TableController, store: Store, site: Site, clock: C
 
 def _told(ended: execute.Ended, before: PushState) -> str | None:
     known, number = facts(ended.journal), ended.journal[-1].push
-    why = known.get("why", "interrupted before verification")
+    why = known.why or "interrupted before verification"
     match ended.state:
         case state if state is before and state in TERMINAL:
             return None
@@ -111,7 +110,7 @@ def _told(ended: execute.Ended, before: PushState) -> str | None:
             return f"push {number} was not finished ({why}); the old table is in force"
         case PushState.OPERATOR:
             raise operator_needed(ended.journal)
-    raise StillActive(f"the unverified table of push {number} is still active: {known.get('pending', ended.why)}", READY)
+    raise StillActive(f"the unverified table of push {number} is still active: {known.pending or ended.why}", READY)
 
 
 async def accept(controller: TableController, store: Store, site: Site, by: str = "a person") -> str:
@@ -167,12 +166,12 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
         book = await _given_to_a_person(store, site, other_chain)
         await book.append(await book.entries(), PushState.ACCEPTED, said(now, by))
     await vouch(store, site, now, by)
-    told = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
+    text = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
     push = known.unverified.get(crc)
     if push is None:
-        return told
+        return text
     name = "" if push.chain == chain and push.machine == site.name else f" of machine {push.machine!r}"
-    return f"{told}; it is that of push {push.push}{name}, which no measurement has verified"
+    return f"{text}; it is that of push {push.push}{name}, which no measurement has verified"
 
 
 def _open_with(crc: int, known: KnownState) -> set[str]:
@@ -197,8 +196,57 @@ def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
     last = journal[-1]
     if last.state in TERMINAL or last.state is PushState.ROLLBACK_PENDING:
         return
-    process = facts(journal).get("process")
+    process = facts(journal).process
     owner = Owner(**process) if process else None
     ours = owner == this_process()
     if owner is not None and (pushes_here(store, site) if ours else not owner.is_gone()):
         raise MachineInUse(f"push {last.push} is under way (process {owner.pid})", "wait until it has ended")
+
+
+async def is_own(controller: Identity, site: Site, journal: Journal) -> bool:
+    """Whether a push was begun on this control, by what proves it: address and name, address and start of the control, or its table.
+
+    A table carries a number drawn by lot, so the table of the push in force is the proof that this is its control. The table from before
+    the push proves nothing: two controls as they came have the same one.
+
+    Parameters
+    ----------
+    controller : Identity
+        Only read, and only where address and name do not match.
+    site : Site
+        The machine as its file names it now.
+    journal : tuple of Entry
+        The push.
+    """
+    known = facts(journal)
+    here = _address(journal) in ("", site.control)
+    if here and _name(journal, site) == site.name:
+        return True
+    now = await controller.comp_status()
+    return (here and now.boot_id == known.boot) or now.bank_crc[now.active_bank] == known.crc
+
+
+async def check_own(controller: Identity, site: Site, journal: Journal) -> None:
+    """Refuse to end a push of which nothing proves that it was begun on this control. Nothing is written.
+
+    Raises
+    ------
+    TableMismatch
+        Which push, where it was begun, and what a person can do.
+    """
+    if await is_own(controller, site, journal):
+        return
+    at = _address(journal) or "an address not noted"
+    raise TableMismatch(
+        f"push {journal[-1].push} of {_name(journal, site)!r} was begun at {at} and has not ended, and its table is not in force here",
+        "start with that machine's file; or, if this is that machine and its table is right: `abbe accept-table MACHINE.toml --yes`; "
+        "nothing was written",
+    )
+
+
+def _address(journal: Journal) -> str:
+    return facts(journal).control
+
+
+def _name(journal: Journal, site: Site) -> str:
+    return facts(journal).machine or site.name

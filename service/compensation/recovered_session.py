@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 from abbe.drivers.api import Controller
 from abbe.service.compensation.recover import recover
@@ -50,4 +51,4 @@ async def recovered_session(
             told(done)
 
     async with open_session(urls or site.urls, ask, first=first) as session:
-        yield session
+        yield replace(session, recovered=True)

@@ -17,15 +17,14 @@ from abbe.service.compensation.proposals import by_whom
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedAgain
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import Journal, JournalEntry, facts
+from abbe.service.push.entries import Journal, facts
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base, read_base
-from abbe.service.tables.push_history import KIND, ended_as, last_kept, pushes_of
+from abbe.service.tables.push_journal import KIND, JournalView, ended_as
 from abbe.service.tables.unverified import unverified_crcs
 
 
@@ -67,7 +66,7 @@ async def rollback(
         The table that was in force when this push had ended; 0: before the first push. Default: before the last kept push, which must have
         brought the table that is in force now.
     ordered : Ordered, optional
-        Who orders it. Default: whoever is logged in at this computer.
+        Who orders it. Default: the account on this computer.
 
     Returns
     -------
@@ -86,20 +85,19 @@ async def rollback(
         As of any push.
     """
     await recover(controller, store, site)
-    entries = await asyncio.to_thread(read_entries, store, site.name, site.control)
-    again = await asyncio.to_thread(_rollbacks, store)
-    if not entries:
+    journal = await asyncio.to_thread(JournalView.read, store, site.name, site.control)
+    if not journal.entries:
         raise TableRefused("no push of this machine is in the journal: there is nothing to take back", "nothing was written")
     base = await read_base(controller)
-    check_known(entries, base)
-    wanted = table_after(entries, to) if to is not None else table_before_last_kept(entries, base, again)
+    check_known(journal, base)
+    wanted = table_after(journal, to) if to is not None else table_before_last_kept(journal, base)
     if wanted.image == base.image:
         return None
-    await check_commissioned(controller, store, site)  # "was in force" was true of a control: nobody knows what another one makes of it
+    await check_commissioned(controller, store, site)  # "was in force" was true of a control: what another one makes of it is not known
     why = f"not measured: byte for byte {wanted.how}; ordered back by a person"
 
     def reasons() -> list[str]:
-        return [] if wanted.image in known_images(entries) else ["UNKNOWN: the journal does not know this table as one that was in force"]
+        return [] if wanted.image in known_images(journal) else ["UNKNOWN: the journal does not know this table as one that was in force"]
 
     async def in_force_before() -> Verdict:
         return Verdict(not reasons(), why)
@@ -113,43 +111,39 @@ async def rollback(
     pushed = await pushing.bring(WantedAgain(wanted.image, wanted.meaning, base, doc), questions)
     if not pushed.kept:
         raise TableRefused(
-            f"the table was not brought back: {pushed.why}", "the table of before is in force; look at the cause, then again"
+            f"the table was not brought back: {pushed.why}", "the table from before is in force; look at the cause, then try again"
         )
     return Back(pushed, wanted.how)
 
 
-def _rollbacks(store: Store) -> frozenset[int]:
-    return frozenset(t.id for t in store.tables.all() if t.doc.get("kind") == KIND)
-
-
 def _base(journal: Journal, how: str) -> KnownTables:
     f = facts(journal)
-    return KnownTables(bytes.fromhex(f["base_image"]), str(f["base_meaning"]), how)
+    return KnownTables(f.base_image, f.base_meaning, how)
 
 
 def _left(journal: Journal) -> KnownTables:
     """What was in force when a push had ended."""
     state, number, f = ended_as(journal), journal[-1].push, facts(journal)
     if state is PushState.KEEP:
-        return KnownTables(bytes.fromhex(f["image"]), str(f["meaning"]), f"the table that push {number} brought and kept")
+        return KnownTables(f.image, f.meaning, f"the table that push {number} brought and kept")
     if state in TERMINAL - {PushState.OPERATOR, PushState.ACCEPTED}:
         return _base(journal, f"the table that was in force before and after push {number}")
     raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another")
 
 
-def known_images(entries: list[JournalEntry]) -> set[bytes]:
+def known_images(journal: JournalView) -> set[bytes]:
     """All tables that were in force, verified or put there by a person: bases, and what was kept."""
-    found, refuted = set(), unverified_crcs(entries)
-    for journal in pushes_of(entries).values():
-        f = facts(journal)
-        if int(f["base_crc"]) not in refuted:
-            found.add(bytes.fromhex(f["base_image"]))
-        if ended_as(journal) is PushState.KEEP:
-            found.add(bytes.fromhex(f["image"]))
+    found, refuted = set(), unverified_crcs(journal.entries)
+    for push in journal.pushes.values():
+        f = facts(push)
+        if f.base_crc not in refuted:
+            found.add(f.base_image)
+        if ended_as(push) is PushState.KEEP:
+            found.add(f.image)
     return found
 
 
-def check_known(entries: list[JournalEntry], base: Base) -> None:
+def check_known(journal: JournalView, base: Base) -> None:
     """What a person or another program put there is never overwritten without a look at it.
 
     Raises
@@ -157,17 +151,17 @@ def check_known(entries: list[JournalEntry], base: Base) -> None:
     TableMismatch
         The table in force is neither known as one that was in force nor as one that a person accepted.
     """
-    accepted = {e.doc["accepted_crc"] for e in entries if e.state is PushState.ACCEPTED}
-    if base.image not in known_images(entries) and crc32(base.image) not in accepted:
+    accepted = {facts((e,)).accepted_crc for e in journal.entries if e.state is PushState.ACCEPTED}
+    if base.image not in known_images(journal) and crc32(base.image) not in accepted:
         raise TableMismatch(
             f"the table in force ({base.crc:08X}) is not one that the push journal knows",
             "look at the controller; nothing was written",
         )
 
 
-def table_after(entries: list[JournalEntry], push: int) -> KnownTables:
+def table_after(journal: JournalView, push: int) -> KnownTables:
     """The table that was in force when a push had ended; 0: before the first."""
-    journals = pushes_of(entries)
+    journals = journal.pushes
     if push == 0 and journals:
         return _base(next(iter(journals.values())), "the table that was in force before the first push")
     if push not in journals:
@@ -175,10 +169,10 @@ def table_after(entries: list[JournalEntry], push: int) -> KnownTables:
     return _left(journals[push])
 
 
-def table_before_last_kept(entries: list[JournalEntry], base: Base, rollbacks: frozenset[int]) -> KnownTables:
+def table_before_last_kept(journal: JournalView, base: Base) -> KnownTables:
     """The table before the last kept push, if that one is in force and was no rollback itself."""
-    last = last_kept(entries, rollbacks)
+    last = journal.last_kept()
     f, number = facts(last), last[-1].push
-    if bytes.fromhex(f["image"]) != base.image:
+    if f.image != base.image:
         raise TableRefused(f"the table in force is not the one of push {number}", "say which with --to PUSH; nothing was written")
     return _base(last, f"the table that was in force before push {number}")

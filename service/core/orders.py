@@ -10,7 +10,6 @@ import asyncio
 import secrets
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Final, Literal
 
 import structlog
@@ -36,8 +35,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import STOPPED, in_force, last_push, ordered, put_right
-from abbe.service.tables.table_history import offered
+from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, put_right
 
 log = structlog.get_logger("abbe.orders")
 
@@ -214,13 +212,16 @@ class Orders(RetryingStore):
         if refused is not None:
             return refused
         try:
-            now = await asyncio.to_thread(offered, self._store, self._context.machine, self._context.control)
+            now = await asyncio.to_thread(self._offered)
         except TableRefused as no:
             return _answer(asked.request, "conflict", str(no))
         if (now.push, now.crc) != (asked.push, asked.crc):
             what = f"meanwhile another table is in force: {now.crc:08X} of push {now.push}; look at it first"
             return _answer(asked.request, "conflict", what)
         return self._jobs.begin(requested, self._rollback_job(asked))
+
+    def _offered(self) -> RollbackOffer:
+        return JournalView.read(self._store, self._context.machine, self._context.control).offer()
 
     def _rollback_job(self, asked: RollBack) -> _TableOrderJob:
         number, ordered_rollback = secrets.token_hex(6), self._actions.ordered_rollback
@@ -232,7 +233,10 @@ class Orders(RetryingStore):
         doc = {"reason": asked.reason, "order": number, "push": asked.push, "crc": f"{asked.crc:08X}"}
         target = f"{self._context.machine}, table of push {asked.push} ({asked.crc:08X})"
         begun = AuditEvent(who=asked.who, action=ROLLBACK, target=target, outcome="begun", doc=doc)
-        look = partial(ordered, self._store, self._context.machine, number)
+
+        def look() -> JobOutcome | None:
+            return JournalView.read(self._store, self._context.machine).of_order(number)
+
         return _TableOrderJob(ROLLBACK, f"{ROLLBACK} of push {asked.push}", self._trail(begun), act, look, self._read)
 
     async def push(self, asked: PushNow) -> Answer:
@@ -252,10 +256,11 @@ class Orders(RetryingStore):
     def _not_approved(self, proposal: int) -> tuple[str, int]:
         """Why a proposal cannot be pushed as it stands, and the number of the last push."""
         machine, found = self._context.machine, load(self._store, proposal)
-        now = proposal_status(self._store, proposal, found, self._clock.utc().timestamp())
-        after = last_push(self._store, machine)
+        journal = JournalView.read(self._store, machine)
+        after = journal.last_push
         if found.candidate.machine != machine:
             return f"proposal {proposal} is for {found.candidate.machine}, not for {machine}", after
+        now = proposal_status(self._store, proposal, found, self._clock.utc().timestamp(), journal)
         return "" if now.word == "approved" else f"proposal {proposal} is {now.word}: {now.text}", after
 
     def _push_job(self, asked: PushNow, after: int) -> _TableOrderJob:
@@ -270,7 +275,10 @@ class Orders(RetryingStore):
 
         doc, target = {"proposal": asked.proposal, "after": after}, f"{machine}, proposal {asked.proposal}"
         begun = AuditEvent(who=asked.who, action=PUSH, target=target, outcome="begun", doc=doc)
-        look = partial(in_force, self._store, machine, asked.proposal, after)
+
+        def look() -> JobOutcome | None:
+            return JournalView.read(self._store, machine).of_proposal(asked.proposal, after)
+
         return _TableOrderJob(PUSH, f"{PUSH} of proposal {asked.proposal}", self._trail(begun), act, look, self._read)
 
     async def _refused(self, requested: JobRequest, order: str, missing: str | Literal[False]) -> Answer | None:

@@ -73,7 +73,8 @@ D = TypeVar("D", Controller, BallBar, DisplacementMeter, Fixture)
 class Session:
     """Open devices. A test that needs an absent one is refused by name (`need`).
 
-    ``attended``: a person can answer a question at the console.
+    ``attended``: a person can answer a question at the console. ``recovered``: what an interrupted push left in the controller was finished
+    when it was opened.
     """
 
     controller: Controller
@@ -81,6 +82,7 @@ class Session:
     laser: DisplacementMeter | None
     fixture: Fixture | None
     attended: bool = True
+    recovered: bool = False
 
     def need_ballbar(self) -> BallBar:
         """The ball-bar, or one clear line that it is not configured."""

@@ -1,4 +1,4 @@
-"""What an exporter has to be told about the one machine that will read its file. Every field has the usual value."""
+"""What an exporter has to know about the one machine that will read its file. Every field has the usual value."""
 
 from __future__ import annotations
 

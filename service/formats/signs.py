@@ -1,4 +1,4 @@
-"""The sign rule of every format, in one place (controllers.md 5.7). e = actual − nominal; nobody else in the code knows a sign.
+"""The sign rule of every format, in one place (controllers.md 5.7). e = actual − nominal; no other code knows a sign.
 
 A number in a file is ``per_error`` times e, plus the nominal position where the control wants the position that was reached.
 """

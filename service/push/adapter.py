@@ -116,7 +116,7 @@ class ControllerPort:
         """Measuring takes longer than a lease: it is renewed meanwhile. Where another has it, nothing of the measurement counts."""
         over, lost = asyncio.Event(), asyncio.Event()
         asked = asyncio.ensure_future(question(journal))
-        beat = asyncio.ensure_future(self._beat(int(facts(journal)["owner"]), over, lost))
+        beat = asyncio.ensure_future(self._beat(facts(journal).owner, over, lost))
         try:
             await asyncio.wait([asked, beat], return_when=asyncio.FIRST_COMPLETED)
             if lost.is_set() and not asked.done():

@@ -6,7 +6,7 @@ It is taken by the process that began the push and by any later one; it may be b
 from __future__ import annotations
 
 from abbe.drivers.api import BankState
-from abbe.service.push.entries import Doc
+from abbe.service.push.entries import Doc, PushFacts
 from abbe.service.push.learn import BACK
 from abbe.service.push.operations import Knowledge, Operation, OperationKind, Refused, Truth
 from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
@@ -25,27 +25,27 @@ def record(state: PushState, **doc: object) -> Operation:
     return Operation(OperationKind.RECORD, state=state, doc=doc)
 
 
-def in_force(f: Doc, truth: Truth) -> str:
+def in_force(f: PushFacts, truth: Truth) -> str:
     """Which table is active: ``"base"``, ``"candidate"`` or ``"neither"``, by the CRC that the controller states."""
     crc = truth.crc[truth.active]
-    if truth.states[truth.active] is BankState.SEALED and crc in (f["base_crc"], f["crc"]):
-        return "base" if crc == f["base_crc"] else "candidate"
+    if truth.states[truth.active] is BankState.SEALED and crc in (f.base_crc, f.crc):
+        return "base" if crc == f.base_crc else "candidate"
     return "neither"
 
 
-def seen(f: Doc, truth: Truth) -> Doc:
+def seen(f: PushFacts, truth: Truth) -> Doc:
     """What a person needs to compare: what the journal knows and what the controller says."""
     says = {"boot": truth.boot, "gen": truth.gen, "active": truth.active, "crc": list(truth.crc), "states": list(truth.states)}
-    return {"expected": {"base_crc": f["base_crc"], "crc": f["crc"]}, "controller": says}
+    return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": says}
 
 
-def go_back(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
+def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
     """Next operation on the way back.
 
     Parameters
     ----------
-    f : dict
-        Facts of the journal.
+    f : PushFacts
+        What the journal says.
     known : Knowledge
         What this process knows.
     state : PushState
@@ -58,7 +58,7 @@ def go_back(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
     if known.doubts >= DOUBTS:
         return _pending(state, "the controller does not answer")
     if state is PushState.ACTIVATING_BACK and known.wrote_last and not known.asked:
-        return Operation(OperationKind.ACTIVATE, bank=f["back_bank"], crc=f["base_crc"], gen=f["back_gen"], owner=known.lease, text=BACK)
+        return Operation(OperationKind.ACTIVATE, bank=f.back_bank, crc=f.base_crc, gen=f.back_gen, owner=known.lease, text=BACK)
     if known.start is None:
         return Operation(OperationKind.LOOK, mark=True)
     which = in_force(f, known.start)
@@ -69,25 +69,25 @@ def go_back(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
     return _switch(f, known, state, seq)
 
 
-def _arrived(f: Doc, known: Knowledge) -> Operation:
+def _arrived(f: PushFacts, known: Knowledge) -> Operation:
     assert known.start is not None
-    step = bracket(known, known.start.active, len(bytes.fromhex(f["base_image"])) // 2, again=False)
+    step = bracket(known, known.start.active, len(f.base_image) // 2, again=False)
     if isinstance(step, Operation):
         return step
-    if step is not None and known.image == bytes.fromhex(f["base_image"]):
+    if step is not None and known.image == f.base_image:
         return record(PushState.ROLLED_BACK, bank=step.truth.active)
     if known.brackets < BRACKETS:
         return Operation(OperationKind.LOOK, mark=True)
     return record(PushState.OPERATOR, why="the active bank has the old table's CRC and another content", **seen(f, known.start))
 
 
-def _switch(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
+def _switch(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
     """The new table is active and has to go."""
     truth = known.start
     assert truth is not None
     if truth.unsafe:
         return _pending(state, f"not safe now: {truth.unsafe}")
-    if truth.states[1 - truth.active] is BankState.LAID_ASIDE and truth.crc[1 - truth.active] == f["base_crc"]:
+    if truth.states[1 - truth.active] is BankState.LAID_ASIDE and truth.crc[1 - truth.active] == f.base_crc:
         return _pending(state, "the old table acts after the control's next start: start it anew, and move nothing before")
     if state is PushState.ACTIVATING_BACK:
         text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation of the old table did not happen"
@@ -105,24 +105,24 @@ def _switch(f: Doc, known: Knowledge, state: PushState, seq: int) -> Operation:
     return _with_old_bank(f, known, truth)
 
 
-def _lease_open(f: Doc, truth: Truth) -> bool:
-    return truth.owner == 0 or f["owner"] <= truth.owner <= f["owner"] + OWNERS
+def _lease_open(f: PushFacts, truth: Truth) -> bool:
+    return truth.owner == 0 or f.owner <= truth.owner <= f.owner + OWNERS
 
 
-def _lease(f: Doc, known: Knowledge, truth: Truth, state: PushState, seq: int) -> Operation:
+def _lease(f: PushFacts, known: Knowledge, truth: Truth, state: PushState, seq: int) -> Operation:
     if isinstance(known.verdict, Refused) or not _lease_open(f, truth):
         return _pending(state, "another owner has the lease")
     if known.leases + known.releases >= LEASES:
         return _pending(state, "the controller answers, but does not give or take the lease")
-    if truth.owner:  # of this push, from before: it is shut out first, whoever still holds it
+    if truth.owner:  # of this push, from before: it is shut out first, also where another process holds it
         return Operation(OperationKind.RELEASE, owner=truth.owner)
-    return Operation(OperationKind.LEASE, owner=f["owner"] + 1 + seq)
+    return Operation(OperationKind.LEASE, owner=f.owner + 1 + seq)
 
 
-def _with_old_bank(f: Doc, known: Knowledge, truth: Truth) -> Operation:
+def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
     """Use the old table where it still stands, restore it from the journal where the controller lost it, never over a person's work."""
-    other, base = 1 - truth.active, bytes.fromhex(f["base_image"])
-    if truth.states[other] is BankState.SEALED and truth.crc[other] == f["base_crc"]:
+    other, base = 1 - truth.active, f.base_image
+    if truth.states[other] is BankState.SEALED and truth.crc[other] == f.base_crc:
         step = bracket(known, other, len(base) // 2, again=False)
         if isinstance(step, Operation):
             return step
@@ -132,13 +132,13 @@ def _with_old_bank(f: Doc, known: Knowledge, truth: Truth) -> Operation:
             return Operation(OperationKind.LOOK, mark=True)
     if truth.states[other] is BankState.EMPTY:  # the controller forgot it
         return _begin_restaging(truth, other)
-    if f.get("restaged"):  # by this push, which was interrupted: what stands there may be ours
+    if f.restaged:  # by this push, which was interrupted: what stands there may be ours
         step = bracket(known, other, len(base) // 2, again=False)
         if isinstance(step, Operation):
             return step
         if step is None and known.brackets < BRACKETS:
             return Operation(OperationKind.LOOK, mark=True)
-        if step is not None and _ours(known.image or b"", base, 2 * f["chunk_words"]):
+        if step is not None and _ours(known.image or b"", base, 2 * f.chunk_words):
             return _begin_restaging(step.truth, other)
     return record(PushState.OPERATOR, why="the old table is no longer in its bank, and somebody else put there what is", **seen(f, truth))
 
@@ -159,12 +159,12 @@ def _ours(held: bytes, base: bytes, size: int) -> bool:
     return len(held) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 
 
-def _restage(f: Doc, known: Knowledge, truth: Truth, state: PushState) -> Operation:
+def _restage(f: PushFacts, known: Knowledge, truth: Truth, state: PushState) -> Operation:
     if not known.wrote_last:  # how far an earlier process came is not known: again from the beginning, with the generation of now
         return record(PushState.ROLLBACK, again="restoring the old table was interrupted")
     image = Image(
-        f["back_bank"], bytes.fromhex(f["base_image"]), f["base_crc"], f["base_meaning"], known.lease,
-        f["restage_gen"], f["restage_boot"], f["crc"], f["chunk_words"],
+        f.back_bank, f.base_image, f.base_crc, f.base_meaning, known.lease,
+        f.restage_gen, f.restage_boot, f.crc, f.chunk_words,
     )  # fmt: skip
     step = stage(image, known)
     if isinstance(step, Coherent):

@@ -1,16 +1,17 @@
 """Entries of the push journal: one for every transition, each chained to the one before it by SHA-256 over canonical JSON.
 
-The journal is at the same time the audit trail: whoever changes, removes or swaps an entry breaks the chain.
+The journal is also the audit trail: an entry that is changed, removed or swapped breaks the chain.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
+from abbe.service.push.order import OperationOrder
 from abbe.service.push.states import FOLLOWS, PushState
 
 Doc = dict[str, Any]
@@ -119,9 +120,145 @@ def check_chain(entries: Sequence[JournalEntry], head: str = GENESIS) -> None:
         last[entry.push], head = entry, entry.digest
 
 
-def facts(journal: Journal) -> Doc:
+NOT_YET = -1
+"""A figure that no entry of a push has given yet: no controller states it, so nothing is ever equal to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerSays:
+    """What a controller said of its banks when a person was called: the active one, and the CRC of each."""
+
+    active: int = NOT_YET
+    crc: tuple[int, ...] = ()
+
+    @property
+    def in_force(self) -> int:
+        """CRC of the active bank; `NOT_YET` where nothing was noted."""
+        return self.crc[self.active] if self.crc else NOT_YET
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushFacts(OperationOrder):
+    """Everything that a push's journal says, later entries over earlier ones, by the state whose entry brings it.
+
+    SNAPSHOT: the order, and what was read: boot id, generation and register map of the
+    controller, bank, CRC, bytes and meaning of the table in force, and the bank ``target`` to which the new one goes. REJECTED: reasons.
+    APPROVED: digest, who, until when. STAGED, ACTIVATING, PROBATION: generations, and the CRC that the activation expects. PROBED and
+    VERIFIED: what was found. RESTAGING and ACTIVATING_BACK: bank, generation and boot id for the way back. ROLLBACK_PENDING: what it waits
+    for. OPERATOR: why, and what the controller said. ACCEPTED: for which table a person vouches.
+    """
+
+    boot: int = NOT_YET
+    gen: int = NOT_YET
+    map: str = ""
+    base_bank: int = NOT_YET
+    base_crc: int = NOT_YET
+    base_image: bytes = b""
+    base_meaning: str = ""
+    target: int = NOT_YET
+    reasons: tuple[str, ...] = ()
+    approval: str = ""
+    approved_by: str = ""
+    expiry: str = ""
+    staged_gen: int = NOT_YET
+    expect_crc: int = NOT_YET
+    expect_gen: int = NOT_YET
+    probation_gen: int = NOT_YET
+    probe: str = ""
+    verify: str = ""
+    restaged: bool = False
+    back_bank: int = NOT_YET
+    back_gen: int = NOT_YET
+    restage_gen: int = NOT_YET
+    restage_boot: int = NOT_YET
+    why: str = ""
+    again: str = ""
+    pending: str = ""
+    controller: ControllerSays = field(default_factory=ControllerSays)
+    accepted_bank: int = NOT_YET
+    accepted_crc: int = NOT_YET
+    by: str = ""
+
+    def binding(self, expiry: str) -> str:
+        """What an approval until ``expiry`` has to bind (`approval_digest`)."""
+        return approval_digest(self.image, base_image=self.base_image, machine=self.machine, limits=self.limits, expiry=expiry)
+
+
+def _bytes(text: str) -> bytes:
+    """Bytes of a hexadecimal text; none where somebody changed it into another."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        return b""
+
+
+_CONVERTED: dict[str, Callable[[Any], Any]] = {
+    "image": _bytes,
+    "base_image": _bytes,
+    "reasons": tuple,
+    "controller": lambda doc: ControllerSays(doc["active"], tuple(doc["crc"])),
+}
+_NO_ORDER: Doc = {
+    "machine": "",
+    "image": b"",
+    "crc": NOT_YET,
+    "meaning": "",
+    "limits": "",
+    "owner": NOT_YET,
+    "level": NOT_YET,
+    "chunk_words": 0,
+}
+_FIELDS = tuple((one.name, _CONVERTED.get(one.name)) for one in fields(PushFacts))
+_SNAPSHOT = frozenset({
+    "machine", "image", "crc", "meaning", "limits", "owner", "level", "attended", "chunk_words", "boot", "gen", "map",
+    "base_bank", "base_crc", "base_image", "base_meaning", "target",
+})  # fmt: skip
+
+
+def facts(journal: Journal) -> PushFacts:
     """Everything that a push's journal says, later entries over earlier ones."""
-    known: Doc = {}
+    return _parsed(_merged(journal))
+
+
+def facts_to_act_on(journal: Journal) -> PushFacts:
+    """The same, complete enough to act on a controller.
+
+    Raises
+    ------
+    JournalBroken
+        The SNAPSHOT does not say all that the way back needs.
+    """
+    doc = _merged(journal)
+    found = _parsed(doc)
+    if (missing := _SNAPSHOT - doc.keys()) or not found.image or not found.base_image:
+        raise JournalBroken(f"push {journal[-1].push}: its first entry does not say {', '.join(sorted(missing)) or 'which tables'}")
+    return found
+
+
+def _merged(journal: Journal) -> Doc:
+    doc: Doc = {}
     for entry in journal:
-        known.update(entry.doc)
-    return known
+        doc.update(entry.doc)
+    return doc
+
+
+def _parsed(doc: Doc) -> PushFacts:
+    said = {name: doc[name] if convert is None else convert(doc[name]) for name, convert in _FIELDS if name in doc}
+    return PushFacts(**(_NO_ORDER | said))
+
+
+def approval_digest(image: bytes, *, base_image: bytes, machine: str, limits: str, expiry: str) -> str:
+    """SHA-256 that a person agrees to: exactly this table, on exactly this base, for this machine, under these limits, until then.
+
+    Parameters
+    ----------
+    image, base_image : bytes
+        The new table and the one in force.
+    machine : str
+        Name of the machine.
+    limits : str
+        Digest of the limits (`abbe.service.push.limits.PushLimits.digest`).
+    expiry : str
+        When the approval ends.
+    """
+    return hashlib.sha256(canonical([image.hex(), base_image.hex(), machine, limits, expiry])).hexdigest()

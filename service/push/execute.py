@@ -15,7 +15,7 @@ from abbe.service.push.states import TERMINAL, PushState
 
 
 class Port(Protocol):
-    """Does one operation on a controller, or asks whoever has to answer. Raises nothing for what a controller or a link does."""
+    """Does one operation on a controller, or asks the one who has to answer. Raises nothing for what a controller or a link does."""
 
     async def execute(self, op: Operation, journal: Journal) -> Outcome:
         """Do it; `journal` is the push so far."""
@@ -36,7 +36,7 @@ class Book(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """Where a push, or its recovery, stands now. ``state`` None: nothing was begun. Not ``settled``: it has to be gone on with."""
+    """Where a push, or its recovery, stands now. ``state`` None: nothing was begun. Not ``settled``: it has to be continued."""
 
     state: PushState | None
     journal: Journal

@@ -10,9 +10,8 @@ import zlib
 from collections.abc import Callable
 
 from abbe.drivers.api import BankState
-from abbe.service.push.approval import approval_digest
 from abbe.service.push.back import DOUBTS, OWNERS, go_back, in_force, record, seen
-from abbe.service.push.entries import Doc, Journal, facts
+from abbe.service.push.entries import Journal, PushFacts, facts_to_act_on
 from abbe.service.push.learn import FORGET
 from abbe.service.push.levels import objection
 from abbe.service.push.operations import Approval, Done, Knowledge, Operation, OperationKind, Refused, Truth, Verdict
@@ -45,7 +44,7 @@ def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | N
     """
     if not journal:
         return _begin(known, order) if order is not None else Operation(OperationKind.END, text="nothing was begun")
-    state, f = journal[-1].state, facts(journal)
+    state, f = journal[-1].state, facts_to_act_on(journal)
     if state in TERMINAL:
         return _leave(f, known)
     if state in GOING_BACK:
@@ -57,7 +56,7 @@ def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | N
     return _AFTER[state](f, known)
 
 
-def _leave(f: Doc, known: Knowledge) -> Operation:
+def _leave(f: PushFacts, known: Knowledge) -> Operation:
     """The push is over: its lease goes back, also one that a process left which died after the last entry."""
     if known.doubts >= DOUBTS or known.fenced:
         return Operation(OperationKind.END)
@@ -69,7 +68,7 @@ def _leave(f: Doc, known: Knowledge) -> Operation:
         return Operation(OperationKind.LOOK)
     return (
         Operation(OperationKind.RELEASE, owner=known.truth.owner)
-        if f["owner"] <= known.truth.owner <= f["owner"] + OWNERS
+        if f.owner <= known.truth.owner <= f.owner + OWNERS
         else Operation(OperationKind.END)
     )
 
@@ -93,15 +92,15 @@ def _begin(known: Knowledge, order: OperationOrder) -> Operation:
     return record(PushState.SNAPSHOT, **base, **order.doc())
 
 
-def _abandon(f: Doc, known: Knowledge, state: PushState, why: str) -> Operation:
+def _abandon(f: PushFacts, known: Knowledge, state: PushState, why: str) -> Operation:
     """Before activation: give the lease back, and end. The table in force was never touched."""
     if state not in (PushState.SNAPSHOT, PushState.VALIDATED) and not known.fenced and known.doubts < 2 * DOUBTS:
-        return Operation(OperationKind.RELEASE, owner=f["owner"], text=why)
+        return Operation(OperationKind.RELEASE, owner=f.owner, text=why)
     return record(PushState.ABORTED, why=why)
 
 
-def _validate(f: Doc, known: Knowledge) -> Operation:
-    no = objection(f["level"], attended=f["attended"])
+def _validate(f: PushFacts, known: Knowledge) -> Operation:
+    no = objection(f.level, attended=f.attended)
     if no:
         return record(PushState.REJECTED, reasons=[no])
     if known.verdict is None:
@@ -112,61 +111,59 @@ def _validate(f: Doc, known: Knowledge) -> Operation:
     return record(PushState.REJECTED, reasons=[known.verdict.text])
 
 
-def _approve(f: Doc, known: Knowledge) -> Operation:
+def _approve(f: PushFacts, known: Knowledge) -> Operation:
     if known.verdict is None:
         return Operation(OperationKind.APPROVE)
     if not isinstance(known.verdict, Done) or not isinstance(known.verdict.value, Approval):
         text = "no answer" if isinstance(known.verdict, Done) else known.verdict.text
         return record(PushState.REJECTED, reasons=[f"not approved: {text}"])
     approval = known.verdict.value
-    if approval.digest != approval_digest(f, approval.expiry):
+    if approval.digest != f.binding(approval.expiry):
         return record(PushState.REJECTED, reasons=["what was approved is not this table on this base under these limits"])
     return record(PushState.APPROVED, approval=approval.digest, approved_by=approval.by, expiry=approval.expiry)
 
 
-def _lease(f: Doc, known: Knowledge) -> Operation:
+def _lease(f: PushFacts, known: Knowledge) -> Operation:
     if known.verdict is None:
-        return Operation(OperationKind.LEASE, owner=f["owner"])
+        return Operation(OperationKind.LEASE, owner=f.owner)
     if isinstance(known.verdict, Refused):
         return _abandon(f, known, PushState.APPROVED, f"the lease is another's: {known.verdict.text}")
     if isinstance(known.verdict, Done):
         return record(PushState.LEASED)
     if known.truth is None:
         return Operation(OperationKind.LOOK)
-    if known.truth.owner == f["owner"]:
+    if known.truth.owner == f.owner:
         return record(PushState.LEASED)
     return _abandon(f, known, PushState.APPROVED, "the lease could not be taken")
 
 
-def _precheck(f: Doc, known: Knowledge) -> Operation:
+def _precheck(f: PushFacts, known: Knowledge) -> Operation:
     truth = known.truth
     if truth is None:
         return Operation(OperationKind.LOOK)
-    why = _changed(f, truth, f["gen"]) or ("the axes have not stood long enough" if truth.still_s < STILL_S else "")
-    if not why and truth.states[f["target"]] is BankState.LAID_ASIDE:
+    why = _changed(f, truth, f.gen) or ("the axes have not stood long enough" if truth.still_s < STILL_S else "")
+    if not why and truth.states[f.target] is BankState.LAID_ASIDE:
         why = "a table is laid aside for the control's next start: start it anew, or take that table away first"
     if why:
         return _abandon(f, known, PushState.LEASED, why)
     return record(PushState.STAGING, still_s=truth.still_s)
 
 
-def _stage(f: Doc, known: Knowledge) -> Operation:
-    image = Image(
-        f["target"], bytes.fromhex(f["image"]), f["crc"], f["meaning"], f["owner"], f["gen"], f["boot"], f["base_crc"], f["chunk_words"]
-    )
+def _stage(f: PushFacts, known: Knowledge) -> Operation:
+    image = Image(f.target, f.image, f.crc, f.meaning, f.owner, f.gen, f.boot, f.base_crc, f.chunk_words)
     step = stage(image, known)
     if isinstance(step, Coherent):
         return record(PushState.STAGED, staged_gen=step.truth.gen)
     return _abandon(f, known, PushState.STAGING, step.why) if isinstance(step, Failed) else step
 
 
-def _arm(f: Doc, known: Knowledge) -> Operation:
+def _arm(f: PushFacts, known: Knowledge) -> Operation:
     """The last look before the activation: everything once more."""
     truth = known.truth
     if truth is None:
         return Operation(OperationKind.LOOK)
-    why = _changed(f, truth, f["staged_gen"])
-    if not why and truth.crc[f["target"]] != f["crc"]:
+    why = _changed(f, truth, f.staged_gen)
+    if not why and truth.crc[f.target] != f.crc:
         why = "the staged bank changed"
     if not why and truth.now_s >= known.approved_until_s:
         why = "the approval has expired"
@@ -174,28 +171,28 @@ def _arm(f: Doc, known: Knowledge) -> Operation:
         why = "the lease is about to end"
     if why:
         return _abandon(f, known, PushState.STAGED, why)
-    return record(PushState.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])
+    return record(PushState.ACTIVATING, expect_crc=f.crc, expect_gen=f.staged_gen)
 
 
-def _changed(f: Doc, truth: Truth, gen: int) -> str:
+def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
     """Why what was read in the snapshot does not hold any more; empty if it does."""
-    if truth.boot != f["boot"]:
+    if truth.boot != f.boot:
         return "the controller restarted"
-    if truth.map != f["map"]:
+    if truth.map != f.map:
         return "the controller's register map changed"
-    if in_force(f, truth) != "base" or truth.active != f["base_bank"]:
+    if in_force(f, truth) != "base" or truth.active != f.base_bank:
         return "the table in force is not the approved base any more"
     if truth.gen != gen:
         return "somebody else changed a bank"
-    if truth.owner != f["owner"]:
+    if truth.owner != f.owner:
         return "the lease is lost"
     return f"not safe now: {truth.unsafe}" if truth.unsafe else ""
 
 
-def _activate(f: Doc, known: Knowledge) -> Operation:
+def _activate(f: PushFacts, known: Knowledge) -> Operation:
     """One command; whatever came of it is asked from the controller, never guessed, and never sent again."""
     if known.mine and known.wrote_last and not known.asked and not known.stop:
-        return Operation(OperationKind.ACTIVATE, bank=f["target"], crc=f["expect_crc"], gen=f["expect_gen"], owner=f["owner"])
+        return Operation(OperationKind.ACTIVATE, bank=f.target, crc=f.expect_crc, gen=f.expect_gen, owner=f.owner)
     if known.mine and known.asked and not known.fenced and not known.stop:
         step = _confirm(f, known)
         if step is not None:
@@ -203,26 +200,26 @@ def _activate(f: Doc, known: Knowledge) -> Operation:
     return _unconfirmed(f, known)
 
 
-def _confirm(f: Doc, known: Knowledge) -> Operation | None:
+def _confirm(f: PushFacts, known: Knowledge) -> Operation | None:
     """The new table is active and is, byte for byte, the approved one. None: it is not, or that cannot be shown."""
     if known.doubts >= DOUBTS:
         return None
-    if known.start is not None and (in_force(f, known.start) != "candidate" or known.start.boot != f["boot"]):
+    if known.start is not None and (in_force(f, known.start) != "candidate" or known.start.boot != f.boot):
         return None
-    step = bracket(known, f["target"], len(f["image"]) // 4, again=False)
+    step = bracket(known, f.target, len(f.image) // 2, again=False)
     if isinstance(step, Operation):
         return step
-    if step is not None and known.image == bytes.fromhex(f["image"]):
+    if step is not None and known.image == f.image:
         return record(PushState.PROBATION, probation_gen=step.truth.gen)
     return Operation(OperationKind.LOOK, mark=True) if known.brackets < BRACKETS else None
 
 
-def _unconfirmed(f: Doc, known: Knowledge) -> Operation:
+def _unconfirmed(f: PushFacts, known: Knowledge) -> Operation:
     """Shut out a command that may still be on its way, then look which table is in force."""
     if known.doubts >= 2 * DOUBTS:
         return Operation(OperationKind.END, text="the controller does not answer: whether the new table is active is not known")
     if not known.fenced:
-        return Operation(OperationKind.RELEASE, owner=f["owner"])
+        return Operation(OperationKind.RELEASE, owner=f.owner)
     if known.truth is None:
         return Operation(OperationKind.LOOK)
     which = in_force(f, known.truth)
@@ -233,9 +230,9 @@ def _unconfirmed(f: Doc, known: Knowledge) -> Operation:
     return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.truth))
 
 
-def _not_in_force(f: Doc, known: Knowledge, truth: Truth) -> Operation:
-    """The old table acts. A control that laid the new one aside for its next start has to forget it: nobody will have verified it."""
-    if truth.states[f["target"]] is BankState.LAID_ASIDE and truth.crc[f["target"]] == f["crc"]:
+def _not_in_force(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+    """The old table acts. A control that laid the new one aside for its next start has to forget it: nothing will have verified it."""
+    if truth.states[f.target] is BankState.LAID_ASIDE and truth.crc[f.target] == f.crc:
         return _forget(f, known, truth)
     if known.forgets:
         return record(PushState.ABORTED, why="this control uses a new table only after its next start: it cannot be verified in a push")
@@ -243,30 +240,30 @@ def _not_in_force(f: Doc, known: Knowledge, truth: Truth) -> Operation:
     return record(PushState.ABORTED, why=known.stop or text)
 
 
-def _forget(f: Doc, known: Knowledge, truth: Truth) -> Operation:
-    """A bank that is written to is no table any more; only whoever has the lease writes."""
+def _forget(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+    """A bank that is written to is no table any more; only the holder of the lease writes."""
     if known.forgets >= DOUBTS:
         why = "the control has laid the new table aside, uses it after its next start, and does not forget it: do not start it anew"
         return record(PushState.OPERATOR, why=why, **seen(f, truth))
     if known.lease and truth.owner == known.lease:
-        data = bytes.fromhex(f["image"])[: 2 * f["chunk_words"]]
-        return Operation(OperationKind.WRITE, bank=f["target"], count=len(data) // 2, data=data, text=FORGET)
+        data = f.image[: 2 * f.chunk_words]
+        return Operation(OperationKind.WRITE, bank=f.target, count=len(data) // 2, data=data, text=FORGET)
     if truth.owner or known.leases >= DOUBTS:
         return Operation(
             OperationKind.END, text="the control would use the new table after its next start, and another owner has the lease"
         )
-    return Operation(OperationKind.LEASE, owner=f["owner"] + 1)  # fenced off, and less than any lease on the way back
+    return Operation(OperationKind.LEASE, owner=f.owner + 1)  # fenced off, and less than any lease on the way back
 
 
-def _probation(f: Doc, known: Knowledge) -> Operation:
+def _probation(f: PushFacts, known: Knowledge) -> Operation:
     return _proved(f, known, OperationKind.PROBE, PushState.PROBED)
 
 
-def _verify(f: Doc, known: Knowledge) -> Operation:
+def _verify(f: PushFacts, known: Knowledge) -> Operation:
     return _proved(f, known, OperationKind.VERIFY, PushState.VERIFIED)
 
 
-def _proved(f: Doc, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
+def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
     """Move the machine and ask; every answer but a clear yes leads back."""
     why = _why_back(known)
     if why:
@@ -275,7 +272,7 @@ def _proved(f: Doc, known: Knowledge, question: OperationKind, then: PushState) 
         truth = known.truth
         if truth is None:
             return Operation(OperationKind.LOOK)
-        if (truth.boot, truth.gen) != (f["boot"], f["probation_gen"]) or in_force(f, truth) != "candidate":
+        if (truth.boot, truth.gen) != (f.boot, f.probation_gen) or in_force(f, truth) != "candidate":
             return record(PushState.ROLLBACK, why="the controller restarted, or somebody changed a table, during probation")
         return record(PushState.ROLLBACK, why=f"not safe now: {truth.unsafe}") if truth.unsafe else Operation(question)
     if isinstance(known.verdict, Done) and isinstance(known.verdict.value, Verdict) and known.verdict.value.passed:
@@ -285,7 +282,7 @@ def _proved(f: Doc, known: Knowledge, question: OperationKind, then: PushState) 
     return record(PushState.ROLLBACK, why=f"{question.value}: {text}")
 
 
-def _keep(f: Doc, known: Knowledge) -> Operation:
+def _keep(f: PushFacts, known: Knowledge) -> Operation:
     """Once more: what is in force is what was approved and verified, byte for byte."""
     why = _why_back(known)
     if why:
@@ -295,7 +292,7 @@ def _keep(f: Doc, known: Knowledge) -> Operation:
         return record(PushState.ROLLBACK, why="the table in force is not the one that was verified")
     if step.state is not PushState.PROBATION:
         return step
-    if (step.doc or {}).get("probation_gen") != f["probation_gen"]:
+    if (step.doc or {}).get("probation_gen") != f.probation_gen:
         return record(PushState.ROLLBACK, why="somebody changed a table while it was verified")
     return record(PushState.KEEP)
 
@@ -307,7 +304,7 @@ def _why_back(known: Knowledge) -> str:
     return known.stop or ("the controller does not answer" if known.doubts >= DOUBTS else "")
 
 
-_FORWARD: dict[PushState, Callable[[Doc, Knowledge], Operation]] = {
+_FORWARD: dict[PushState, Callable[[PushFacts, Knowledge], Operation]] = {
     PushState.SNAPSHOT: _validate,
     PushState.VALIDATED: _approve,
     PushState.APPROVED: _lease,
@@ -315,7 +312,7 @@ _FORWARD: dict[PushState, Callable[[Doc, Knowledge], Operation]] = {
     PushState.STAGING: _stage,
     PushState.STAGED: _arm,
 }
-_AFTER: dict[PushState, Callable[[Doc, Knowledge], Operation]] = {
+_AFTER: dict[PushState, Callable[[PushFacts, Knowledge], Operation]] = {
     PushState.ACTIVATING: _activate,
     PushState.PROBATION: _probation,
     PushState.PROBED: _verify,

@@ -89,8 +89,8 @@ class Truth:
 class Approval:
     """A person's (or the policy's) yes to exactly one table on exactly one base.
 
-    ``digest``: what was agreed to (`abbe.service.push.approval`). ``expiry``: when it ends, as text, part of the digest. ``until_s``: the
-    same end as monotonic host time, because somebody may set the wall clock.
+    ``digest``: what was agreed to (`abbe.service.push.entries.approval_digest`). ``expiry``: when it ends, as text, part of the digest.
+    ``until_s``: the same end as monotonic host time, because somebody may set the wall clock.
     """
 
     digest: str
@@ -109,7 +109,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The controller (or whoever was asked) did it and said so."""
+    """The controller (or the one who was asked) did it and said so."""
 
     value: Any = None
 

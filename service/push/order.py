@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from abbe.service.push.entries import Doc
+from abbe.service.domain.document import Doc
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class OperationOrder:
     control : str
         Identity of the control (`abbe.service.devices.urls.control_of`); empty: not known.
     process : dict
-        Which process pushes (`abbe.service.domain.owner.Owner`): nobody recovers while it lives.
+        Which process pushes (`abbe.service.domain.owner.Owner`): no other process recovers while it lives.
     """
 
     machine: str

@@ -98,7 +98,7 @@ def _chunk(image: Image, known: Knowledge) -> Operation | Failed:
         return Operation(OperationKind.READ_CHUNK, bank=image.bank, first=first, count=len(data) // 2, data=data)
     if known.truth is None:
         return Operation(OperationKind.LOOK)
-    # Another content than ours is overwritten only while the generation says that nobody but us has written.
+    # Another content than ours is overwritten only while the generation says that only we have written.
     if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):
         return Failed("somebody else wrote into the bank, or the controller restarted; what it holds now was left alone", foreign=True)
     if known.rewrites_here >= REWRITES_PER_CHUNK or known.rewrites >= REWRITES:

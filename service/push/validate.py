@@ -100,14 +100,21 @@ def _evidence(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iter
         yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, allowed are {low:g} to {high:g} °C"
     if e.run_count < limits.runs:
         yield f"RUNS: {e.run_count}, needed are {limits.runs}"
-    if not e.drift_mm <= limits.drift_mm:
-        yield f"DRIFT: {e.drift_mm * 1e3:.1f} µm between the first and the last run, allowed are {limits.drift_mm * 1e3:.1f} µm"
+    if drift := drift_reason(e.drift_mm, limits):
+        yield drift
     if promise := promise_reason(e.before_mm, e.after_mm, e.u_mm, limits):
         yield f"PROMISE: {promise}"
     if not e.calibrated_until_s:
         yield "CERTIFICATE: the instruments have no calibration certificate"
     elif not min(e.calibrated_until_s) >= newest_s:
         yield "CERTIFICATE: a calibration had expired when it was measured"
+
+
+def drift_reason(drift_mm: float, limits: PushLimits) -> str:
+    """Why the machine has drifted too far between the first and the last run; empty: it has not."""
+    if drift_mm <= limits.drift_mm:
+        return ""
+    return f"DRIFT: {drift_mm * 1e3:.1f} µm between the first and the last run, allowed are {limits.drift_mm * 1e3:.1f} µm"
 
 
 def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushLimits) -> str:
@@ -120,7 +127,7 @@ def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushL
 
 
 def _policy(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """What only holds when nobody is there: an unattended loop may not walk away, nor hurry."""
+    """Limits of unattended pushes only: a loop without a person may neither drift away nor hurry."""
     if scene.attended:
         return
     if scene.now_s - scene.last_push_s < limits.unattended_h * 3600.0:

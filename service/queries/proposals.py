@@ -8,13 +8,12 @@ from typing import Literal
 
 from abbe.service.compensation.proposal_diff import ACTIVE, TableDifference, compare
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import ProposalStatus, status_of_proposal
+from abbe.service.compensation.proposal_states import ProposalStatus, proposal_status
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import NotStored, Unusable
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import JournalEntry
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
+from abbe.service.tables.push_journal import JournalView
 
 ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
 OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
@@ -62,28 +61,18 @@ class ProposalDetail(ProposalSummary):
 
 
 class _Standings:
-    """Where proposals of one store stand; journals and tables are read once for all of them."""
+    """Where proposals of one store stand; journals are read once for all of them."""
 
     def __init__(self, reader: Reader) -> None:
         self._reader = reader
-        self._tables = {table.id: table.doc for table in reader.store.tables.all()}
-        self._journals: dict[str, list[JournalEntry]] = {}
+        self._journals: dict[str, JournalView] = {}
 
     def of(self, number: int, proposed: Proposed) -> ProposalStatus:
         """Where one stands."""
         store, machine = self._reader.store, proposed.candidate.machine
         if machine not in self._journals:
-            self._journals[machine] = read_entries(store, machine, self._reader.control_of(machine))
-        entries = self._journals[machine]
-        return status_of_proposal(
-            number,
-            proposed,
-            store.proposals.approvals(number),
-            entries,
-            self._tables,
-            self._reader.now_s,
-            store.proposals.rejections(number),
-        )
+            self._journals[machine] = JournalView.read(store, machine, self._reader.control_of(machine))
+        return proposal_status(store, number, proposed, self._reader.now_s, self._journals[machine])
 
 
 def proposals(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[ProposalSummary], int | None]:

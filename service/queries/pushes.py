@@ -7,7 +7,7 @@ from typing import Any
 
 from abbe.service.domain.decisions import PushTransition
 from abbe.service.queries.reader import Reader, of_row
-from abbe.service.tables.table_history import TableHistory, table_history
+from abbe.service.tables.push_journal import JournalView, TableHistory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,4 +41,4 @@ def push_entry(reader: Reader, number: int) -> PushEntryDetail:
 
 def tables(reader: Reader) -> TableHistory:
     """The table in force on this service's machine, its pushes, and what can be ordered back. Raises JournalChanged."""
-    return table_history(reader.store, reader.machine, reader.control)
+    return JournalView.read(reader.store, reader.machine, reader.control).history()

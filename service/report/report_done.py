@@ -12,8 +12,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import WORD, JournalBroken, JournalEntry, check_chain, facts
+from abbe.service.push.entries import NOT_YET, WORD, JournalBroken, JournalEntry, PushFacts, check_chain, facts
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
@@ -25,7 +24,7 @@ from abbe.service.report.report_table import table_said
 from abbe.service.report.report_then import of_then
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import tables_from_image
-from abbe.service.tables.push_history import push_log
+from abbe.service.tables.push_journal import JournalView, push_log
 from abbe.service.verification.iso_report import Evaluated, evaluate
 from abbe.service.verification.verify import COVERAGE
 
@@ -117,18 +116,19 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     NotStored
         The machine has no push of this number.
     """
-    entries = read_entries(store, machine)
+    history = JournalView.read(store, machine, origins=False)
+    entries = history.entries
     journal = tuple(e for e in entries if e.push == number != WORD)
     if not journal:
         raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
     known = facts(journal)
-    machine = str(known.get("machine", machine))  # as it was called then
+    machine = known.machine or machine  # as it was called then
     doc = _machine_doc(store, machine)
     verified = [v for v in store.verifications.latest(limit=MANY) if _is_of(store, v, machine, number)]
     campaigns = [from_store(store, store.campaigns.find(v.campaign_id).name) for v in verified if v.campaign_id is not None]
     runs = [r for c in campaigns for r in c.runs]
     condition, remarks = parts.conditions(runs, rules) if runs else ({}, [])
-    tables = _tables(str(known.get("image", "")))
+    tables = _tables(known.image)
     lines = [(str(e.seq), line) for e, line in zip(journal, push_log(journal), strict=True)]
     document = Document(
         kind="push",
@@ -144,7 +144,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
             "Corrections are what the controller adds to the command, as the independent decoder reads them; they have no U of their own."
         ],
         provenance=parts.provenance(parts.doc_digest([e.digest for e in journal]))
-        | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": str(known.get("meaning", ""))},
+        | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": known.meaning},
         appendix=[*_drawn(tables), Section("Journal", [TextTable(("Entry", "What happened"), lines)])],
     )
     return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is PushState.KEEP else document
@@ -159,26 +159,25 @@ def _machine_doc(store: Store, machine: str) -> Doc:
     return next(m.doc for m in reversed(store.machines.all()) if m.name == machine)
 
 
-def _about(store: Store, journal: Sequence[JournalEntry], known: Doc) -> dict[str, str]:
+def _about(store: Store, journal: Sequence[JournalEntry], known: PushFacts) -> dict[str, str]:
     out = {"Begun": journal[0].utc, "Last entry": journal[-1].utc, "State": str(journal[-1].state)}
-    if "crc" in known:
-        out["New table"] = f"CRC {known['crc']:08X}, bank {known['target']}"
-        out["Table before"] = f"CRC {known['base_crc']:08X}, bank {known['base_bank']}"
-    if known.get("table"):
-        table = store.tables.get(int(known["table"]))
+    if known.crc != NOT_YET:
+        out["New table"] = f"CRC {known.crc:08X}, bank {known.target}"
+        out["Table before"] = f"CRC {known.base_crc:08X}, bank {known.base_bank}"
+    if known.table:
+        table = store.tables.get(known.table)
         out["Stored as"] = f"table {table.id}" + ("" if table.solution_id is None else f", from solution {table.solution_id}")
-    out["Capability of the control"] = f"level {known.get('level', 'unknown')}" + (", a person is there" if known.get("attended") else "")
-    for key, name in (("approved_by", "Approved by"), ("probe", "Proof of sign, axis and unit"), ("verify", "Verification")):
-        if known.get(key):
-            out[name] = str(known[key])
-    return out
+    out["Capability of the control"] = f"level {'unknown' if known.level == NOT_YET else known.level}" + (
+        ", a person is there" if known.attended else ""
+    )
+    found = {"Approved by": known.approved_by, "Proof of sign, axis and unit": known.probe, "Verification": known.verify}
+    return out | {name: text for name, text in found.items() if text}
 
 
-def _verdict(journal: Sequence[JournalEntry], known: Doc) -> tuple[Sign, str, str]:
+def _verdict(journal: Sequence[JournalEntry], known: PushFacts) -> tuple[Sign, str, str]:
     state = journal[-1].state
     sign, word = ENDS.get(state, ("open", "Not ended"))
-    reasons = "; ".join(str(r) for r in known.get("reasons", []))
-    why = str(known.get("why") or known.get("verify") or reasons or "")
+    why = known.why or known.verify or "; ".join(known.reasons)
     return sign, word, (why or f"it stands at {state}") + ("" if state in TERMINAL else f" (state {state})")
 
 
@@ -190,10 +189,10 @@ def _chain(entries: Sequence[JournalEntry]) -> list[str]:
     return []
 
 
-def _tables(image: str) -> NineTables | None:
+def _tables(image: bytes) -> NineTables | None:
     try:
-        return tables_from_image(bytes.fromhex(image)) if image else None
-    except (TableMismatch, ValueError):
+        return tables_from_image(image) if image else None
+    except TableMismatch:
         return None
 
 

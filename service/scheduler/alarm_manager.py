@@ -26,7 +26,7 @@ from abbe.service.scheduler.ports import Doc, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import OPEN, STOPPED, by_journal, in_force, last_push
+from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, put_right
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
 
@@ -141,7 +141,7 @@ class AlarmManager(RetryingStore):
             if entry.kind == AlarmKind.PUSHED and entry.doc.get("word") != OPEN:
                 continue
             proposal, after = int(entry.doc["proposal"]), int(entry.doc.get("after", 0))
-            now = await asyncio.to_thread(in_force, self._store, self._machine, proposal, after) or NOTHING_YET
+            now = await asyncio.to_thread(self._of_proposal, proposal, after) or NOTHING_YET
             if entry.kind == AlarmKind.PUSHING or now.word != OPEN:
                 text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
                 await self._record_pushed(entry.alarm, proposal, after, JobOutcome(now.word, text))
@@ -155,20 +155,24 @@ class AlarmManager(RetryingStore):
 
     async def settled(self, found: Approved, after: int, reported: JobOutcome) -> JobOutcome:
         """Record how a push later than ``after`` ended, by the journal; return that."""
-        done = await self._read(by_journal, self._store, self._machine, found.proposal, after, reported)
+        done = put_right(await self._read(self._of_proposal, found.proposal, after), reported)
         await self._record_pushed(found.alarm, found.proposal, after, done)
         return done
 
     async def last_push(self) -> int:
         """Return the number of the machine's last push."""
-        return await self._read(last_push, self._store, self._machine)
+        return (await self._read(JournalView.read, self._store, self._machine)).last_push
 
     async def interrupted(self, found: Approved, after: int) -> None:
         """Record at once where a push stands that is interrupted by the end of the service."""
-        done = await asyncio.to_thread(in_force, self._store, self._machine, found.proposal, after) or NOTHING_YET
+        done = await asyncio.to_thread(self._of_proposal, found.proposal, after) or NOTHING_YET
         log.warning("the push was interrupted by the end of the service", word=done.word, text=done.text)
         text = f"{done.text} (stopped with the service)"
         await self._record_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
+
+    def _of_proposal(self, proposal: int, after: int) -> JobOutcome | None:
+        """How the last push of a proposal stands, by the journal as it is now."""
+        return JournalView.read(self._store, self._machine).of_proposal(proposal, after)
 
     async def _record_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
         text = f"proposal {proposal} {SAID.get(done.word, done.word)}: {done.text}"

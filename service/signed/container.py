@@ -56,7 +56,7 @@ class Claims:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedContent:
-    """What the machine at hand is: the claims have to be about it. ``base`` None: not known here, then it is only told."""
+    """What the machine at hand is: the claims have to be about it. ``base`` None: not known here, then it is only reported."""
 
     machine: str
     limits: str
@@ -96,7 +96,7 @@ def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, 
     Raises
     ------
     SignatureRefused
-        Not as signed, by a key that nobody trusts, for another machine, base, limits or format, or expired.
+        Not as signed, by a key that is not trusted, for another machine, base, limits or format, or expired.
     """
     key, claims, signature = _parts(sealed)
     if key not in expected.trusted:

@@ -13,11 +13,10 @@ from abbe.drivers.api import TableController
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import TableMismatch
-from abbe.service.push.book import read_entries
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables import table_gate
-from abbe.service.tables.push_history import wanted_by
+from abbe.service.tables.push_journal import JournalView
 from abbe.service.tables.table_gate import InForceNow
 from abbe.service.tables.unverified import KnownState, known_tables
 
@@ -31,9 +30,9 @@ class InForce:
     bank, crc : int
         The active bank and the CRC-32 of its content.
     wanted : int or None
-        CRC of the table that was kept or accepted last, else of the one that the first push found; None: nobody knows.
+        CRC of the table that was kept or accepted last, else of the one that the first push found; None: not known.
     settled : bool
-        False: a push is on its way, or a person has to look at one; nothing can be told by comparing.
+        False: a push is on its way, or a person has to look at one; comparing says nothing.
     unverified : str
         Which push brought it, where nothing has verified it; else empty.
     strange : bool
@@ -64,7 +63,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
             chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
             now = await _seen(session.controller, known, chain, corrects)
         # After the controller: a push that ended in between is known to the journal before it can be missed here.
-        wanted, settled = wanted_by(await asyncio.to_thread(read_entries, store, site.name, site.control))
+        wanted, settled = (await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)).wanted
         push = now.unverified
         whose = "" if push is None else f"push {push.push} of machine {push.machine!r}"
         return InForce(now.status.active_bank, now.crc, wanted, settled, whose, now.strange or now.elsewhere is not None)

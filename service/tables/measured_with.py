@@ -11,8 +11,8 @@ from typing import Any
 
 from abbe.service.domain.document import Doc
 from abbe.service.errors import FormatRefused
-from abbe.service.push.book import read_entries
 from abbe.service.storage.store import Store
+from abbe.service.tables.push_journal import JournalView
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0
 """Bytes of an image that say its kind (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
@@ -39,17 +39,15 @@ def stored_tables(store: Store, solution_id: int) -> list[Doc]:
     """Tables of a stored solution's runs, also where its document is older than that it names them."""
     solution = store.solutions.get(solution_id)
     runs = [r.start_doc for r in store.runs.all(solution.campaign_id) if r.id in set(solution.run_ids)]
-    told = [start.get("imported", start).get("table", {}) for start in runs]
-    return distinct([t for t in told if "crc" in t] + tables_of(solution.doc))
+    found = [start.get("imported", start).get("table", {}) for start in runs]
+    return distinct([t for t in found if "crc" in t] + tables_of(solution.doc))
 
 
 def images_of(store: Store) -> Images:
     """Images by their CRC, as far as this database has met them: written by a push, or in force before one."""
     found = {t.crc: t.image for t in store.tables.all()}
     for name in {store.machines.get(t.machine_id).name for t in store.tables.all()}:
-        for entry in read_entries(store, name):
-            if "base_image" in entry.doc:
-                found[int(entry.doc["base_crc"])] = bytes.fromhex(entry.doc["base_image"])
+        found |= {push.base_crc: push.base_image for push in JournalView.read(store, name, origins=False).bases() if push.base_image}
     return found.get
 
 
@@ -73,7 +71,7 @@ def check_fresh(tables: list[Doc], images: Images, *, said_so: bool = False) -> 
     Raises
     ------
     FormatRefused
-        A table corrected something, or nobody knows whether it did.
+        A table corrected something, or it is not known whether it did.
     """
     for table in tables:
         image = images(table["crc"])

@@ -50,7 +50,7 @@ class PushedTable:
 class Fine:
     """Why a table is right on one control: a push kept it there, a person vouched for it, or the first push found it in force.
 
-    ``push``: 0 for a person's word before the first; ``by``: who vouched, empty for nobody.
+    ``push``: 0 for a person's word before the first; ``by``: who vouched, empty for no person.
     """
 
     how: How

@@ -43,7 +43,7 @@ OF_WORK = (
     AlarmKind.PUSHED,
 )
 TRIES = 2
-"""So often a step of an investigation may fail, or a campaign not come to its end, before it is left to a person."""
+"""How often a step of an investigation may fail, or a campaign not come to its end, before a person takes over."""
 NO_ALARM = 0
 """Number under which pushes are noted that no alarm has asked for."""
 
@@ -142,7 +142,7 @@ class Alarm:
 
     @property
     def word(self) -> str:
-        """``raised``, ``acknowledged``, ``cleared`` (nobody has acknowledged it) or ``closed``."""
+        """``raised``, ``acknowledged``, ``cleared`` (not acknowledged) or ``closed``."""
         if self.active:
             return "acknowledged" if self.acknowledged_by else "raised"
         return "closed" if self.acknowledged_by else "cleared"

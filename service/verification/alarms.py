@@ -13,9 +13,8 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import NotStored, StoreError
-from abbe.service.push.book import read_entries
-from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
+from abbe.service.tables.push_journal import JournalView
 from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
 from abbe.service.verification.verify import judge
@@ -166,8 +165,8 @@ def series_begins(store: Store, machine: str) -> datetime | None:
 
     A push that came back leaves the series as it is; tables that others have written are not known here.
     """
-    changed = [e.utc for e in read_entries(store, machine) if e.state in (PushState.KEEP, PushState.ACCEPTED)]
-    return datetime.fromisoformat(changed[-1]) if changed else None
+    changed = JournalView.read(store, machine, origins=False).changes
+    return datetime.fromisoformat(changed[-1].utc) if changed else None
 
 
 def look(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> Looked:

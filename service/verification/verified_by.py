@@ -16,19 +16,15 @@ from pydantic import Field, computed_field
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import StoreError
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import JournalBroken, JournalEntry, check_chain, facts
+from abbe.service.push.entries import JournalEntry
 from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_history import KIND, wanted_by
+from abbe.service.tables.push_journal import KIND, JournalView
 
 LOOKED = 20
 """So many of the latest checks are looked at for one that measured something."""
 STRANGE = "CMP-010"
 """Code of the alarm that somebody else has changed the table in force."""
-
-_CHANGES = (PushState.KEEP, PushState.ACCEPTED)
-"""States of a push that bring a table into force. One that was taken back leaves things as they were."""
 
 Word = Literal["verified", "unverified", "unknown"]
 Why = Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"]
@@ -62,7 +58,7 @@ class VerifiedBy:
     utc : datetime or None
         When that was; None for never.
     crc : int or None
-        CRC-32 of the table in force by the push journal; None where there was no push, or nobody knows.
+        CRC-32 of the table in force by the push journal; None where there was no push, or it is not known.
     since : datetime or None
         When that table came into force by the journal; None where no push brought one. Checks before it are of another table.
     changes : tuple of datetime
@@ -138,16 +134,14 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
     StoreError
         The database does not answer. A journal that was changed is a standing, not an error.
     """
-    entries = read_entries(store, machine, control)
-    try:
-        check_chain(entries)
-    except JournalBroken:
+    journal = JournalView.read(store, machine, control, origins=False)
+    if not journal.sound:
         return VerifiedBy("unknown", "journal")
     checks = store.verifications.of_machine(machine, LOOKED)
-    return of_journal(store, entries, checks, strange=strange or _said_strange(store, machine, entries, checks))
+    return _of_journal(store, journal, checks, strange=strange or _said_strange(store, machine, journal, checks))
 
 
-def _said_strange(store: Store, machine: str, entries: Sequence[JournalEntry], checks: Sequence[VerificationRecord]) -> bool:
+def _said_strange(store: Store, machine: str, journal: JournalView, checks: Sequence[VerificationRecord]) -> bool:
     """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
     the journal's one in force.
     """
@@ -156,19 +150,19 @@ def _said_strange(store: Store, machine: str, entries: Sequence[JournalEntry], c
         return False
     seen = datetime.fromisoformat(said.seen_utc)
     last = _last_measured(checks)
-    if last is not None and _with(store, last, wanted_by(list(entries))[0], seen):
+    if last is not None and _with(store, last, journal.wanted[0], seen):
         return False
-    return all(datetime.fromisoformat(e.utc) <= seen for e in entries if e.state in _CHANGES)
+    return all(datetime.fromisoformat(e.utc) <= seen for e in journal.changes)
 
 
-def of_journal(store: Store, entries: Sequence[JournalEntry], checks: Sequence[VerificationRecord], *, strange: bool = False) -> VerifiedBy:
+def _of_journal(store: Store, journal: JournalView, checks: Sequence[VerificationRecord], *, strange: bool) -> VerifiedBy:
     """The same of a journal that was read and checks, newest first."""
-    crc, settled = wanted_by(list(entries))
-    changed = [e for e in entries if e.state in _CHANGES]
+    crc, settled = journal.wanted
+    changed = journal.changes
     changes = tuple(datetime.fromisoformat(e.utc) for e in changed)
     known: dict[str, Any] = {"crc": crc, "since": changes[-1] if changes else None, "changes": changes}
     if not settled:
-        return VerifiedBy("unverified", "open", entries[-1].push, datetime.fromisoformat(entries[-1].utc), **known)
+        return VerifiedBy("unverified", "open", journal.entries[-1].push, datetime.fromisoformat(journal.entries[-1].utc), **known)
     last = _last_measured(checks)
     if strange:
         return VerifiedBy("unverified", "changed", **known)
@@ -177,16 +171,16 @@ def of_journal(store: Store, entries: Sequence[JournalEntry], checks: Sequence[V
         other = crc is not None and table is not None and table != crc
         return VerifiedBy("unverified" if other else "verified", "other" if other else "check", last.id, started(last), **known)
     if changed:
-        return _since(store, entries, changed[-1], known)
+        return _since(store, journal, changed[-1], known)
     return VerifiedBy("unknown", "never", **known)
 
 
-def _since(store: Store, entries: Sequence[JournalEntry], change: JournalEntry, known: dict[str, Any]) -> VerifiedBy:
+def _since(store: Store, journal: JournalView, change: JournalEntry, known: dict[str, Any]) -> VerifiedBy:
     """No check was measured since a table came into force: what brought it says whether a measurement stands behind it."""
     if change.state is PushState.ACCEPTED:
         return VerifiedBy("unverified", "accepted", change.push, datetime.fromisoformat(change.utc), **known)
-    number = facts(tuple(e for e in entries if e.push == change.push)).get("table")
-    if number and _kind(store, int(number)) == KIND:
+    number = journal.facts(change.push).table
+    if number and _kind(store, number) == KIND:
         return VerifiedBy("unverified", "rollback", change.push, datetime.fromisoformat(change.utc), **known)
     return VerifiedBy("verified", "push", change.push, datetime.fromisoformat(change.utc), **known)
 
@@ -230,7 +224,7 @@ def started(record: VerificationRecord) -> datetime:
 
 
 def table_of(store: Store, record: VerificationRecord) -> int | None:
-    """CRC-32 of the table that was in force while a check was measured; None where nobody wrote it down."""
+    """CRC-32 of the table that was in force while a check was measured; None where it was not recorded."""
     crc = record.doc.get("table_crc")
     if crc is None and record.campaign_id is not None:
         crc = store.campaigns.find(record.campaign_id).doc.get("table_crc")

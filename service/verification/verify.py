@@ -136,7 +136,7 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
     """Keep only if the worst diagonal improved by more than its expanded uncertainty and no other figure got worse (reliability.md H11).
 
     "Worse" is more than the expanded uncertainty of the difference plus `WORSE_SHARE`: a diagonal that happened to be good because errors
-    cancelled may come closer to the others, but only by a small part of what the worst one was. Where that cannot be told, because the two
+    cancelled may come closer to the others, but only by a small part of what the worst one was. Where that is unknown, because the two
     do not compare (`incomparable`) or a figure is less certain than what was gained, the old table comes back as well.
     """
     why = incomparable(before, after, pushed_crc)

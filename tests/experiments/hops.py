@@ -2,6 +2,7 @@
 
     python -m tests.experiments.hops quick-check            # against a simulated machine
     python -m tests.experiments.hops solve FOLDER           # a campaign folder
+    python -m tests.experiments.hops push                   # a table into a simulated control; measurements answer at once
 
 A file is entered when a function of it is called after it was loaded (module and class bodies do not count). Prints each file with its
 calls, then the sum; ``--edges`` also prints which file calls into which.
@@ -10,6 +11,7 @@ calls, then the sum; ``--edges`` also prints which file calls into which.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import json
 import subprocess
 import sys
@@ -21,6 +23,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
+
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("abbe", "service", "drivers", "models")
@@ -146,7 +150,39 @@ def solve(folder: str) -> Hops:
     return command("solve", folder, "--json")
 
 
-PATHS: dict[str, Callable[..., Hops]] = {"quick-check": quick_check, "solve": solve}
+def push() -> Hops:
+    """A push that nobody attends, from the job's side of the push machine to the wire and back; probe and verification answer at once."""
+    from abbe.models.compensation.tables import NineTables
+    from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
+    from abbe.service.config import load_machine
+    from abbe.service.devices.session import DeviceUrls, open_session
+    from abbe.service.push.operations import Verdict
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+    from abbe.service.tables.base_table import read_base
+
+    async def yes() -> Verdict:
+        return Verdict(True, "a stand-in")
+
+    async def work(machine: Path, hops: Hops) -> None:
+        site = site_of(load_machine(machine).machine)
+        x, y, z = (np.linspace(*stroke, 9) for stroke in site.machine.stroke_mm)
+        rising, none = np.linspace(0.0, 0.004, 9)[:, None] * np.ones(3), np.zeros((9, 3))
+        tables = NineTables((x, y, z), (rising, rising, rising), (none, none, none))
+        with Store.open(f"sqlite:///{machine.with_name('push.sqlite3')}") as store:
+            async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
+                wanted = WantedTable(tables, await read_base(session.controller), 100, None, {})
+                pushing = Pushing(session.controller, store, site, level=3, attended=False)
+                with hops.counting():
+                    await pushing.bring(wanted, Questions(list, "an experiment", yes, yes))
+
+    with tempfile.TemporaryDirectory() as folder, simulated(Path(folder)) as machine:
+        hops = Hops()
+        asyncio.run(work(machine, hops))
+        return hops
+
+
+PATHS: dict[str, Callable[..., Hops]] = {"quick-check": quick_check, "solve": solve, "push": push}
 
 
 def main() -> None:

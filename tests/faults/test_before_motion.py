@@ -11,8 +11,8 @@ import pytest
 
 from abbe.drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
 from abbe.service.campaigns.measure import measure
-from abbe.service.compensation.correct import correct, push
-from abbe.service.compensation.gate import PushContext
+from abbe.service.compensation.correct import correct
+from abbe.service.compensation.gate import PushContext, admit
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.needed import needed_by
 from abbe.service.sequences.recipes.recipe import HelixPoints
@@ -108,5 +108,5 @@ async def test_no_table_is_written_that_could_not_be_measured_afterwards(place: 
     with pytest.raises(ConfigError, match=f"add {missing} = "):
         await correct(PushContext(session, store, b.site), "june", [])
     with pytest.raises(ConfigError, match=f"add {missing} = "):
-        await push(PushContext(session, store, b.site), 1, [])
+        await admit(PushContext(session, store, b.site), 1)
     assert b.sim.table_accesses() == []

@@ -181,7 +181,7 @@ def in_force(b) -> list[int]:
 async def test_an_honest_controller_is_proved_and_may_be_pushed_into_by_night(place):
     b, store = place
     assert (await push(b, store, attended=True)).kept  # a real table is in force
-    assert facts(tuple(read_entries(store, "sim")))["level"] == 2  # not proved yet: what the status block shows
+    assert facts(tuple(read_entries(store, "sim"))).level == 2  # not proved yet: what the status block shows
     comp, before = b.sim.world.controller.comp, in_force(b)
     where = b.sim.world.controller.position_mm.copy()
     active = comp.active
@@ -194,12 +194,12 @@ async def test_an_honest_controller_is_proved_and_may_be_pushed_into_by_night(pl
     assert bank.parse(comp.words[1 - active])[0] == 1  # the copy stays
     assert (await level_status(b.session.controller, store, b.site)).hint == ""
     assert (await push(b, store, attended=False, slope=2e-5)).kept
-    assert facts(tuple(e for e in read_entries(store, "sim") if e.push == 2))["level"] == 3
+    assert facts(tuple(e for e in read_entries(store, "sim") if e.push == 2)).level == 3
 
 
 async def test_never_proved_is_for_attended_pushes_only_and_says_so(place):
     b, store = place
-    assert "never proved" in await check_level(b.session.controller, store, b.site)
+    assert "never proved" in (await check_level(b.session.controller, store, b.site)).hint
     with pytest.raises(TableRefused, match="a person who approves has to be at the machine"):
         await check_level(b.session.controller, store, b.site, attended=False)
     gen = b.sim.world.controller.comp.generation

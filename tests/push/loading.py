@@ -10,7 +10,7 @@ from types import ModuleType, SimpleNamespace
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = (
-    "states", "entries", "operations", "levels", "limits", "candidate", "validate_numbers", "approval", "learn", "staging", "back", "order",
+    "states", "order", "entries", "operations", "levels", "limits", "candidate", "validate_numbers", "learn", "staging", "back",
     "machine", "execute", "semantic_digest",
 )  # fmt: skip
 """In the order of their imports."""

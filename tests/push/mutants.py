@@ -23,30 +23,30 @@ MUTANTS: dict[str, Edits] = {
     "journal after the action": (
         (
             "machine",
-            'return record(PushState.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"])',
-            'return record(PushState.ACTIVATING, expect_crc=f["crc"], expect_gen=f["staged_gen"]) if known.asked else '
-            'Operation(OperationKind.ACTIVATE, bank=f["target"], crc=f["crc"], gen=f["staged_gen"], owner=f["owner"])',
+            'return record(PushState.ACTIVATING, expect_crc=f.crc, expect_gen=f.staged_gen)',
+            'return record(PushState.ACTIVATING, expect_crc=f.crc, expect_gen=f.staged_gen) if known.asked else '
+            'Operation(OperationKind.ACTIVATE, bank=f.target, crc=f.crc, gen=f.staged_gen, owner=f.owner)',
         ),
     ),
     "activation sent again blindly": (("machine", "not known.asked and not known.stop:", "(not known.asked or known.doubts):"),),
     "only the first chunk compared": (("learn", "outcome.value == op.data:", "(op.first > 0 or outcome.value == op.data):"),),
     "boot id ignored": (
-        ("machine", '(truth.boot, truth.gen) != (f["boot"], f["probation_gen"])', 'truth.gen != f["probation_gen"]'),
-        ("machine", ' or known.start.boot != f["boot"])', ")"),
+        ("machine", '(truth.boot, truth.gen) != (f.boot, f.probation_gen)', 'truth.gen != f.probation_gen'),
+        ("machine", ' or known.start.boot != f.boot)', ")"),
     ),
-    "generation of the snapshot used": (("machine", 'expect_gen=f["staged_gen"])', 'expect_gen=f["gen"])'),),
+    "generation of the snapshot used": (("machine", 'expect_gen=f.staged_gen)', 'expect_gen=f.gen)'),),
     "generation of the last look used": (
         ("machine", "if truth.gen != gen:", "if False:"),
-        ("machine", 'expect_gen=f["staged_gen"])', "expect_gen=truth.gen)"),
+        ("machine", 'expect_gen=f.staged_gen)', "expect_gen=truth.gen)"),
     ),
     "reasons noted, table written": (("machine", "reasons=reasons) if reasons else", "reasons=reasons) if False else"),),
     "approval of the machine's name": (
-        ("approval", '[known["image"], known["base_image"], known["machine"], known["limits"], expiry]', '[known["machine"], expiry]'),
+        ("entries", '[image.hex(), base_image.hex(), machine, limits, expiry]', '[machine, expiry]'),
     ),
-    "approval without the base": (("approval", 'known["image"], known["base_image"], ', 'known["image"], '),),
+    "approval without the base": (("entries", '[image.hex(), base_image.hex(), ', '[image.hex(), '),),
     "approval never ends": (("machine", "truth.now_s >= known.approved_until_s", "False"),),
     "way back without the old table": (
-        ("back", 'if truth.states[other] is BankState.SEALED and truth.crc[other] == f["base_crc"]:', "if True:"),
+        ("back", 'if truth.states[other] is BankState.SEALED and truth.crc[other] == f.base_crc:', "if True:"),
         ("back", "if step is not None and known.image == base:", "if step is not None:"),
     ),
     "late command not shut out": (("machine", "if not known.fenced:\n        return Operation(OperationKind.RELEASE", "if False:\n        return Operation(OperationKind.RELEASE"),),
@@ -72,13 +72,13 @@ MUTANTS: dict[str, Edits] = {
         (
             "back",
             "return _armed(step.truth, other, PushState.ROLLBACK)",
-            'return Operation(OperationKind.ACTIVATE, bank=other, crc=f["base_crc"], gen=step.truth.gen, owner=known.lease)',
+            'return Operation(OperationKind.ACTIVATE, bank=other, crc=f.base_crc, gen=step.truth.gen, owner=known.lease)',
         ),
     ),
     "another's lease not respected": (
         ("machine", "if isinstance(known.verdict, Refused):\n        return _abandon(f, known, PushState.APPROVED", "if False:\n        return _abandon(f, known, PushState.APPROVED"),
         ("machine", "if isinstance(known.verdict, Done):\n        return record(PushState.LEASED)", "if known.verdict is not None:\n        return record(PushState.LEASED)"),
-        ("machine", 'if truth.owner != f["owner"]:', "if False:"),
+        ("machine", 'if truth.owner != f.owner:', "if False:"),
     ),
     "activated on a lease that ends": (("machine", "truth.lease_ms < LEASE_LEFT_MS", "truth.lease_ms < 0"),),
     "pushed into axes that only just stand": (("machine", "STILL_S = 1.0", "STILL_S = 0.0"),),

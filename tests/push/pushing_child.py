@@ -25,7 +25,6 @@ from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError
 from abbe.service.push import operations as o
 from abbe.service.push.adapter import ControllerPort, PushActors
-from abbe.service.push.approval import approval_digest
 from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import check_chain, facts
 from abbe.service.push.execute import push, recover
@@ -94,7 +93,7 @@ def people(clock: SystemClock, *, better: bool) -> PushActors:
         return []
 
     async def approve(journal: Any) -> o.Approval:
-        return o.Approval(approval_digest(facts(journal), "today"), "a test", "today", clock.monotonic_s() + 60.0)
+        return o.Approval(facts(journal).binding("today"), "a test", "today", clock.monotonic_s() + 60.0)
 
     async def probe(journal: Any) -> o.Verdict:
         return o.Verdict(True, "stand-in")
@@ -145,7 +144,7 @@ def _why(ended: Any) -> str:
     if ended is None:
         return ""
     known = facts(ended.journal)
-    return str(known.get("pending") or known.get("why") or "; ".join(known.get("reasons", [])) or ended.why)
+    return str(known.pending or known.why or "; ".join(known.reasons) or ended.why)
 
 
 def main() -> None:

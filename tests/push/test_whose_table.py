@@ -28,8 +28,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from abbe.service.tables.in_force import look_at_table
 from abbe.service.tables.measured_with import KIND_AT
-from abbe.service.tables.push_outcome import open_pushes
-from abbe.service.tables.table_history import table_history
+from abbe.service.tables.push_journal import JournalView, open_pushes
 from abbe.service.tables.unverified import known_tables
 from abbe.service.verification.verified_by import verified_by
 from tests.faults.sequencer_world import Bench, bench
@@ -165,7 +164,7 @@ async def test_a_verdict_of_the_control_that_had_the_name_before_is_not_this_one
     await pushed(store, "mill", (OLD, NEW), KEPT, HERE)
     await pushed(store, "mill-old", (NEW, THIRD), KEPT, HERE)  # renamed; a new machine is called mill now
     assert verified_by(store, "mill", control=THERE).why == "never"
-    assert (verified_by(store, "mill-old", control=HERE).crc, table_history(store, "mill", THERE).pushes) == (crc32(THIRD), ())
+    assert (verified_by(store, "mill-old", control=HERE).crc, JournalView.read(store, "mill", THERE).history().pushes) == (crc32(THIRD), ())
     await pushed(store, "mill", (b"a", b"b"), TAKEN_BACK, THERE)
     await pushed(store, "mill-old", (THIRD, b"c"), KEPT, HERE)
     by_name = verified_by(store, "mill")
@@ -369,7 +368,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
                 assert await recover(controller, store, again, accept_by="bob") is None  # there is nothing left to accept
             check_chain(read_entries(store, site.name))
             assert [(e.push, e.state, e.doc["by"]) for e in read_entries(store, site.name)] == [(WORD, PushState.ACCEPTED, "ann")]
-            told = table_history(store, site.name)
+            told = JournalView.read(store, site.name).history()
             assert (told.now.how, told.pushes, f"{told.now.crc:08X}") == ("accepted", (), crc)
             await accept(controller, store, site, "eve")  # the same word by `abbe accept-table`
             used = [{"table": {"crc": int(crc, 16), "acting": True}}]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Coroutine
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -283,10 +283,10 @@ class World:
             return self.p.operations.Refused("no")
         f = self.p.entries.facts(self.journal)
         if self.case.approved == "another table":
-            f = f | {"image": self.base.hex()}
+            f = replace(f, image=self.base)
         if self.case.approved == "another base":
-            f = f | {"base_image": self.candidate.hex()}
-        digest = self.p.approval.approval_digest(f, "then")
+            f = replace(f, base_image=self.candidate)
+        digest = f.binding("then")
         return self._question(lambda: self.p.operations.Approval(digest, "a person", "then", self.time_s + self.case.approval_s))
 
     def _probe(self, op: Any) -> Any:

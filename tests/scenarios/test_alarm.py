@@ -18,7 +18,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
 from abbe.service.cli.administration.serve import duties_on
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.proposal_checks import approve
+from abbe.service.compensation.proposal_decisions import approve
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.config import load_machine
@@ -163,7 +163,7 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         assert acknowledge(shop.store, "sim", 1, "otto").word == "acknowledged"
 
         # a person says yes: the service pushes, verifies, keeps, checks again, and the alarm is over
-        approve(shop.store, number, load(shop.store, number), "anna", 1.0, SystemClock())
+        approve(shop.store, number, "anna", 1.0, SystemClock())
         await until(lambda: shop.alarms()[0].last(AlarmKind.PUSHED))
         pushed = shop.alarms()[0].last(AlarmKind.PUSHED)
         assert pushed is not None

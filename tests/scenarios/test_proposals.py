@@ -18,8 +18,9 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.correct import Correction, push
-from abbe.service.compensation.gate import PushContext
-from abbe.service.compensation.proposal_checks import approve, hold
+from abbe.service.compensation.gate import PushContext, admit
+from abbe.service.compensation.proposal_checks import hold
+from abbe.service.compensation.proposal_decisions import approve
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
 from abbe.service.compensation.proposal_states import proposal_status, status_of_proposal
 from abbe.service.compensation.proposals import load_runs, login
@@ -29,13 +30,13 @@ from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.decisions import ProposalApproval
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.errors import StoreError, TableRefused
-from abbe.service.push.book import read_entries
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
+from abbe.service.tables.push_journal import JournalView
 from tests.pretended import as_if_commissioned
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import registers
@@ -111,7 +112,8 @@ def try_push(shop: Shop, store: Store, number: int, *, site: Site | None = None,
         async with open_session((site or shop.site).urls) as session:
             ids = [r.id for r in store.runs.all("start")]
             runs = await load_runs(store, ids)
-            return await push(PushContext(session, store, site or shop.site, clock=Later(hours)), number, runs)
+            context = PushContext(session, store, site or shop.site, clock=Later(hours))
+            return await push(context, await admit(context, number), runs)
 
     return asyncio.run(work())
 
@@ -143,7 +145,7 @@ def test_what_is_not_as_it_was_refuses_the_push_and_writes_nothing(shop, what):
     with Store.open(shop.url) as store:
         number = shop.copy(store)
         if what != "nobody's approval":
-            approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+            approve(store, number, "anna", 24.0, SystemClock())
         with pytest.raises(TableRefused, match=reason):
             try_push(shop, store, number, site=change(shop.site), hours=hours)
         assert store.pushes.entries("sim") == []
@@ -165,7 +167,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
         assert any(reason.startswith("POLICY WALK: ") for reason in against)
         before = next_approved(store, "sim", [], SystemClock().utc().timestamp())
         assert before is None or before.proposal != number  # of this file's other tests
-        row = approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+        row = approve(store, number, "anna", 24.0, SystemClock())
         found = next_approved(store, "sim", [], SystemClock().utc().timestamp())
         assert found == Approved(number, row.id, 0)
         begun: list[int] = []
@@ -186,7 +188,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
 def test_an_approval_ends_and_binds_who_and_what(shop):
     with Store.open(shop.url) as store:
         number = shop.copy(store)
-        approve(store, number, load(store, number), "anna", 0.5, SystemClock())
+        approve(store, number, "anna", 0.5, SystemClock())
         with pytest.raises(TableRefused, match="APPROVAL: the approval of anna expired"):
             try_push(shop, store, number, hours=1.0)
 
@@ -224,7 +226,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
     with Store.open(shop.url) as store:
         plain, sealed = shop.copy(store), shop.copy(store)
         for number in (plain, sealed):
-            approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+            approve(store, number, "anna", 24.0, SystemClock())
         change_row(shop.url, plain, bend, sealed=False)
         change_row(shop.url, sealed, bend, sealed=True)
         with pytest.raises(StoreError, match="was changed after it was stored"):
@@ -244,7 +246,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
 def test_a_restarted_control_with_the_same_table_and_generation_is_refused(shop, tmp_path):
     with simulated(tmp_path, *SIMS) as restarted, Store.open(shop.url) as store:
         number = shop.copy(store)
-        approve(store, number, load(store, number), "anna", 24.0, SystemClock())
+        approve(store, number, "anna", 24.0, SystemClock())
         before = controller_words(restarted)
         assert before[2:] == shop.untouched[2:]  # generation, banks
         assert before[:2] != shop.untouched[:2]  # boot id
@@ -314,12 +316,13 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
         approved = next(e.doc for e in store.pushes.entries("sim") if e.state == "APPROVED")
         assert approved["approval"] == store.proposals.approvals(1)[0].digest  # the machine of the push checked the person's own yes
         assert approved["approved_by"].startswith("anna; pushed by ")
-        entries, docs, proposed = read_entries(store, "sim"), {t.id: t.doc for t in store.tables.all()}, load(store, 1)
+        journal, proposed = JournalView.read(store, "sim"), load(store, 1)
         now_s = SystemClock().utc().timestamp()
         assert proposal_status(store, twin, proposed, now_s).word == "superseded"  # of the same time: banks were written since
-        for k, word in ((0, "proposed"), (1, "pushed"), (len(entries) - 1, "pushed"), (len(entries), "kept")):
-            assert status_of_proposal(1, proposed, [], entries[:k], docs, now_s).word == word
-        assert status_of_proposal(1, proposed, [], [], docs, proposed.valid_until_s).word == "expired"
+        count = len(journal.entries)
+        for k, word in ((0, "proposed"), (1, "pushed"), (count - 1, "pushed"), (count, "kept")):
+            assert status_of_proposal(1, proposed, [], [], replace(journal, entries=journal.entries[:k]), now_s).word == word
+        assert status_of_proposal(1, proposed, [], [], JournalView(), proposed.valid_until_s).word == "expired"
     pushed = shop.words()
     code, out = abbe("push", shop.file, str(twin), "--before", "start")
     assert code == 1

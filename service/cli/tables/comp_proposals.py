@@ -151,14 +151,14 @@ def approve(
 ) -> None:
     """Approve exactly this table on exactly this base, for this machine, under these limits (exit code 1: it cannot be approved)."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_states import approve_waiting
+    from abbe.service.compensation.proposal_decisions import approve as work_approve
     from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
-    from abbe.service.tables.push_outcome import open_pushes
+    from abbe.service.tables.push_journal import open_pushes
 
     with open_store(database_url(db, machine)) as store:
         try:
-            done = approve_waiting(store, proposal, name.strip() or login(), hours, SystemClock())
+            done = work_approve(store, proposal, name.strip() or login(), hours, SystemClock())
         except TableRefused as error:
             typer.echo(f"not approved: {error}")
             raise typer.Exit(1) from None
@@ -187,13 +187,13 @@ def reject(
 ) -> None:
     """Reject a proposal for good: it cannot be approved or pushed any more (exit code 1: it cannot be rejected any more)."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_states import reject_waiting
+    from abbe.service.compensation.proposal_decisions import reject as work_reject
     from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
 
     with open_store(database_url(db, machine)) as store:
         try:
-            done = reject_waiting(store, proposal, name.strip() or login(), reason, SystemClock())
+            done = work_reject(store, proposal, name.strip() or login(), reason, SystemClock())
         except TableRefused as error:
             typer.echo(f"not rejected: {error}")
             raise typer.Exit(1) from None

@@ -31,7 +31,7 @@ def push(
     from abbe.service.cli.running import run_job
     from abbe.service.cli.waiting import taken_back_when_safe
     from abbe.service.compensation.correct import push as work_push
-    from abbe.service.compensation.gate import NotAdmitted, PushContext, admit
+    from abbe.service.compensation.gate import PushContext, admit
     from abbe.service.config import load_machine
     from abbe.service.errors import TableRefused
     from abbe.service.site import site_of
@@ -45,17 +45,17 @@ def push(
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink)
-                said.append((await admit(context, proposal)).hint)
+                admission = await admit(context, proposal)
+                said.append(admission.hint)
                 runs = await verification_before(session, store, site, before, sink)
                 async with taken_back_when_safe(session, store, site, wait_s):
-                    return await work_push(context, proposal, runs)
+                    return await work_push(context, admission, runs)
 
     with Store.open(loaded.database_url) as store:
         try:
             found = run_job(work(store))
         except TableRefused as error:  # the answer is no, not a fault
-            reasons = error.reasons if isinstance(error, NotAdmitted) else (error.detail,)
-            for reason in (*reasons, *getattr(error, "__notes__", [])):
+            for reason in (*error.reasons, *getattr(error, "__notes__", [])):
                 typer.echo(f"not pushed: {reason}")
             raise typer.Exit(1) from None
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)

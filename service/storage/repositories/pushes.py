@@ -106,7 +106,7 @@ def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) 
     if own is not None:
         return own
     # A control that is nowhere noted: at a new address. The journal of its name is its, unless a machine of another name has used it
-    # since. An open push in it is held against the control (`abbe.service.tables.whose_push`).
+    # since. An open push in it is held against the control (`abbe.service.compensation.recover.is_own`).
     named = next((chain for chain, (name, _) in last.items() if name == machine), None)
     if named is not None:
         return named

@@ -9,7 +9,8 @@ from typing import Annotated
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import Response
 
-from abbe.service.compensation.proposal_states import approve_waiting, reject_waiting
+from abbe.service.compensation.proposal_decisions import approve as work_approve
+from abbe.service.compensation.proposal_decisions import reject as work_reject
 from abbe.service.queries import proposals as proposed
 from abbe.service.queries import pushes
 from abbe.service.queries.reader import as_stored
@@ -68,7 +69,7 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
 
         def work() -> Decision:
             with _stored(sources, number):
-                done = approve_waiting(reader.store, number, name, body.hours, reader.clock, account)
+                done = work_approve(reader.store, number, name, body.hours, reader.clock, account)
             return Decision(proposal=number, decision="approved", by=name, utc=done.utc, expiry=done.expiry)
 
         return await once(reader.store, request, key, body, work)
@@ -82,7 +83,7 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
 
         def work() -> Decision:
             with _stored(sources, number):
-                done = reject_waiting(reader.store, number, name, reason, reader.clock, account)
+                done = work_reject(reader.store, number, name, reason, reader.clock, account)
             return Decision(proposal=number, decision="rejected", by=name, utc=done.utc, reason=done.reason)
 
         return await once(reader.store, request, key, body, work)

@@ -10,7 +10,7 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import AfterValidator
 
-from abbe.service.compensation.proposal_states import approve_waiting
+from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.errors import NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
 from abbe.service.queries.proposals import proposals
@@ -166,7 +166,7 @@ def _add_approval(app: FastAPI, context: PageContext) -> None:
         account = visit.principal.name
         name = account.partition(":")[2].partition("/")[0]
         try:
-            await context.read(approve_waiting, context.store, number, name, hours, context.reader.clock, account)
+            await context.read(work_approve, context.store, number, name, hours, context.reader.clock, account)
         except TableRefused as error:
             return problem(409, str(error), error.code)
         except NotStored as error:

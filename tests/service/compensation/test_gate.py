@@ -8,24 +8,27 @@ from typing import Any, cast
 import pytest
 
 from abbe.service.compensation import gate
-from abbe.service.compensation.gate import NotAdmitted, PushContext
+from abbe.service.compensation.gate import PushContext
+from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.errors import TableRefused
+from abbe.service.push.levels import Capabilities
 
 
 class Control:
     """What the gate asks, answered as each test wants it; ``asked``: what was asked."""
 
     def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, *, commissioned: bool = True, level: bool = True, reasons: tuple[str, ...] = ()
-    ) -> None:
+        self, monkeypatch: pytest.MonkeyPatch, *, commissioned: bool = True, level: bool = True,
+        reasons: tuple[str, ...] = (), recovered: bool = False,
+    ) -> None:  # fmt: skip
         self.asked: list[str] = []
 
         def answers(name: str, good: bool, detail: str, remedy: str) -> Any:
-            async def check(*_: object, **options: object) -> str:
+            async def check(*_: object, **options: object) -> LevelStatus:
                 self.asked.append(name)
                 if not good:
                     raise TableRefused(detail, remedy)
-                return "a hint"
+                return LevelStatus(Capabilities(), "a hint")
 
             return check
 
@@ -41,12 +44,14 @@ class Control:
         monkeypatch.setattr(gate, "hold", hold)
         site = SimpleNamespace(machine=None, watching=SimpleNamespace(air_c=None))
         monkeypatch.setattr(gate, "verification", lambda *_, **__: None)
-        self.context = PushContext(cast("Any", SimpleNamespace(controller=None)), cast("Any", None), cast("Any", site), attended=False)
+        self.context = PushContext(
+            cast("Any", SimpleNamespace(controller=None, recovered=recovered)), cast("Any", None), cast("Any", site), attended=False
+        )
 
 
 async def test_all_reasons_come_at_once_with_the_first_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch, commissioned=False, level=False, reasons=("STALE: measured 80 h ago", "APPROVAL: none"))
-    with pytest.raises(NotAdmitted) as closed:
+    with pytest.raises(TableRefused) as closed:
         await gate.admit(control.context, 4)
     assert closed.value.reasons == ("never proved", "level 1 is too low", "STALE: measured 80 h ago", "APPROVAL: none")
     assert closed.value.remedy == "abbe comp commission"
@@ -59,13 +64,25 @@ async def test_each_question_is_asked_once_and_the_old_push_comes_first(monkeypa
     assert admission.hint == "a hint"
 
 
+async def test_a_session_that_recovered_when_it_was_opened_does_not_recover_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control(monkeypatch, recovered=True)
+    await gate.admit(control.context, 4)
+    assert control.asked == ["devices", "commissioned", "level", "hold attended=False"]
+
+
+async def test_what_was_asked_before_the_proposal_was_made_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    control = Control(monkeypatch)
+    await gate.admit(control.context, 4, await gate.ready(control.context))
+    assert control.asked == ["recover", "devices", "commissioned", "level", "hold attended=False"]
+
+
 async def test_before_a_proposal_only_the_control_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch)
-    assert await gate.ready(control.context) == "a hint"
+    assert (await gate.ready(control.context)).hint == "a hint"
     assert control.asked == ["recover", "devices", "commissioned", "level"]
 
 
 async def test_a_control_that_was_never_proved_stops_the_measurement_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch, commissioned=False)
-    with pytest.raises(NotAdmitted, match="never proved"):
+    with pytest.raises(TableRefused, match="never proved"):
         await gate.ready(control.context)

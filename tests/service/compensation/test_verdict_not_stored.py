@@ -37,7 +37,7 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
         )
 
         class Work(correct._Correcting):
-            def reasons(self) -> list[str]:
+            def drifted(self) -> list[str]:
                 return []
 
         class Decided:
@@ -50,7 +50,7 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
                 return PushResult(1, 1, 1, 7, 0, 5, kept, "as decided", ())
 
         held = SimpleNamespace(by="anna", approval=lambda clock: None)
-        work = Work(cast("Any", bench), cast("Any", held), None, None, AFTER)
+        work = Work(cast("Any", bench), cast("Any", SimpleNamespace(held=held, level=3)), None, None, AFTER)
         monkeypatch.setattr(correct, "Pushing", Decided)
         await correct._push_and_verify(work, cast("Any", None))
         (stored,) = store.verifications.latest()

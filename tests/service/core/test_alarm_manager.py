@@ -38,7 +38,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_outcome import by_journal, open_push
+from abbe.service.tables.push_journal import JournalView, put_right
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
@@ -354,7 +354,7 @@ async def test_the_word_is_that_of_the_journal(bench: Bench, states: tuple[Push,
     bench.push = push
     said, text = await bench.pushed()
     assert (said, part in text) == (word, True), text
-    assert (open_push(bench.store, "mill-7") != "") == (word == "open")
+    assert (JournalView.read(bench.store, "mill-7").open_push != "") == (word == "open")
 
 
 async def test_a_push_before_this_one_says_nothing_of_it(bench: Bench) -> None:
@@ -366,8 +366,9 @@ async def test_a_push_before_this_one_says_nothing_of_it(bench: Bench) -> None:
 
     bench.push = push
     assert (await bench.pushed())[0] == "failed"
-    assert by_journal(bench.store, "mill-7", 4, 0, JobOutcome("failed", "")).word == "kept"
-    assert by_journal(bench.store, "mill-7", 5, 0, JobOutcome("failed", "")).word == "failed"
+    journal, heard = JournalView.read(bench.store, "mill-7"), JobOutcome("failed", "")
+    assert put_right(journal.of_proposal(4), heard).word == "kept"
+    assert put_right(journal.of_proposal(5), heard).word == "failed"
 
 
 async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -379,7 +380,7 @@ async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(be
     bench.push = push
     bench.clock.sleep = lambda s: asyncio.sleep(0)  # type: ignore[method-assign]
     with monkeypatch.context() as patch:
-        patch.setattr("abbe.service.scheduler.alarm_manager.by_journal", _unreadable)
+        patch.setattr(JournalView, "of_proposal", _unreadable)
         with pytest.raises(StoreError):
             await bench.pushed()
     assert [line.kind for line in bench.lines()] == [AlarmKind.PUSHING]
@@ -402,7 +403,7 @@ async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: B
 
     bench.push = push
     task = asyncio.create_task(bench.pushed())
-    await bench.until(lambda: open_push(bench.store, "mill-7").startswith("push 1 stands at PROBED"))
+    await bench.until(lambda: JournalView.read(bench.store, "mill-7").open_push.startswith("push 1 stands at PROBED"))
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task

@@ -29,8 +29,7 @@ from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_history import KIND
-from abbe.service.tables.table_history import table_history
+from abbe.service.tables.push_journal import KIND, JournalView
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
 from abbe.service.users.roles import Permission, Role
@@ -125,7 +124,7 @@ async def test_it_is_a_job_with_who_and_why_in_the_audit(bench: Bench) -> None:
     assert (order.push, order.crc, order.ordered.who, order.ordered.reason) == (1, crc32(NEW), "user:ann", "worse")
     assert bench.recorded() == [("user:ann", "rollback", "begun", "worse"), ("user:ann", "rollback", "kept", "worse")]
     assert bench.audit.verify() == []
-    told = table_history(bench.store, MACHINE)
+    told = JournalView.read(bench.store, MACHINE).history()
     assert (told.now.crc, told.now.how, told.now.push) == (crc32(OLD), "ordered", 2)
     assert (told.pushes[0].why, told.pushes[1].proposal) == ("worse", 4)
     assert (told.pushes[1].word, told.pushes[1].text) == ("kept", "better")  # and not that it is in force: it is not any more
@@ -169,7 +168,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
     await bench.push({}, NEW, OTHER, UP_TO_ACTIVE)
     answer = await bench.ask(push=2)
     assert (answer.outcome, answer.text.split(":")[0]) == ("conflict", "which table is in force is not known")
-    assert table_history(bench.store, MACHINE).now.crc is None
+    assert JournalView.read(bench.store, MACHINE).history().now.crc is None
     assert (bench.orders_seen, bench.book.seen(), bench.recorded()) == ([], (), [])
 
 

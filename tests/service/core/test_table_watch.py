@@ -14,7 +14,7 @@ from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWa
 from abbe.service.push.entries import JournalEntry
 from abbe.service.push.states import PushState
 from abbe.service.tables.in_force import InForce
-from abbe.service.tables.push_history import wanted_by
+from abbe.service.tables.push_journal import JournalView
 from tests.service.core.fakes import FakeClock, FakeShelf, settle, utc
 
 OURS = InForce(0, 0xA, 0xA)
@@ -179,4 +179,4 @@ ON_STRANGE = {"crc": 5, "base_crc": 9}
     ],
 )
 def test_what_the_journal_left_in_force(journal: list[JournalEntry], wanted: tuple[int | None, bool]) -> None:
-    assert wanted_by(journal) == wanted
+    assert JournalView(tuple(journal)).wanted == wanted

@@ -7,8 +7,9 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from abbe.service.compensation.proposal_decisions import approve, reject
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import approve_waiting, proposal_status, reject_waiting
+from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.errors import NotStored, TableRefused, Unusable
 from abbe.service.queries.proposals import ProposalSummary, difference, proposal, proposals
 from abbe.service.queries.reader import Reader
@@ -40,14 +41,14 @@ def test_a_changed_row_says_so_and_promises_nothing(reader: Reader) -> None:
 def test_a_decision_moves_the_state_once(reader: Reader, plant: Plant) -> None:
     row = plant.store.proposals.get(plant.approvable[0])
     number = plant.store.proposals.add(row.machine, row.solution_id, row.doc, row.digest)
-    approve_waiting(plant.store, number, "anna", 1.0, plant.clock, "user:anna")
+    approve(plant.store, number, "anna", 1.0, plant.clock, "user:anna")
     found = proposal(reader, number)
     assert (found.state, found.waits, [one.name for one in found.approvals]) == ("approved", True, ["anna"])
-    reject_waiting(plant.store, number, "kim", "too warm", plant.clock, "user:kim")
+    reject(plant.store, number, "kim", "too warm", plant.clock, "user:kim")
     found = proposal(reader, number)
     assert (found.state, found.waits, [one.reason for one in found.rejections]) == ("rejected", False, ["too warm"])
     with pytest.raises(TableRefused, match="is rejected: by kim: too warm"):
-        approve_waiting(plant.store, number, "anna", 1.0, plant.clock, "user:anna")
+        approve(plant.store, number, "anna", 1.0, plant.clock, "user:anna")
 
 
 def test_the_difference_to_the_table_in_force_and_to_another(reader: Reader) -> None:

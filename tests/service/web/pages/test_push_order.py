@@ -14,7 +14,7 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, PushNow
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.proposal_states import approve_waiting
+from abbe.service.compensation.proposal_decisions import approve
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
@@ -92,7 +92,7 @@ async def test_only_what_is_approved_is_pushed_and_the_journal_has_the_word(benc
     assert (await bench.ask(999)).outcome == "unknown"
     answer = await bench.ask(refused)
     assert (answer.outcome, answer.text.startswith(f"proposal {refused} is refused")) == ("conflict", True)
-    approve_waiting(bench.store, number, "anna", 1.0, SystemClock(), "user:anna")
+    approve(bench.store, number, "anna", 1.0, SystemClock(), "user:anna")
     first = await bench.ask(number, key="k")
     assert first.outcome == "done", first.text
     done = await bench.ended()

@@ -1,0 +1,391 @@
+"""The pushes of one machine as their journal and the stored tables tell them: how each ended, which table is in force, what can go back.
+
+For readers without a way to a control: what a controller holds is not asked here. Read once (`JournalView.read`), asked often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
+from typing import Any, Literal
+
+from abbe.service.domain.job_state import JobOutcome
+from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
+from abbe.service.push.book import read_entries
+from abbe.service.push.entries import NOT_YET, WORD, Journal, JournalBroken, JournalEntry, PushFacts, check_chain, facts
+from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
+from abbe.service.storage.store import Store
+from abbe.service.tables.unverified import PushedTable, known_tables
+
+KIND = "rollback"
+"""Kind of a table that a person ordered back."""
+STILL_ACTIVE = "the unverified table is STILL ACTIVE"
+OPEN, STOPPED = "open", "stopped"
+NOTHING = "nothing was written"
+
+
+@dataclass(frozen=True, slots=True)
+class TableOrigin:
+    """Why a stored table was pushed: a proposal (0: none), or a person's order (``order``: its number) with a reason."""
+
+    kind: str = "push"
+    proposal: int = 0
+    order: str = ""
+    reason: str = ""
+
+    @classmethod
+    def of(cls, doc: Mapping[str, Any]) -> TableOrigin:
+        """From the document of a stored table."""
+        proposal = doc.get("proposal")
+        number = proposal if isinstance(proposal, int) else 0
+        return cls(str(doc.get("kind", "push")), number, str(doc.get("order", "")), str(doc.get("reason", "")))
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """What the two tables of a push are called in its sentence: the one that comes, the same again in short, and the one that goes."""
+
+    new: str = "the new table"
+    it: str = "the new one"
+    old: str = "the old table"
+
+
+BACK = Names("the table ordered back", "the one ordered back", "the table from before the order")
+
+
+@dataclass(frozen=True, slots=True)
+class PushSummary:
+    """One push. ``proposal``: 0 for none; ``why``: the reason that a person gave for a rollback; ``by``: who approved or ordered it."""
+
+    push: int
+    kind: str
+    proposal: int
+    crc: int
+    base_crc: int
+    begun: str
+    ended: str
+    state: str
+    word: str
+    text: str
+    by: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentTable:
+    """The table in force by the journal.
+
+    ``crc``: None where it is not known, ``text`` says why. ``how``: "verified" by a measurement, "ordered" back by a person without one,
+    "accepted" by a person who looked, "before": it was there before the first push. ``push``: which brought it, 0 for none.
+    """
+
+    crc: int | None
+    how: Literal["", "verified", "ordered", "accepted", "before"]
+    push: int
+    utc: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class RollbackOffer:
+    """What can be ordered back: the table of ``push`` (CRC ``crc``) goes, the one with ``to_crc`` comes."""
+
+    push: int
+    crc: int
+    to_crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class TableHistory:
+    """Everything of a machine's tables. ``offer``: None where nothing can be taken back, ``refusal`` says why."""
+
+    now: CurrentTable
+    pushes: tuple[PushSummary, ...]
+    offer: RollbackOffer | None
+    refusal: str
+
+
+@dataclass(frozen=True)
+class JournalView:
+    """All entries of a machine's pushes, in the order of writing, and the origins of the stored tables by their number.
+
+    `pushes`, and whatever needs them, raises `JournalChanged` where an entry was changed, removed or swapped.
+    """
+
+    entries: tuple[JournalEntry, ...] = ()
+    origins: Mapping[int, TableOrigin] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, store: Store, machine: str, control: str = "", *, origins: bool = True) -> JournalView:
+        """Read the journal of a machine's control, whatever the machine was called.
+
+        Parameters
+        ----------
+        control : str
+            Identity of the control; empty: by the name alone.
+        origins : bool
+            Whether to read the origins of the tables as well; without them a push is none of a proposal and none of an order.
+
+        Raises
+        ------
+        StoreError
+            It cannot be read.
+        """
+        return cls(tuple(read_entries(store, machine, control)), origins_of(store) if origins else {})
+
+    @property
+    def sound(self) -> bool:
+        """Whether the journal is what was written."""
+        try:
+            check_chain(self.entries)
+        except JournalBroken:
+            return False
+        return True
+
+    @cached_property
+    def pushes(self) -> dict[int, Journal]:
+        """Journals of all pushes, by number; a person's word before the first is none."""
+        try:
+            check_chain(self.entries)
+        except JournalBroken as error:
+            raise JournalChanged(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
+        numbers = sorted({e.push for e in self.entries} - {WORD})
+        return {n: self._of(n) for n in numbers}
+
+    def _of(self, push: int) -> Journal:
+        return tuple(e for e in self.entries if e.push == push)
+
+    def facts(self, push: int) -> PushFacts:
+        """What the journal says of a push."""
+        return facts(self._of(push))
+
+    def origin(self, journal: Journal) -> TableOrigin:
+        """Why the table of a push was pushed."""
+        return self.origins.get(facts(journal).table, TableOrigin())
+
+    @property
+    def last_push(self) -> int:
+        """Number of the last push; 0: there was none."""
+        return max((entry.push for entry in self.entries), default=0)
+
+    @property
+    def wanted(self) -> tuple[int | None, bool]:
+        """The CRC that should be in force, and whether the last push has come to its end. None: no push yet, or it is under way.
+
+        A push that came to nothing vouches for nothing: the table that it found in force may be a strange one.
+        """
+        if not self.entries:
+            return None, True
+        last = self.entries[-1]
+        if last.state not in TERMINAL or last.state is PushState.OPERATOR:
+            return None, False
+        for entry in reversed(self.entries):
+            if entry.state is PushState.ACCEPTED:
+                return facts((entry,)).accepted_crc, True
+            if entry.state is PushState.KEEP:
+                return self.facts(entry.push).crc, True
+        bases = (facts((entry,)).base_crc for entry in self.entries if entry.state is PushState.SNAPSHOT)
+        return next((crc for crc in bases if crc != NOT_YET), None), True
+
+    @property
+    def changes(self) -> list[JournalEntry]:
+        """Entries that brought a table into force for good: kept, or vouched for by a person. A push that came back is none."""
+        return [e for e in self.entries if e.state in (PushState.KEEP, PushState.ACCEPTED)]
+
+    def kept(self, before: datetime | None = None) -> list[PushFacts]:
+        """The pushes that were kept, oldest first; ``before``: up to then."""
+        keeps = [e for e in self.entries if e.state is PushState.KEEP]
+        return [self.facts(e.push) for e in keeps if before is None or datetime.fromisoformat(e.utc) <= before]
+
+    @property
+    def last_kept_s(self) -> float:
+        """When a push was kept last, UTC; minus infinity for never."""
+        keeps = [e.utc for e in self.entries if e.state is PushState.KEEP]
+        return datetime.fromisoformat(keeps[-1]).timestamp() if keeps else float("-inf")
+
+    def bases(self) -> Iterator[PushFacts]:
+        """What each push found in force."""
+        return (facts((e,)) for e in self.entries if e.state is PushState.SNAPSHOT)
+
+    def of_proposal(self, proposal: int, after: int = 0) -> JobOutcome | None:
+        """How the last push of a proposal stands, of those later than push ``after``; None: the journal has none, nothing was written."""
+        return self._last_own(lambda number, origin: number > after and origin.proposal == proposal, Names())
+
+    def of_order(self, order: str) -> JobOutcome | None:
+        """How the push of an ordered rollback stands; None: the journal has none, nothing was written."""
+        return self._last_own(lambda _, origin: origin.order == order, BACK)
+
+    def _last_own(self, own: Callable[[int, TableOrigin], bool], names: Names) -> JobOutcome | None:
+        mine = [journal for number, journal in self.pushes.items() if own(number, self.origin(journal))]
+        return outcome_of(mine[-1], names) if mine else None
+
+    @property
+    def open_push(self) -> str:
+        """What is open of the last push, as a sentence; empty if nothing is."""
+        found = outcome_of(self.pushes[max(self.pushes)]) if self.pushes else None
+        return found.text if found is not None and found.word == OPEN else ""
+
+    def last_kept(self) -> Journal:
+        """The last push that was kept and can be taken back.
+
+        Raises
+        ------
+        TableRefused
+            None was kept, or it was a rollback itself.
+        """
+        kept = [j for j in self.pushes.values() if ended_as(j) is PushState.KEEP]
+        if not kept:
+            raise TableRefused("no push of this machine was kept: there is nothing to take back", NOTHING)
+        if self.origin(kept[-1]).kind == KIND:
+            raise TableRefused(
+                f"the last kept push ({kept[-1][-1].push}) was a rollback itself",
+                f"say how far with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
+            )
+        return kept[-1]
+
+    def offer(self) -> RollbackOffer:
+        """What can be ordered back now.
+
+        Raises
+        ------
+        TableRefused
+            Nothing, and why.
+        """
+        if not self.entries:
+            raise TableRefused("no push of this machine is in the journal: there is nothing to take back", NOTHING)
+        crc, settled = self.wanted
+        if crc is None or not settled:
+            text = outcome_of(self._of(self.entries[-1].push)).text
+            raise TableRefused(f"which table is in force is not known: {text}", NOTHING)
+        last = self.last_kept()
+        known = facts(last)
+        if known.crc != crc:
+            raise TableRefused(
+                f"the table in force ({crc:08X}) is not the one of push {last[-1].push}, the last that was kept",
+                f"say which with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
+            )
+        return RollbackOffer(last[-1].push, crc, known.base_crc)
+
+    def history(self) -> TableHistory:
+        """Everything of the machine's tables, newest push first."""
+        summaries = tuple(self._summary(journal) for journal in self.pushes.values())
+        try:
+            offer, refusal = self.offer(), ""
+        except TableRefused as no:
+            offer, refusal = None, no.detail
+        return TableHistory(self._now(summaries), tuple(reversed(summaries)), offer, refusal)
+
+    def _summary(self, journal: Journal) -> PushSummary:
+        last, known, origin = journal[-1], facts(journal), self.origin(journal)
+        outcome = outcome_of(journal, BACK if origin.kind == KIND else Names())
+        # What was in force when it ended need not be now: of a push that has ended only the cause is given.
+        ended = {PushState.KEEP: known.verify, PushState.ROLLED_BACK: known.why, PushState.ABORTED: known.why}
+        return PushSummary(
+            last.push, origin.kind, origin.proposal, known.crc, known.base_crc, journal[0].utc, last.utc, str(last.state),
+            outcome.word, ended.get(last.state, outcome.text), known.approved_by, origin.reason,
+        )  # fmt: skip
+
+    def _now(self, summaries: tuple[PushSummary, ...]) -> CurrentTable:
+        crc, settled = self.wanted
+        if not self.entries:
+            return CurrentTable(None, "", 0, "", "no push of this machine is in the journal")
+        if crc is None or not settled:
+            return CurrentTable(None, "", summaries[-1].push, summaries[-1].ended, summaries[-1].text)
+        for entry in reversed(self.entries):
+            if entry.push == WORD:
+                return CurrentTable(crc, "accepted", 0, entry.utc, "a person vouches for the table that was there before the first push")
+            one = next(t for t in summaries if t.push == entry.push)
+            if entry.state is PushState.ACCEPTED and facts((entry,)).accepted_crc == crc:
+                return CurrentTable(crc, "accepted", one.push, entry.utc, one.text)
+            if entry.state is PushState.KEEP and one.crc == crc:
+                return CurrentTable(crc, "ordered" if one.kind == KIND else "verified", one.push, entry.utc, one.text)
+        return CurrentTable(crc, "before", 0, "", "it was there before the first push")
+
+
+def origins_of(store: Store) -> dict[int, TableOrigin]:
+    """Why each stored table was pushed, by its number."""
+    return {table.id: TableOrigin.of(table.doc) for table in store.tables.all()}
+
+
+def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
+    """What is open of a machine's last push, and of every push of another journal whose table nothing has verified and may be in force:
+    it may be that of this control, under another name or address.
+    """
+    chain, own = store.pushes.chain(machine, control), JournalView.read(store, machine, control).open_push
+    others = [p for p in known_tables(store).unverified.values() if p.may_be_active and p.chain != chain]
+    return [*filter(None, [own]), *map(_other, others)]
+
+
+def _other(push: PushedTable) -> str:
+    at = f" at {push.control}" if push.control else ""
+    what = "its table was never verified; if this is that control, nothing is measured on it"
+    return f"push {push.push} of machine {push.machine!r}{at} stands at {push.state}: {what}"
+
+
+def ended_as(journal: Journal) -> PushState:
+    """The state in which a push stands or came to its end: a person's word for a table, given later, changes nothing of that."""
+    return next((e.state for e in reversed(journal) if e.state is not PushState.ACCEPTED), PushState.ACCEPTED)
+
+
+def push_log(journal: Journal) -> tuple[str, ...]:
+    """Every transition of a push as a line for people."""
+    lines = []
+    for entry in journal:
+        known = facts((entry,))
+        words = [known.why, known.pending, known.again, known.approved_by, known.probe, known.verify]
+        if entry.state is PushState.SNAPSHOT:
+            words = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; to come: CRC {known.crc:08X}"]
+        lines.append(": ".join([str(entry.state), *filter(None, words)]) + f" ({entry.utc})")
+    return tuple(lines)
+
+
+def outcome_of(journal: Journal, names: Names = Names()) -> JobOutcome:
+    """How a push stands by its journal."""
+    last, known = journal[-1], facts(journal)
+    name, why = f"push {last.push}", known.why
+    match last.state:
+        case PushState.KEEP:
+            return JobOutcome("kept", f"{name}: {names.new} is kept and in force: {known.verify}")
+        case PushState.ROLLED_BACK:
+            return JobOutcome("rolled back", f"{name}: {names.old} is in force again: {why}")
+        case PushState.REJECTED:
+            return JobOutcome("refused", f"{name}: nothing was written: {'; '.join(known.reasons) or why}")
+        case PushState.ABORTED:
+            return JobOutcome("failed", f"{name}: {names.old} is in force, {names.it} never was: {why}")
+        case PushState.ACCEPTED:
+            new = known.accepted_crc == known.crc
+            return JobOutcome("kept" if new else "rolled back", f"{name}: a person vouches for {names.new if new else 'another table'}")
+        case PushState.OPERATOR:
+            return JobOutcome(OPEN, f"{operator_needed(journal)}; a person has to look")
+        case state if state in BEFORE_ACTIVATION:
+            return JobOutcome(OPEN, f"{name} stands at {state}: {names.old} is in force; the next start closes the journal")
+    pending = f" ({known.pending})" if known.pending else ""
+    return JobOutcome(
+        OPEN, f"{name} stands at {last.state}{pending}: an unverified table may be in force; it is taken back before anything else"
+    )
+
+
+def put_right(found: JobOutcome | None, heard: JobOutcome) -> JobOutcome:
+    """What was heard of a push, put right by the journal (None: it says nothing): the journal says what is in force."""
+    if found is None:
+        return heard if heard.word in ("refused", STOPPED) else JobOutcome("failed", heard.text)
+    if found.word == heard.word:
+        return heard
+    word = STOPPED if (found.word, heard.word) == ("failed", STOPPED) else found.word
+    return JobOutcome(word, f"{found.text}; {heard.text}")
+
+
+def operator_needed(journal: Journal, detail: str = "") -> TableMismatch:
+    """What a person has to know whom the machine calls: why, and whether the table that nothing has verified is the one in force."""
+    known = facts(journal)
+    cause = f"{detail}; {known.why}" if detail and detail != known.why else known.why
+    if known.controller.in_force == known.crc != NOT_YET:
+        return TableMismatch(
+            f"push {journal[-1].push}: {cause}: {STILL_ACTIVE} (CRC {known.crc:08X})",
+            "do not machine; restore the old table at the controller, or vouch for this one with `abbe accept-table MACHINE.toml`",
+        )
+    return TableMismatch(
+        f"push {journal[-1].push}: {cause}", "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
+    )
