@@ -67,7 +67,7 @@ log = structlog.get_logger("abbe.serve")
 STOP_S = 4.5
 """Promised are 5 s from the signal to the end of the process; what hangs after this is cut off. The store survives that."""
 LEAVE_S = 0.3
-"""So long a thread that still computes is waited for once all is closed."""
+"""Longest wait for a thread that still computes once all is closed, s."""
 HOLD_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0

@@ -30,7 +30,7 @@ LARGEST_B = 256 * 1024
 """The longest message, bytes."""
 MOST_JOBS = 50
 PAGE_MEMORY_MB = 1024
-"""What the page's process gets, where nobody has said otherwise, MiB."""
+"""What the page's process gets, by default, MiB."""
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -60,7 +60,7 @@ class MachineSummary:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """First message of the core: all that the web process has to know. Told here, not by arguments or environment, which others see."""
+    """First message of the core: all that the web process has to know. Other users could read arguments and environment."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["begin"]

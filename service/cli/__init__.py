@@ -92,7 +92,7 @@ def _unwritten(err: OSError) -> int:
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
     if err.errno == errno.EPIPE:
-        return 1  # whoever read this has seen enough, as typer has it
+        return 1  # the reader has seen enough, as typer has it
     return complain("USE-002", f"the output cannot be written: {err.strerror} - give stdout a place to go")
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 async def console_ask(text: str) -> None:
-    """Print what to do and wait for Enter. What was typed before the question is thrown away: nobody confirms what he has not read.
+    """Print what to do and wait for Enter. What was typed before the question is thrown away: people confirm only what they have read.
 
     Raises
     ------

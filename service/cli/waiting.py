@@ -1,4 +1,4 @@
-"""A job ends with an unverified table still active, and somebody is at the console: wait with him until the machine is safe."""
+"""A job ends with an unverified table still active, and a person is at the console: wait with them until the machine is safe."""
 
 from __future__ import annotations
 

@@ -12,13 +12,13 @@ import structlog
 log = structlog.get_logger("abbe.serve")
 
 WORDS_S = 0.25
-"""So long the journal is read for the last word of a forced end."""
+"""Longest time to read the push journal before a forced end, s."""
 LastWords = Callable[[], str]
 """Which push is open, as a sentence; empty: none."""
 
 
 def cut_off_now(words: list[LastWords]) -> None:
-    """End the process. The axes were told to stop first, and the journal of a push is always ahead of what it permits: nothing is lost."""
+    """End the process. The axes were stopped first, and the journal of a push is always ahead of what it permits: nothing is lost."""
     told: list[str] = []
     for one in words:  # in a thread of its own: a database that hangs must not hold up the end
         reading = threading.Thread(target=lambda say=one: told.append(say()), daemon=True)

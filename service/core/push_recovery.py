@@ -1,4 +1,4 @@
-"""What an earlier end has left open - runs in segments, a push on its way - is looked for at start, and told until it is closed.
+"""Recovery of what an earlier end left open - runs in segments, a push under way: at start, and reported until it is closed.
 
 A push of the running service can be left open too, with a table in force that nobody has verified: it is gone back to in the same way.
 """
@@ -44,13 +44,13 @@ class PushRecovery:
     place : MachineClaim
         The machine is ours during a try: no check starts meanwhile.
     alarms : Alarms
-        Told of each new reason why it is not possible.
+        Gets each new reason why it is not possible.
     attention : list of str
         What the page shows until it is done.
     clock : Clock
         Pauses between tries.
     changed : callable
-        Told when ``attention`` has changed.
+        Called when ``attention`` has changed.
     """
 
     def __init__(
@@ -76,10 +76,10 @@ class PushRecovery:
                 await self._clock.sleep(LOOK_S)
 
     async def _left_open(self) -> bool:
-        """Look at the journal alone: nobody is turned away from a machine where there is nothing to take back."""
+        """Look at the journal alone: the machine is not locked where there is nothing to take back."""
         try:
             return await self._is_open()
-        except AbbeError as trouble:  # whoever begins a push or a check needs the same database: the next look is soon
+        except AbbeError as trouble:  # a push or a check needs the same database: the next look is soon
             log.warning("whether a push is open cannot be read now", cause=trouble.detail)
             return False
 

@@ -14,7 +14,7 @@ def may(store: Store, who: str, need: Permission) -> bool:
     store : Store
         Holds the users.
     who : str
-        As `abbe.service.users.people.Principal` names him.
+        As `abbe.service.users.people.Principal` names the user.
     need : Permission
         The right.
     """

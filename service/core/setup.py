@@ -63,7 +63,7 @@ class ServiceSetup:
     duties : callable, optional
         Given the open store, what is done about alarms; None: none are raised.
     table : callable, optional
-        Given the open store, how the table in force is looked at; None: nobody watches it.
+        Given the open store, how the table in force is looked at; None: it is not watched.
     live : LiveFeed, optional
         What ``check`` shows of its paths, for the page.
     summary : MachineSummary, optional

@@ -1,4 +1,4 @@
-"""The table in force is not one that Abbe brought and verified: seen within seconds, told once, shown until a person has looked.
+"""Watches for a table in force that Abbe did not push and verify: seen within seconds, reported once, shown until a person has looked.
 
 Modbus asks nobody for a password: whoever is in the machine's network can put any table into force. Nothing here writes to the
 controller or takes anything back: which table is right is a person's word (``abbe accept-table``).
@@ -29,20 +29,20 @@ REMEDY = "find out who wrote it; restore the right table at the controller, or, 
 
 
 class TableWatch:
-    """Looks at the table in force while nobody works with the machine.
+    """Looks at the table in force while no job has the machine.
 
     Parameters
     ----------
     look : LookAtTable
         One look; it raises what devices and store raise.
     alarms : Alarms
-        Told once of each strange table.
+        Gets each strange table once.
     attention : list of str
         What the page shows until the table is one that Abbe knows.
     clock : Clock
         Pauses.
     changed : callable
-        Told when ``attention`` has changed.
+        Called when ``attention`` has changed.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Who is told what the running check does: the board, and with it the page; and the broker."""
+"""Watchers of the running job: the board, and with it the page; and the broker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The web process as the core sees it: started, told how things stand, heard, ended; and started again when it is gone or hangs.
+"""The web process as the core sees it: started, informed, heard, ended; and started again when it is gone or hangs.
 
 Nothing that happens to it may hold up or end the core: it is told without waiting, and what it says is checked before it is believed.
 """
@@ -53,7 +53,7 @@ NO_PATH = LivePath("path", RecordedPath())
 
 async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
     """Tell every path and what it reads, until cancelled. A web process that does not read in time misses samples, and the disk none."""
-    live.stretches()  # what came in while nobody looked on is old: it would be seconds of samples at once
+    live.stretches()  # what came in without a listener is old: it would be seconds of samples at once
     told = 0
     while True:
         await live.active.wait()
@@ -174,7 +174,7 @@ class WebProcess:
         self._heard_s = 0.0
 
     def changed(self) -> None:
-        """Something is to be told."""
+        """Send a snapshot soon: something has changed."""
         self._changed.set()
 
     def stop(self) -> None:
@@ -296,5 +296,5 @@ class WebProcess:
             if self._orders is None:
                 return Answer("answer", message.request, "conflict", "this service takes no orders of tables", "")
             return await (self._orders.rollback(message) if isinstance(message, RollBack) else self._orders.push(message))
-        except AbbeError as error:  # the store does not answer: then nobody is known
+        except AbbeError as error:  # the store does not answer: then no user is known
             return Answer("answer", message.request, "busy", str(error)[:1000], "")

@@ -1,4 +1,4 @@
-"""What a service looks for before its first check, and whenever a push was left open: runs cut off, a push that nobody has finished."""
+"""Recovery before the first check, and whenever a push was left open: interrupted runs, an unfinished push."""
 
 from __future__ import annotations
 

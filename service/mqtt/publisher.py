@@ -51,9 +51,9 @@ class Publisher:
     clock : Clock
         Pauses, and the time in the state message.
     on_change : callable, optional
-        Told True when connected and False when not.
+        Called with True when connected and with False when not.
     on_drop : callable, optional
-        Told how many waiting messages were dropped, because the broker was away for too long.
+        Called with the number of waiting messages that were dropped, because the broker was away for too long.
     """
 
     def __init__(

@@ -248,7 +248,7 @@ class Scheduler:
                     waiting.told = True
                     await self._tell(*outcomes.still_waits(waiting, hindrance))
             else:
-                self._running = waiting.schedule.name  # before anything is awaited: nobody else takes the machine now
+                self._running = waiting.schedule.name  # before anything is awaited: nothing else takes the machine now
                 await self._ledger.begin(waiting.schedule.name, waiting.slot)
                 self._waiting.remove(waiting)
                 tasks.create_task(self._run_check(waiting.schedule, waiting.slot), name=f"check {waiting.schedule.name}")
@@ -293,7 +293,7 @@ class Scheduler:
             state = await self._run_slot(schedule, slot)
             ended = outcomes.SlotOutcome(state, "", state.reason if isinstance(state, SlotState) else "")
         except Exception:
-            ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and nobody has stopped it
+            ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and no person has stopped it
             raise
         finally:
             self.give_back()

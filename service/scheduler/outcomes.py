@@ -25,7 +25,7 @@ class SlotOutcome(NamedTuple):
 
 
 def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutcome:
-    """Nobody was there to start it in time."""
+    """No service was there to start it in time."""
     allowed = span(timedelta(seconds=schedule.grace_s))
     how = span(late)
     return SlotOutcome(
@@ -61,12 +61,12 @@ def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindra
 
 
 def broken_off(name: str, slot: datetime) -> SlotOutcome:
-    """The service ended, by a power cut say, while the check ran. It is not run again: nobody knows how far it got."""
+    """The service ended, by a power cut say, while the check ran. It is not run again: how far it got is not known."""
     return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
 
 
 def stopped(name: str, slot: datetime) -> SlotOutcome:
-    """The service was stopped while it was measured: said at once, or nobody would miss it before the next start."""
+    """The service was stopped while it was measured: said at once, or it would not be missed before the next start."""
     return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service was stopped while it ran")
 
 

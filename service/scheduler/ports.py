@@ -61,7 +61,7 @@ class SlotLedger(Protocol):
         ...
 
     async def begin(self, schedule: str, slot_utc: datetime) -> None:
-        """Note that the check of a claimed slot starts: nobody may start it again."""
+        """Note that the check of a claimed slot starts: it is not started again."""
         ...
 
     async def release(self, schedule: str, slot_utc: datetime) -> None:

@@ -60,7 +60,7 @@ class StoreLedger(RetryingStore):
         return await self._write(self._store.slots.claim, self._key(schedule), slot_utc)
 
     async def begin(self, schedule: str, slot_utc: datetime) -> None:
-        """Note that the check of a claimed slot starts: nobody may start it again."""
+        """Note that the check of a claimed slot starts: it is not started again."""
         await self._write(self._store.slots.begin, self._key(schedule), slot_utc)
 
     async def release(self, schedule: str, slot_utc: datetime) -> None:
@@ -98,7 +98,7 @@ class StoreShelf(RetryingStore):
     topics : tuple of str
         Where verifications and alarms are published; empty if there is no broker in the machine file.
     posted : callable
-        Told when there is something new to publish.
+        Called when there is something new to publish.
     """
 
     def __init__(
