@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from abbe.service.domain.results import SolutionRecord
+from abbe.service.domain.solution_file import BudgetLineValue, MeanValue, MonteCarloCheck, WorstPoint, stored_solution
 from abbe.service.rendering.model import Contribution
 from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, finite, fixed, placed, plain
 from abbe.service.rendering.plots.bars import contribution_bars
@@ -69,48 +69,45 @@ class BudgetScreen:
 
 def budget_screen(store: Store, record: SolutionRecord, say: Say) -> BudgetScreen:
     """The budget as the store has it; nothing is computed anew but the ends of intervals."""
-    doc = record.doc
+    solution = stored_solution(record.doc, record.id)
     campaign = store.campaigns.find(record.campaign_id).name
-    known: Mapping[str, Any] = doc.get("uncertainty") or {}
-    lines = known.get("budget") or []
+    lines, worst, trials = solution.uncertainty.budget, solution.uncertainty.worst_point, solution.monte_carlo
     if not lines:
         return BudgetScreen(record.id, campaign)
-    bars = [Contribution(_name(b), float(b["u_um"])) for b in lines]
-    total = float(np.sqrt(sum(float(b["u_um"]) ** 2 for b in lines)))
-    worst = known["worst_point"]
-    trials = doc.get("monte_carlo") or {}
+    bars = [Contribution(_name(b), b.u_um) for b in lines]
+    total = float(np.sqrt(sum(b.u_um**2 for b in lines)))
     # The SVG writer has escaped every text; escaping again would show the reader the tags.
     picture = Markup(contribution_bars(bars, key="budget", heading=say("budget.bars"), unit=current().drawn()))  # noqa: S704
     return BudgetScreen(
         record.id, campaign, [_source(b) for b in lines], _size(total, 2), picture, _worst(worst),
-        ", ".join(placed(float(v), current().drawn("mm")) for v in worst["at_mm"]), _size(float(worst["expanded_vector_um"]), 2),
-        [_mean(name, m) for name, m in (doc.get("mean_over_volume") or {}).items()], _trials(trials), str(trials.get("text", "")),
-        any("type" not in b for b in lines),
+        ", ".join(placed(v, current().drawn("mm")) for v in worst.at_mm), _size(worst.expanded_vector_um, 2),
+        [_mean(name, m) for name, m in solution.mean_over_volume.items()], _trials(trials), "" if trials is None else trials.text,
+        any(b.type is None for b in lines),
     )  # fmt: skip
 
 
-def _name(b: Mapping[str, Any]) -> str:
+def _name(b: BudgetLineValue) -> str:
     """Short name of a source; as it is where it has no translation."""
-    return current().state("source", str(b["source"]))
+    return current().state("source", b.source)
 
 
 def _size(value_um: float, digits: int) -> str:
     return plain(value_um / current().drawn().size, digits)
 
 
-def _source(b: Mapping[str, Any]) -> SourceLine:
-    dof = "–" if "type" not in b else "∞" if b.get("dof") is None else plain(float(b["dof"]), 3)
-    return SourceLine(_name(b), str(b["words"]), _size(float(b["u_um"]), 2), f"{b['share']:.1%}", str(b.get("type") or "–"), dof)
+def _source(b: BudgetLineValue) -> SourceLine:
+    dof = "–" if b.type is None else "∞" if b.dof is None else plain(b.dof, 3)
+    return SourceLine(_name(b), b.words, _size(b.u_um, 2), f"{b.share:.1%}", b.type or "–", dof)
 
 
-def _worst(worst: Mapping[str, Any]) -> list[IntervalLine]:
+def _worst(worst: WorstPoint) -> list[IntervalLine]:
     """Components of the deviation with the interval of 95 % as it was stored (k from its degrees of freedom)."""
-    rows = zip(("dX", "dY", "dZ"), worst["deviation_um"], worst["expanded_um"], strict=True)
-    return [_interval(name, float(value), float(expanded), "µm") for name, value, expanded in rows]
+    rows = zip(("dX", "dY", "dZ"), worst.deviation_um, worst.expanded_um, strict=True)
+    return [_interval(name, value, expanded, "µm") for name, value, expanded in rows]
 
 
-def _mean(name: str, m: Mapping[str, Any]) -> IntervalLine:
-    return _interval(name, float(m["value"]) * UM, COVERAGE * float(m["u"]) * UM, "µm/m" if name[0] == "E" else "µrad")
+def _mean(name: str, m: MeanValue) -> IntervalLine:
+    return _interval(name, m.value * UM, COVERAGE * m.u * UM, "µm/m" if name[0] == "E" else "µrad")
 
 
 def _interval(name: str, value: float, expanded: float, unit: str) -> IntervalLine:
@@ -124,8 +121,8 @@ def _interval(name: str, value: float, expanded: float, unit: str) -> IntervalLi
     return IntervalLine(name, shown, half, low, high, frame.unit(unit))
 
 
-def _trials(trials: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    if not trials:
+def _trials(trials: MonteCarloCheck | None) -> list[tuple[str, str, str, str]]:
+    if trials is None:
         return []
-    rows = zip(("dX", "dY", "dZ"), trials["stated_um"], trials["found_um"], trials["valid"], strict=True)
-    return [(name, _size(float(a), 3), _size(float(b), 3), current().say("yes" if ok else "compare.no")) for name, a, b, ok in rows]
+    rows = zip(("dX", "dY", "dZ"), trials.stated_um, trials.found_um, trials.valid, strict=True)
+    return [(name, _size(a, 3), _size(b, 3), current().say("yes" if ok else "compare.no")) for name, a, b, ok in rows]
