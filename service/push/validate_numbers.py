@@ -13,6 +13,8 @@ from abbe.service.push.limits import PushLimits
 LARGEST = 32767
 WHOLE = 0.01
 """How far from a whole unit of the table a value may be: float noise only, so that rounding it costs nothing more."""
+ZERO_MM = 0.5e-6
+"""A table that is not zero at its reference moves the axis at once when it comes into force."""
 
 
 def number_reasons(candidate: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
@@ -88,7 +90,7 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
     slopes = [abs(d - c) / (b - a) for c, d, a, b in zip(v, v[1:], p, p[1:], strict=False)]
     if max(slopes) > limits.slope:
         yield f"SLOPE: {max(slopes) * 1e3:.2f} µm/mm, allowed are {limits.slope * 1e3:.2f} µm/mm"
-    if abs(v[0]) > lsb_mm:
+    if abs(v[0]) > ZERO_MM:
         yield f"REFERENCE: {v[0] * 1e3:.2f} µm at the reference instead of 0"
     if max(abs(x / lsb_mm - round(x / lsb_mm)) for x in v) > WHOLE:
         yield "ROUNDING: values are no whole units of the table; quantise it first"
