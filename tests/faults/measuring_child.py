@@ -40,7 +40,7 @@ def plan(name: str) -> CampaignPlan:
             ),
             name,
         ),
-        Circle("circle", "B2", "identify", (200.0, 200.0, 150.0), 40.0, feed_in_deg=20.0, feed_out_deg=20.0),
+        Circle("circle", "B2", "identify", (200.0, 200.0, 150.0), 40.0, "XY", feed_in_deg=20.0, feed_out_deg=20.0),
         Linear("lineX", "L1", "identify", 0, positions=7, at_share=(0.15, 0.15)),
         Linear("lineZ", "L2", "identify", 2, positions=7, at_share=(0.15, 0.15)),
         Diagonal("diagXYZ", "D1", "identify", "ppp", 2, "XYZ", unmount=False),

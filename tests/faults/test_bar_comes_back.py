@@ -113,7 +113,7 @@ async def test_without_the_option_it_ends_and_goes_on_in_the_same_session(place,
         await measure(b.session, store, b.site, PLAN, manner=Manner(pulled_on_the_path(hand, None), yes))
     await b.sim.plug()
     found = await resume(b.session, store, b.site, PLAN, "c", yes)
-    (run_id,) = await measure(b.session, store, b.site, PLAN, manner=Manner(None, yes, {}, found))
+    (run_id,) = await measure(b.session, store, b.site, PLAN, manner=Manner(None, yes, None, found))
     assert [(one.label, one.status) for one in store.runs.all()] == [("test", "failed"), ("test-2", "complete")]
     assert whole(store, run_id)[0] == 0
     assert b.session.ballbar.settings.zero_nm == 0

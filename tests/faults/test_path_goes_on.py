@@ -89,7 +89,7 @@ async def resumed_item(b: Bench, store: Store, plan: CampaignPlan, confirm=yes, 
     found = await resume(b.session, store, b.site, plan, plan.name, confirm)
     control = None if again_s is None else After(plan, b, again_s, estop(b), step=1)
     try:
-        await measure(b.session, store, b.site, plan, manner=Manner(control, confirm, {}, found))
+        await measure(b.session, store, b.site, plan, manner=Manner(control, confirm, None, found))
     except Interlock:
         assert again_s is not None
         freed(b)

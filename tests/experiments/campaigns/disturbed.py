@@ -185,7 +185,7 @@ async def measured(store: Store, out: Outside, plan: CampaignPlan, tally: Tally,
                 begun = any(c.name == plan.name and store.checkpoints.of_campaign(c.id) for c in store.campaigns.all())
                 found = await resume(session, store, out.site(), plan, plan.name, untouched) if begun else None
                 out.control = Control()
-                manner = Manner(out.control, untouched, {}, found)
+                manner = Manner(out.control, untouched, None, found)
                 return await measure(session, store, out.site(), plan, progress=say, manner=manner)
         except (AbbeError, DriverError, TimeoutError) as error:
             tally.ends[f"{getattr(error, 'code', type(error).__name__)}" if isinstance(error, Interlock) else _short(error)] += 1

@@ -76,7 +76,7 @@ MUTANTS = (
     Mutant("axes need not have stood", MACHINE, "STILL_S = 1.0", "STILL_S = 0.0", (SINGLE,)),
     Mutant("whatever stands in the bank is ours", BACK, "return len(held) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)", "return True", (SINGLE,)),
     Mutant("nothing that stands in the bank is ours", BACK, "return len(held) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)", "return False", (SINGLE,)),
-    Mutant("lost lease is not seen in the last look", MACHINE, 'if truth.owner != f["owner"]:', "if False:", (SINGLE,)),
+    Mutant("lost lease is not seen in the last look", MACHINE, 'if truth.owner != f.owner:', "if False:", (SINGLE,)),
     Mutant("lost lease does not end the measurement", ADAPTER, "                except Refused:\n                    lost.set()\n                    return\n", "                except Refused:\n                    return\n", (AROUND + "::test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_not_kept",)),
     Mutant("active bank after ACTIVATE not asked (driver)", "drivers/cnc/banks.py", "if active != bank:", "if False:", (BANKS + "::test_acknowledged_but_not_active_is_a_fault",)),
     Mutant("active bank after ACTIVATE not asked (push)", MACHINE, '(in_force(f, known.start) != "candidate" or known.start.boot', "(known.start.boot", (SINGLE,)),
