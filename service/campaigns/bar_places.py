@@ -1,4 +1,4 @@
-"""The ball-bar hung in once and read at the same few places again and again, while tables change in between."""
+"""Reads the ball-bar, mounted once, repeatedly at the same few positions while tables change in between."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STILL_MOUNTED = "cup and bar may still be mounted: take them out before anything
 
 @dataclass(frozen=True, slots=True)
 class PlaceReadings:
-    """One pass over the places: commanded positions, shape (n, 3), and readings, shape (n,), mm."""
+    """One pass over the positions: commanded coordinates, shape (n, 3), and readings, shape (n,), mm."""
 
     places_mm: F2
     deviation_mm: F1
@@ -39,9 +39,9 @@ class PlaceReadings:
 
 @dataclass
 class BarPlaces:
-    """Reads ``places`` places on a hemisphere; the first reading mounts cup and bar, `cleared_away` takes them out.
+    """Reads ``places`` positions on a hemisphere; the first pass mounts cup and bar, `cleared_away` takes them out.
 
-    ``control``: who may stop the job that this is a part of.
+    ``control`` belongs to the surrounding job.
     """
 
     session: Session
@@ -55,18 +55,18 @@ class BarPlaces:
     radius_mm: float = 0.0
     run_ids: list[int] = field(default_factory=list)
     mounted: bool = False
-    """Cup and bar are in, or may be: from the first motion towards mounting them until they were certainly taken out."""
+    """Whether cup and bar may be mounted: from the first motion towards mounting until they are certainly out."""
 
     def __post_init__(self) -> None:
         self.centre_mm, self.radius_mm = hemisphere(self.site.machine, (0.5, 0.5, 0.35), 0.6)
 
     async def read(self, what: str) -> PlaceReadings:
-        """Read all places with the table in force, as a campaign of its own.
+        """Read all positions with the table in force, as a campaign of its own.
 
         Raises
         ------
         MeasurementFault
-            The bar did not read at every place.
+            The bar did not read at every position.
         """
         first, self.mounted = not self.mounted, True
         recipe = HelixPoints(
@@ -93,13 +93,7 @@ class BarPlaces:
         return recipe.path()[0][-1]
 
     async def clear_away(self) -> None:
-        """Take cup and bar out, if they are in.
-
-        Raises
-        ------
-        DriverError
-            They were not; a note says that they are still in.
-        """
+        """Take cup and bar out if they are mounted; an error gets the note that they may still be in."""
         if not self.mounted:
             return
         try:
@@ -111,10 +105,10 @@ class BarPlaces:
 
     @asynccontextmanager
     async def cleared_away(self) -> AsyncIterator[None]:
-        """Whatever comes of it, cup and bar are taken away, or it is said that they are not: the next motion goes down to the centre."""
+        """Take cup and bar out after the block, or warn that they may still be mounted: the next motion goes down to the centre."""
         try:
             yield
-        except (TableRefused, PushNotBegun, MeasurementFault) as error:  # the axes stand, and the space is free to reach into
+        except (TableRefused, PushNotBegun, MeasurementFault) as error:  # the axes stand, and a person can reach in
             try:
                 await self.clear_away()
             except (AbbeError, DriverError) as again:

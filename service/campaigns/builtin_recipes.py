@@ -1,4 +1,4 @@
-"""The recipes that Abbe has, and what a campaign is made from. Nothing here reaches a device."""
+"""Built-in recipes, and the sources of a campaign's plan. Nothing here reaches a device."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_sour
 from abbe.service.sequences.steps import CampaignPlan
 
 IDENTIFICATION = "identification"
-"""The full campaign: no check, and only with a person who mounts its set-ups."""
+"""The full campaign: not a check, and only with a person who mounts its set-ups."""
 USUAL_HZ = 100
 RATES_HZ = (50, 100, 200, 250, 500, 1000)
-"""Rates of the ball-bar that a person is offered; any other that divides 1000 can be named as well."""
+"""Offered rates of the ball-bar; any other divisor of 1000 works, too."""
 _RATE = re.compile(r"(?P<name>.+) at (?P<rate>[1-9][0-9]{0,3}) Hz")
 
 
 class BuiltinRecipe(Protocol):
-    """A recipe that fits itself into a machine."""
+    """A recipe that scales to a machine."""
 
     def __call__(self, machine: Machine, *, rate_hz: int = ...) -> CampaignPlan:
-        """Return the plan, with so many ball-bar samples per second."""
+        """Return the plan with this ball-bar rate."""
         ...
 
 
 RECIPES: dict[str, BuiltinRecipe] = {"quick-check": quick_check, "verification": verification}
-"""Those that end with a verdict, as a schedule needs it."""
+"""Recipes that end with a verdict, as a schedule needs it."""
 CAMPAIGNS: dict[str, BuiltinRecipe] = {IDENTIFICATION: identification, "verification": verification, "quick-check": quick_check}
 
 
 def named(recipe: str, rate_hz: int) -> str:
-    """A recipe's name together with its rate, as jobs and campaigns show it: ``quick-check at 1000 Hz``; the usual rate is left out."""
+    """Recipe name with its rate, as jobs and campaigns show it: ``quick-check at 1000 Hz``; omits the usual rate."""
     return recipe if rate_hz == USUAL_HZ else f"{recipe} at {rate_hz} Hz"
 
 
 def parted(name: str) -> tuple[str, int]:
-    """Recipe and rate of such a name; a rate that does not divide 1000 is none, and stays part of the name."""
+    """Split a name made by `named` into recipe and rate; a rate that does not divide 1000 stays part of the name."""
     found = _RATE.fullmatch(name)
     if found is None or 1000 % int(found["rate"]):
         return name, USUAL_HZ
@@ -51,13 +51,7 @@ def parted(name: str) -> tuple[str, int]:
 
 
 def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
-    """The plan of a shipped recipe; ``NAME at 500 Hz`` is the recipe with that rate of the ball-bar.
-
-    Raises
-    ------
-    ConfigError
-        There is no such recipe; the message lists those there are.
-    """
+    """Return the plan of a built-in recipe; ``NAME at 500 Hz`` sets the ball-bar rate. Raises ConfigError for an unknown recipe."""
     recipe, rate_hz = parted(name)
     if recipe not in RECIPES:
         close = get_close_matches(recipe, RECIPES, n=1)
@@ -68,9 +62,9 @@ def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecipeSource:
-    """What a campaign's plan is made from. Its journal keeps it, so that a resumed campaign needs no file.
+    """Source of a campaign's plan. The journal keeps it, so that a resumed campaign needs no file.
 
-    ``helix``: instead of a recipe, ``X,Y,Z,RADIUS`` in mm. ``text``: of a recipe file, which ``recipe`` names.
+    ``helix``: ``X,Y,Z,RADIUS`` in mm instead of a recipe. ``text``: of a recipe file, which ``recipe`` names.
     """
 
     recipe: str
@@ -84,7 +78,7 @@ class RecipeSource:
         Raises
         ------
         ConfigError
-            There is no such recipe, the rate does not divide 1000, or helix or file cannot be used.
+            The recipe is unknown, the rate does not divide 1000, or helix or file is not valid.
         """
         if self.rate_hz < 1 or 1000 % self.rate_hz:
             raise ConfigError(f"rate {self.rate_hz} Hz does not divide 1000", "use 1000, 500, 250, 200, 125, 100, 50 ...")
@@ -105,12 +99,12 @@ class RecipeSource:
         except ValueError:
             raise ConfigError(f"--helix {self.helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
         wanted = Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=self.rate_hz)
-        recipe_text("helix", (wanted,))  # what no recipe file may say is refused here, too
+        recipe_text("helix", (wanted,))  # applies the limits of recipe files
         return CampaignPlan("helix", (wanted.plan(machine),))
 
 
 def campaign_source(name: str, folder: Path) -> RecipeSource:
-    """Return the source of a full campaign: ``identification``, which may name its rate, or a recipe file of a folder.
+    """Return the source of a full campaign: ``identification``, optionally with its rate, or a recipe file in the folder.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One test of a campaign until it is complete: over pauses and suspensions, from checkpoint to checkpoint."""
+"""Carries one test of a campaign to completion across pauses and suspensions, from checkpoint to checkpoint."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from abbe.service.sequences.waiting import may_suspend, paused, suspended
 from abbe.service.storage.store import Store
 
 BALLBAR = "ballbar"
-"""The word in ``[limits] continue_after``."""
+"""Value in ``[limits] continue_after``."""
 MOST_BREAKS = 5
-"""So often a test begins again because the box was lost; then a person has to look at it."""
+"""Most restarts of a test after losses of the box; then a person has to look."""
 BREAKS = (LinkDown, ReplyTimeout, Rebooted)
 
 
 async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
-    """Before a run: if it needs the ball-bar, the same box answers, and reads as it did when it was first met.
+    """Check before a run that the ball-bar's box, if needed, is the same and has its first settings.
 
     Raises
     ------
     DriverError
-        It is not there, is another one, or a person has to look at it.
+        The box does not answer, is another one, or needs a person.
     """
     if session.ballbar is None or not any(isinstance(step, RecordPath | ReadBar) for step in test.steps):
         return None
@@ -47,33 +47,23 @@ async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
 
 
 class BarBreaks:
-    """What becomes of a test whose runs are ended by the loss of the box.
-
-    Parameters
-    ----------
-    session : Session
-        Open devices.
-    control : Control
-        How the wait can be stopped.
-    suspending : Suspending
-        Whether and how long to wait for the box; without ``ballbar`` in its conditions the error ends the measurement.
-    """
+    """Handles the loss of the box during a test. Without ``ballbar`` in the conditions of ``suspending`` it ends the measurement."""
 
     def __init__(self, session: Session, control: Control, suspending: Suspending) -> None:
         self._bar, self._control, self._suspending = session.ballbar, control, suspending
         self._count = 0
 
     async def wait(self, error: DriverError, runner: Runner, journal: Journal) -> None:
-        """After a run that ended by this error: returns when nothing is to be done about it here.
+        """Wait for a lost box after a run that ended with this error; return if the error is not such a loss.
 
         Raises
         ------
         RunInterrupted
-            The box is back: the test begins again, in a run of its own. The person who plugged it in may have touched what is mounted.
+            The box is back: the test begins again in a new run. The person who plugged it in may have touched the set-up.
         DriverError
-            It did not come back in time, or another one did.
+            The box did not come back in time, or another one did.
         Stopped, Aborted
-            That was asked for meanwhile.
+            A person requested it.
         """
         if self._bar is None or error.device != self._bar.name or not isinstance(error, BREAKS):
             return
@@ -85,14 +75,14 @@ class BarBreaks:
         await self._control.unless_stopped(self._bar.make_ready(within_s=self._suspending.longest_s))
         runner.touched = True
         raise RunInterrupted(
-            f"the ball-bar's box was lost and is back ({error.code})", "the test begins again; what was read is kept as evidence"
+            f"the ball-bar's box was lost and is back ({error.code})", "the test begins again; its readings are kept as evidence"
         ) from error
 
 
 MOST_TRIES = 5
-"""So often in a row a test is suspended or mounted anew without a new point; then a person has to look."""
+"""Most consecutive suspensions or mountings of a test without a new point; then a person has to look."""
 LEAST_GAIN_MM = 1.0
-"""So much farther than ever before a path must have been read, for that to be a gain."""
+"""Least extension of a path's read length that counts as a gain."""
 Confirm = Callable[[str], Awaitable[bool]]
 
 
@@ -101,28 +91,27 @@ def _in_vain(why: SetupDisturbed | Interlock | RunInterrupted) -> SetupDisturbed
 
 
 async def decline(_: str) -> bool:
-    """For unattended campaigns: no person confirms that a set-up was not touched, so it is mounted anew."""
+    """Answer no, for unattended campaigns: no person confirms an untouched set-up, so it is mounted anew."""
     return False
 
 
 async def _nothing_read(_: str, __: int) -> SoFar | None:
-    """Paths begin again."""
+    """Report no reading: paths begin again."""
     return None
 
 
 def plan_hash(plan: CampaignPlan) -> str:
-    """What a campaign is to measure, as one number: another recipe, or a version that draws another path, has another."""
+    """Hash of a campaign's tests; another recipe, or a version that computes another path, has another hash."""
     return hashlib.sha256(repr(plan.tests).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A test on its way to being complete.
+    """State of a test that is not complete yet.
 
-    ``test`` and ``first`` as planned (``first`` mounts the set-up that ``test`` uses); ``whole``: its steps in the present mounting, of
-    which ``mounting`` is the number; ``left``: what is left of them from ``offset`` on; ``hand``: last step by hand that was done;
-    ``before``: where the machine stood when it began with what an earlier test left mounted; ``remainder``: what is left of its path, if it
-    was broken off; ``kept_mm``: the farthest that it was ever read.
+    ``test`` and ``first`` as planned (``first`` mounts the set-up of ``test``); ``whole``: all steps in the present mounting, whose number
+    is ``mounting``; ``left``: the remaining steps, from ``offset`` on; ``hand``: last manual step done; ``before``: start position, if an
+    earlier test mounted the set-up; ``remainder``: rest of an interrupted path; ``kept_mm``: greatest length read so far.
     """
 
     test: TestPlan
@@ -144,12 +133,12 @@ class Item:
         return str(self.test.setup["setup_id"])
 
     def attempt(self) -> Attempt:
-        """What the runner gets."""
+        """Return the attempt for the runner."""
         return Attempt(self.test.label, self.setup, self.offset, self.mounting, self.resume_trail, remainder=self.remainder)
 
 
 def items(plan: CampaignPlan) -> tuple[Item, ...]:
-    """All tests of a plan, each from its beginning in the first mounting of its set-up."""
+    """Return all tests of a plan, each from its beginning in the first mounting of its set-up."""
     made: list[Item] = []
     firsts: dict[str, TestPlan] = {}
     for test in plan.tests:
@@ -160,13 +149,13 @@ def items(plan: CampaignPlan) -> tuple[Item, ...]:
 
 
 def in_mounting(item: Item, mounting: int) -> Item:
-    """The test from its beginning, with what was mounted for the n-th time by an earlier test."""
+    """Restart a test from its beginning, in the n-th mounting of its set-up by an earlier test."""
     whole = anew(item.test, mounting)
     return replace(item, whole=whole, left=whole, mounting=mounting)
 
 
 def mounted_anew(item: Item, mounting: int) -> Item:
-    """The test from its beginning, mounting by itself."""
+    """Restart a test from its beginning, with a mounting of its own."""
     whole = remounted(item.test, item.first, mounting)
     return replace(
         item, whole=whole, left=whole, mounting=mounting, offset=0, resume_trail=ResumeTrail(), hand=None, before=None, remainder=None
@@ -174,14 +163,14 @@ def mounted_anew(item: Item, mounting: int) -> Item:
 
 
 def resumed_item(item: Item, hand: int | None, records: tuple[dict[str, Any], ...], so_far: SoFar | None = None) -> Item:
-    """The test from its last checkpoint, in the present mounting."""
+    """Resume a test from its last checkpoint, in the present mounting."""
     hand = item.hand if hand is None else hand
     left, offset, resume_trail, remainder = rest_of(item.whole, hand, records, item.before, so_far)
     return replace(item, left=left, offset=offset, resume_trail=resume_trail, hand=hand, remainder=remainder)
 
 
 async def read_path(session: Session, store: Store, campaign: int, test: str, mounting: int) -> SoFar | None:
-    """How far the path of a test was read in a mounting, if the ball-bar's box has not been restarted since."""
+    """Return how far the path of a test was read in a mounting; None if the ball-bar's box was restarted since."""
 
     def look() -> SoFar | None:
         lines = (one.doc for one in store.checkpoints.of_campaign(campaign) if one.kind == RUN)
@@ -195,16 +184,16 @@ async def read_path(session: Session, store: Store, campaign: int, test: str, mo
 
 
 def halfway(item: Item) -> str:
-    """The question before a path goes on where it was."""
-    return f"Set-up {item.setup} was left mounted, {item.test.label} half read. Has nobody touched it since?"
+    """Question to a person before an interrupted path resumes."""
+    return f"Set-up {item.setup} was left mounted, {item.test.label} half read. Is it still untouched?"
 
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """Where a campaign goes on that was broken off: ``done`` complete runs by test, ``start`` the tests that begin elsewhere than planned.
+    """State from which an interrupted campaign resumes. ``done``: complete runs by test; ``start``: tests that do not begin as planned.
 
-    ``campaign``: number and clock zero; ``mounted_us``: when each mounting was made; ``said``: what was found, one sentence each;
-    ``expected``: controller run and table that the campaign was begun with.
+    ``campaign``: number and clock zero; ``mounted_us``: time of each mounting; ``messages``: findings, one sentence each; ``expected``:
+    controller run and table at the beginning of the campaign.
     """
 
     campaign: tuple[int, int]
@@ -213,16 +202,16 @@ class Resumed:
     mountings: dict[str, int]
     used: frozenset[tuple[str, int]]
     mounted_us: dict[str, int]
-    said: tuple[str, ...]
+    messages: tuple[str, ...]
     expected: ExpectedTable | None = None
 
 
 @dataclass
 class CampaignRun:
-    """What it takes to carry a campaign through: who may say what, what is watched, where it is written down.
+    """Context of a running campaign.
 
-    ``mountings``: how often each set-up was mounted; ``used``: set-ups (planned name, mounting) with a complete run; ``labels``: taken
-    names of runs; ``read_path``: how far the path of a test was read in a mounting.
+    ``mountings``: number of mountings of each set-up; ``used``: set-ups (planned name, mounting) with a complete run; ``labels``: used
+    names of runs; ``read_path``: returns how far the path of a test was read in a mounting.
     """
 
     session: Session
@@ -238,21 +227,16 @@ class CampaignRun:
     read_path: Callable[[str, int], Awaitable[SoFar | None]] = _nothing_read
 
     def runner(self) -> Runner:
-        """A runner for one attempt."""
+        """Return a runner for one attempt."""
         return Runner(self.session, self.control, self.watching, self.journal, self.expected)
 
     async def complete(self, item: Item, once: Callable[[TestPlan, Attempt, Runner], Awaitable[int]]) -> int:
-        """Run a test until it is complete; returns the number of its complete run.
-
-        Parameters
-        ----------
-        once : callable
-            Runs one attempt as one run of the store.
+        """Run a test until it is complete; return the number of its complete run. ``once`` runs one attempt as one run of the store.
 
         Raises
         ------
         AbbeError, DriverError
-            What cannot be gone on from without a person.
+            The test cannot continue without a person.
         """
         while True:
             self.mountings.setdefault(item.setup, item.mounting)
@@ -274,30 +258,30 @@ class CampaignRun:
             return run_id
 
     async def _ready(self) -> None:
-        """Before a run starts: the same controller with the same table, no other program, and no hold that a killed process has left.
+        """Check controller run, table and interlocks before a run, and clear a feed hold that a killed process left.
 
         Raises
         ------
-        WorldChanged, Interlock
-            Not so.
+        PreconditionsChanged, Interlock
+            The run cannot start.
         """
         comp = await self.session.controller.comp_status()
         check_expected(self.expected, comp.boot_id, comp.bank_crc[comp.active_bank])
         if not self.freed:
             check_interlocks(await self.session.controller.status())
-            await self.session.controller.abort()  # an abort that was not finished is not to be seen in the status
+            await self.session.controller.abort()  # the status does not show an unfinished abort
             self.freed = True
 
     async def _next(self, item: Item, runner: Runner, why: RunInterrupted | SetupDisturbed | Interlock, so_far: SoFar | None) -> Item:
-        """Wait as long as it has to, then the test from its last checkpoint.
+        """Wait until the test can resume, and return it from its last checkpoint.
 
         Raises
         ------
-        Interlock, Stopped, Aborted, WorldChanged
-            It does not go on.
+        Interlock, Stopped, Aborted, PreconditionsChanged
+            The test cannot resume.
         """
         if isinstance(why, StretchDiffers) and (item.setup, item.mounting) not in self.used:
-            return resumed_item(item, runner.hand, ())  # nothing is kept that the mounting could contradict
+            return resumed_item(item, runner.hand, ())  # no kept reading depends on the mounting
         if isinstance(why, SetupDisturbed):
             return self.again_mounted(item)
         if isinstance(why, Interlock):
@@ -306,7 +290,7 @@ class CampaignRun:
             touched = await suspended(self.session, self.control, self.watching, self.expected, self.journal, why)
         else:
             touched = await paused(self.session, self.control, self.watching, self.expected, self.journal) or runner.touched
-        if runner.asked is not None:  # it is unknown how far the mounting has come
+        if runner.asked is not None:  # the mounting was not confirmed as done
             return self.again_mounted(item)
         records = () if isinstance(why, BeamLost) else tuple(runner.records)
         again = resumed_item(item, runner.hand, records)
@@ -316,25 +300,25 @@ class CampaignRun:
         return self.again_mounted(item) if (item.setup, item.mounting) in self.used else again
 
     async def untouched(self, item: Item) -> bool:
-        """Whether what is mounted can still be used after a person may have touched it.
+        """Whether the set-up is still usable after a person may have touched it.
 
-        A set-up of which nothing is kept has nothing that it could contradict; a laser run that goes on reads its last point again. Else a
-        person must say so: the stretch of a path that is read twice shows a cup that was knocked along the bar, not across it.
+        Without kept readings the set-up does not matter, and a resumed laser run reads its last point again. Otherwise a person must
+        confirm: the repeated stretch of a path shows a displacement of the cup along the bar, but not across it.
         """
         if item.resume_trail.carried:
             return True
         if (item.setup, item.mounting) in self.used:
-            return await self.confirm(f"Set-up {item.setup} was left mounted and has complete runs. Has nobody touched it since?")
+            return await self.confirm(f"Set-up {item.setup} was left mounted and has complete runs. Is it still untouched?")
         return item.remainder is None or await self.confirm(halfway(item))
 
     def again_mounted(self, item: Item) -> Item:
-        """The test with its set-up mounted once more."""
+        """Return the test with one more mounting of its set-up."""
         number = self.mountings.get(item.setup, item.mounting) + 1
         self.mountings[item.setup] = number
         return mounted_anew(item, number)
 
     def _named(self, test: TestPlan) -> TestPlan:
-        """The test under a name that no run of the campaign has yet."""
+        """Return the test under a name that no run of the campaign has yet."""
         label, n = test.label, 1
         while label in self.labels:
             n += 1

@@ -1,7 +1,7 @@
-"""Listening to a program that the operator starts: the laser is read all the time, and its standstills become the readings of the recipe.
+"""Listens to a program that the operator starts: reads the laser continuously and turns its standstills into the readings of the recipe.
 
 For controllers that Abbe does not move. Abbe writes nothing to the controller; of its status it uses the clock, the position and "NC
-program running". Times are those at which the laser took its samples, by its own clock, brought to the controller's.
+program running". Sample times are those of the laser's own clock, converted to the controller's.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
 from abbe.service.sequences.steps import MountLaser, MoveTo, ReadLaser, TestPlan
 
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 STATUS_EVERY = 3
-"""One status for so many readings of the laser."""
+"""Laser readings per controller status."""
 QUIET = 4.0
-"""Where no "program running" is seen, a test has ended when nothing has moved for so many of its longest dwells."""
+"""Without a "program running" status, a test has ended after this many of its longest dwells without motion."""
 MOVED_MM = 0.05
 START_MM = 0.05
 POLL_S = 0.05
@@ -41,7 +41,7 @@ U_DELAY_S = 2e-3
 
 @dataclass(frozen=True, slots=True)
 class ListenRequest:
-    """One reading of the recipe: where, in what direction."""
+    """One reading of the recipe: position and direction."""
 
     target_mm: Point
     direction: int
@@ -51,20 +51,14 @@ class ListenRequest:
 
 @dataclass
 class Heard:
-    """What was heard of one test."""
+    """Laser readings and controller statuses of one test."""
 
     readings: list[LaserReading] = field(default_factory=list)
     statuses: list[ControllerStatus] = field(default_factory=list)
 
 
-def wanted(test: TestPlan) -> list[ListenRequest]:
-    """The readings of a laser test, in order.
-
-    Raises
-    ------
-    MeasurementFault
-        Not a test of single laser readings.
-    """
+def planned_readings(test: TestPlan) -> list[ListenRequest]:
+    """Return the readings of a laser test in order. Raises MeasurementFault for a test without single laser readings."""
     here, out = None, list[ListenRequest]()
     beam = np.array(next((s.beam for s in test.steps if isinstance(s, MountLaser)), test.setup.get("nominal_beam", (0.0, 0.0, 0.0))))
     for step in test.steps:
@@ -80,16 +74,16 @@ def wanted(test: TestPlan) -> list[ListenRequest]:
     return out
 
 
-async def listen_to(session: Session, recorder: Recorder, test: TestPlan, say: Say) -> dict[str, Any]:
-    """Mount, zero, listen until the program has ended, and store the readings that its standstills are; gives the end document.
+async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report: Report) -> dict[str, Any]:
+    """Mount, zero, listen until the program has ended, and store a reading for each standstill; return the end document.
 
     Raises
     ------
     MeasurementFault
-        What was heard is not this test; or a beam that was lost.
+        The record does not match this test, or the beam was lost.
     """
-    plan = wanted(test)
-    await _at_start(session, test, plan[0].target_mm, say)
+    plan = planned_readings(test)
+    await _at_start(session, test, plan[0].target_mm, report)
     for step in test.steps:
         if isinstance(step, MountLaser):
             await session.need_fixture().mount_laser(step.beam)
@@ -98,11 +92,11 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, say: S
     await laser.clear_beam()
     await laser.set_environment_compensation(True)
     await laser.zero()
-    say(f"{test.label}: listening, start the program")
+    report(f"{test.label}: listening, start the program")
     heard = await _hear(session, (QUIET * (LASER_DWELL_S + plan[0].settle_s)))
     if not all(air_is_compensated(r.status) for r in heard.readings):
         raise MeasurementFault(
-            f"test {test.label}: the laser's environmental compensation was switched off meanwhile", "switch it on, start the program again"
+            f"test {test.label}: the laser's environmental compensation was switched off", "switch it on, start the program again"
         )
     found, planned = _detected(test, heard, plan)
     lines = named(found, planned)
@@ -111,24 +105,24 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, say: S
     for one, reading, middle_s in zip(plan, found.readings, middles, strict=True):
         await recorder.add_record(_record(one, reading, middle_s, heard, times))
     for line in lines:
-        say(f"{test.label}: {line}")
+        report(f"{test.label}: {line}")
     doc = {"standstills": {"trouble": list(lines), "missing": list(found.missing), "noise_mm": found.noise}, "mounted_us": mounted_us}
     if lag is not None and lag.told:
         doc["lag"] = {"laser_behind_position_ms": lag.lag_s * 1e3, "u_ms": lag.u_s * 1e3}
     return doc | {"heard": [[r.device_us, r.displacement_tenth_nm] for r in heard.readings]}
 
 
-async def _at_start(session: Session, test: TestPlan, start_mm: Point, say: Say) -> None:
-    """Wait until the machine stands where the test begins: the mirror is mounted there."""
-    before, told = None, False
+async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: Report) -> None:
+    """Wait until the machine stands at the start of the test, where a person mounts the mirror."""
+    before, reported = None, False
     while True:
         status = await session.controller.status()
         if math.dist(status.position_mm, start_mm) < START_MM and status.position_mm == before:
             return
-        if not told:
-            told = True
+        if not reported:
+            reported = True
             at = " ".join(f"{a}{v:.3f}" for a, v in zip(AXES, start_mm, strict=True))
-            say(f"{test.label}: waiting until the program has taken the machine to {at}")
+            report(f"{test.label}: waiting until the program has moved the machine to {at}")
         before = status.position_mm
         await asyncio.sleep(POLL_S)
 
@@ -145,7 +139,7 @@ async def _hear(session: Session, quiet_s: float) -> Heard:
             status = await session.controller.status()
             heard.statuses.append(status)
             running = status.program_runs
-            if ran and not running and moved_us:  # before that, the operator went on from one halt to the next
+            if ran and not running and moved_us:  # without motion, the operator only resumed from one halt to the next
                 return heard
             ran = running or (ran and bool(moved_us))
         level = reading.displacement_tenth_nm if level is None else level
@@ -170,7 +164,7 @@ def _stream(heard: Heard) -> tuple[F1, F1]:
 
 
 def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
-    """Laser time to controller time by both clocks' fits over this computer's, and the laser's lag behind the controller's positions."""
+    """Return the conversion from laser to controller time, by both clocks' fits to the host's, and the laser's lag."""
     laser = _fit([(r.device_us, r.host_s) for r in heard.readings])
     cnc = _fit([(s.ctrl_us, s.host_s) for s in heard.statuses])
 
@@ -195,30 +189,30 @@ def _fit(pairs: list[tuple[int, float]]) -> ClockFit:
     try:
         return fit_clock(stamps[keep] * 1e-6, arrived[keep], u_delay_s=U_DELAY_S)
     except ValueError as error:
-        raise MeasurementFault(f"too little was heard to compare the clocks ({error})", "listen from before the program starts") from None
+        raise MeasurementFault(f"too few readings to compare the clocks ({error})", "start listening before the program") from None
 
 
 def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: float) -> list[float]:
-    """Laser time of every planned reading, (n,) s, rising: the middle of its window; of a missing one a time between its neighbours, before
-    the first one seen between that and the beginning of listening, after the last one seen ``apart_s`` each."""
-    seen = [(k, 0.5 * (one.start_s + one.end_s)) for k, one in enumerate(readings) if one is not None]
-    at, times = [float(k) for k, _ in seen], [t for _, t in seen]
+    """Laser time of every planned reading, (n,) s, rising: the middle of its window. Missing readings get interpolated times: between their
+    neighbours, before the first found one from ``start_s`` on, after the last found one at steps of ``apart_s``."""
+    found = [(k, 0.5 * (one.start_s + one.end_s)) for k, one in enumerate(readings) if one is not None]
+    at, times = [float(k) for k, _ in found], [t for _, t in found]
     last = len(readings) - 1
-    if seen[0][0] > 0:
+    if found[0][0] > 0:
         at, times = [-1.0, *at], [min(start_s, times[0] - 1e-3), *times]
-    if seen[-1][0] < last:
-        at, times = [*at, float(last)], [*times, times[-1] + apart_s * (last - seen[-1][0])]
+    if found[-1][0] < last:
+        at, times = [*at, float(last)], [*times, times[-1] + apart_s * (last - found[-1][0])]
     return [float(t) for t in np.interp(np.arange(last + 1.0), at, times)]
 
 
 def _record(one: ListenRequest, reading: DwellReading | None, middle_s: float, heard: Heard, times: Callable[[F1], F1]) -> dict[str, Any]:
-    """A record as the sequencer makes it, of one standstill; of one that was not seen the nominal place, marked as missing."""
+    """Return a record of one standstill, as the sequencer makes it; for a missing one its nominal position, marked as missing."""
     near = min(heard.readings, key=lambda r: abs(r.device_us * 1e-6 - middle_s))
-    told: dict[str, Any] = {"displacement_tenth_nm": round(one.along_mm / MM_PER_COUNT), "missing": True}
+    value: dict[str, Any] = {"displacement_tenth_nm": round(one.along_mm / MM_PER_COUNT), "missing": True}
     if reading is not None:
         window = {"u_mm": reading.u, "window_s": [reading.start_s, reading.end_s], "samples": reading.samples}
-        told = {"displacement_tenth_nm": round(reading.value / MM_PER_COUNT)} | window
-    return told | {
+        value = {"displacement_tenth_nm": round(reading.value / MM_PER_COUNT)} | window
+    return value | {
         "host_s": near.host_s,
         "ctrl_us": int(times(np.array([middle_s]))[0] * 1e6),
         "target_mm": list(one.target_mm),

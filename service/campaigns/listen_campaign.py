@@ -1,4 +1,4 @@
-"""A campaign that is only listened to: every laser test of a recipe, one after the other, as a run in the store."""
+"""Records a campaign that the operator's NC program drives: every laser test of a recipe becomes a run in the store."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
-from abbe.service.campaigns.listen import Say, listen_to, wanted
+from abbe.service.campaigns.listen import Report, listen_to, planned_readings
 from abbe.service.campaigns.measure import OpenCampaign, start_campaign, start_document
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
@@ -19,20 +19,20 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 
-async def listen(session: Session, store: Store, site: Site, plan: CampaignPlan, say: Say, clock: Clock | None = None) -> list[int]:
-    """Listen to the program of a plan, test by test; gives the numbers of the runs.
+async def listen(session: Session, store: Store, site: Site, plan: CampaignPlan, report: Report, clock: Clock | None = None) -> list[int]:
+    """Listen to the program of a plan, test by test; return the numbers of the runs.
 
     Raises
     ------
     StrokeError, MeasurementFault
-        The plan does not fit the machine or holds a test that cannot be listened to; nothing was asked of anybody.
+        Before any prompt: the plan does not fit the machine, or a test is not suited for listening.
     MeasurementFault, DriverError
-        The run in hand is closed as failed, with the reason; earlier runs stay.
+        The current run is closed as failed, with the reason; earlier runs stay.
     """
     clock = clock or SystemClock()
     dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     for test in plan.tests:
-        wanted(test)
+        planned_readings(test)
     await check_devices(session, plan)
     under_way = OpenCampaign(*await start_campaign(session, store, site, plan.name, {"listened": True}))
     run_ids = []
@@ -44,7 +44,7 @@ async def listen(session: Session, store: Store, site: Site, plan: CampaignPlan,
         recorder: CaptureRecorder | None = None
         try:
             async with recording(store, run_id, site.capture, clock, about) as recorder:
-                end = await listen_to(session, recorder, test, say)
+                end = await listen_to(session, recorder, test, report)
             under_way.mounted_us[test.setup["setup_id"]] = end["mounted_us"]
             status, reason = "complete", ""
             if any(isinstance(step, Unmount) for step in test.steps):

@@ -1,4 +1,4 @@
-"""Measure a campaign: every test becomes a run in the store, complete or visibly not."""
+"""Measures a campaign: every test becomes a run in the store, complete or visibly incomplete."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 class ProgressMeter:
     """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
 
-    The time in which the job waited for a person (``waited_s``) says nothing about the machine and does not count.
+    Time spent waiting for a person (``waited_s``) does not count.
     """
 
     stage: str
@@ -74,35 +74,35 @@ class ProgressMeter:
         self.start_s = self.clock.monotonic_s()
 
     def at(self, done_s: float, message: str, waited_s: float = 0.0) -> None:
-        """Report how far the job is, and how long the last step waited for a person."""
+        """Report the progress, and how long the last step waited for a person."""
         self.waited_s += waited_s
         self.message, self._at_s = message, done_s
         self._report(self._eta_s(done_s))
 
-    async def tell(self) -> None:
-        """Report every pause and suspension as it begins and ends; a suspension's time is left out of the ETA."""
+    async def report_states(self) -> None:
+        """Report begin and end of every pause and suspension; the ETA leaves their time out."""
         if self.control is None:
             return
         async for now in self.control.watch():
             if now.state in WAITING:
-                self.waits()
+                self.start_wait()
                 self._report(None)
             else:
-                self.goes_on()
+                self.end_wait()
 
-    def waits(self) -> None:
-        """The job waits from now on."""
+    def start_wait(self) -> None:
+        """Start to count waiting time."""
         if self._waits_since_s is None:
             self._waits_since_s = self.clock.monotonic_s()
 
-    def goes_on(self) -> None:
-        """It does not wait any more."""
+    def end_wait(self) -> None:
+        """Stop counting waiting time."""
         if self._waits_since_s is not None:
             self.waited_s += self.clock.monotonic_s() - self._waits_since_s
             self._waits_since_s = None
 
     def skip(self, duration_s: float) -> None:
-        """Planned time of what was complete before this job began: it says nothing about how fast this one is."""
+        """Add planned time of tests that were complete before this job began; the ETA ignores it."""
         self.done_s += duration_s
         self.skipped_s += duration_s
 
@@ -116,15 +116,15 @@ class ProgressMeter:
 
 
 RUN_STATUS: dict[type[Exception], str] = {Stopped: "stopped", Aborted: "aborted", RunInterrupted: "aborted"}
-"""How a run is closed that a person has ended, or that resumes later; everything else has failed."""
+"""Status of a run that a person ended, or that resumes later; all other errors close it as failed."""
 
 
 LAST_LINE_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class How:
-    """By whom a test is run, which part of it, where its checkpoints go, and who looks on."""
+class AttemptContext:
+    """Runner, part, journal and live view of one attempt at a test."""
 
     runner: Runner
     attempt: Attempt
@@ -134,7 +134,7 @@ class How:
 
 @dataclass
 class OpenCampaign:
-    """A campaign that is being measured: number in the store, clock zero and when each set-up was mounted (controller time, us)."""
+    """A campaign under measurement: number in the store, clock zero and time of each mounting (controller time, us)."""
 
     id: int
     ctrl0_us: int
@@ -142,7 +142,7 @@ class OpenCampaign:
 
 
 async def start_campaign(session: Session, store: Store, site: Site, name: str, more: dict[str, Any] | None = None) -> tuple[int, int]:
-    """A new campaign in the store and its clock zero (controller time, us). ``more``: what else its document shall say."""
+    """Add a campaign to the store; return its number and clock zero (controller time, us). ``more``: further fields of its document."""
     machine_id = await store.write(store.machines.add, site.name, site.doc)
     status = await session.controller.status()
     comp = await session.controller.comp_status()
@@ -160,10 +160,11 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
 
 @dataclass(frozen=True, slots=True)
 class Manner:
-    """Who may interrupt a measurement, who can say whether a set-up was touched, what it was made of, and where it goes on.
+    """Options of a measurement.
 
-    ``source``: what the plan can be made from again, for `abbe measure --resume`. ``part``: what ``control`` controls is not over with this
-    measurement. ``live``: is shown what paths read.
+    ``control``: interrupts it. ``confirm``: asks a person whether a set-up is untouched. ``source``: of the plan, for `abbe measure
+    --resume`. ``resumed``: where an interrupted campaign resumes. ``part``: the job of ``control`` continues after this measurement.
+    ``live``: receives the readings of paths.
     """
 
     control: Control | None = None
@@ -174,7 +175,7 @@ class Manner:
     live: LiveFeed | None = None
 
 
-async def measure(  # noqa: PLR0913 - what on what, and for whom
+async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     session: Session,
     store: Store,
     site: Site,
@@ -185,23 +186,18 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     campaign: tuple[int, int] | None = None,
     manner: Manner | None = None,
 ) -> list[int]:
-    """Run all tests of a plan; returns the numbers of their complete runs in the store.
+    """Run all tests of a plan; return the numbers of their complete runs in the store.
 
-    Parameters
-    ----------
-    campaign : tuple of int, optional
-        A campaign that was begun, as `start_campaign` gives it; default: a new one of the plan's name.
-    manner : Manner, optional
-        Control from outside, and from where to go on; default: no interruption, from the beginning.
+    ``campaign``: result of `start_campaign`; default: a new campaign with the plan's name.
 
     Raises
     ------
     StrokeError, ConfigError, DevicesNotReady, DriverError
-        The plan does not fit the machine, or a device that it needs is missing, silent or not what it should be: before anything moves.
+        Before anything moves: the plan does not fit the machine, or a needed device is missing, silent or wrong.
     Interlock, MeasurementFault, DriverError
-        The run in hand is closed as failed, with the reason; earlier runs stay.
+        The current run is closed as failed, with the reason; earlier runs stay.
     Stopped, Aborted
-        A person asked for it; the run in hand is closed as stopped or aborted.
+        A person requested it; the current run is closed as stopped or aborted.
     """
     clock, manner = clock or SystemClock(), manner or Manner()
     control, resumed = manner.control or Control(), manner.resumed
@@ -215,7 +211,7 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
     campaign_run = await _campaign_run(session, store, site, plan, journal, manner, control)
     progress_meter = ProgressMeter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
     control.now(State.RUNNING)
-    notes, told = IncidentNotes(journal, clock), asyncio.create_task(progress_meter.tell())
+    notes, reporting = IncidentNotes(journal, clock), asyncio.create_task(progress_meter.report_states())
     once = _once(session, store, site, under_way, progress_meter, manner.live)
     try:
         async with incidents_noted(session, notes):
@@ -227,12 +223,12 @@ async def measure(  # noqa: PLR0913 - what on what, and for whom
         await _ended(journal, notes, "complete", None)
     finally:
         control.now(State.RUNNING if manner.part else State.ENDED)
-        told.cancel()
+        reporting.cancel()
     return run_ids
 
 
 async def _ended(journal: StoreJournal, notes: IncidentNotes, how: str, error: BaseException | None) -> None:
-    """The journal's last line. A database that does not take it must not hide why the measurement has ended."""
+    """Write the journal's last line. A failure of the database must not hide why the measurement ended."""
     journal.longest_s = min(journal.longest_s, LAST_LINE_S)
     try:
         left_out = {"incidents_not_written": notes.not_written} if notes.not_written else {}
@@ -246,11 +242,11 @@ async def _ended(journal: StoreJournal, notes: IncidentNotes, how: str, error: B
 async def _campaign_run(
     session: Session, store: Store, site: Site, plan: CampaignPlan, journal: StoreJournal, manner: Manner, control: Control
 ) -> CampaignRun:
-    """The journal's first line, and what the campaign is carried through with."""
+    """Write the journal's first line and return the context of the campaign."""
     comp = await session.controller.comp_status()
     expected = ExpectedTable(comp.boot_id, comp.bank_crc[comp.active_bank])
     if manner.resumed is not None and manner.resumed.expected is not None:
-        expected = manner.resumed.expected  # the table may have been changed since it was looked at: while a question stood
+        expected = manner.resumed.expected  # the table may have changed since the check, while a question was open
     source = {} if manner.source is None else asdict(manner.source)
     begun = {"plan": plan_hash(plan), "source": source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
     begun["owner"] = asdict(this_process())
@@ -265,7 +261,7 @@ async def _campaign_run(
 
 
 def planned_seconds(test: TestPlan) -> float:
-    """How long a test's steps take."""
+    """Planned machine time of a test, s."""
     seconds, here = 0.0, None
     for step in test.steps:
         if not (isinstance(step, MoveTo) and here == step.target_mm):
@@ -285,7 +281,7 @@ async def _all_tests(
     resumed: Resumed | None,
     once: Callable[[TestPlan, float], Once],
 ) -> list[int]:
-    """Every test that has no complete run yet, in the plan's order."""
+    """Run every test without a complete run, in the plan's order."""
     run_ids: list[int] = []
     done, start = (resumed.done, resumed.start) if resumed is not None else ({}, {})
     for item, duration_s in zip(items(plan), seconds, strict=True):
@@ -304,20 +300,20 @@ async def _all_tests(
 def _once(
     session: Session, store: Store, site: Site, under_way: OpenCampaign, progress_meter: ProgressMeter, live: LiveFeed | None
 ) -> Callable[[TestPlan, float], Once]:
-    """How one attempt at a test becomes one run."""
+    """Return a factory of functions that run one attempt at a test as one run."""
 
     def of(test: TestPlan, base_s: float) -> Once:
         breaks = BarBreaks(session, progress_meter.control or Control(), site.watching.suspending)
 
         async def once(left: TestPlan, attempt: Attempt, runner: Runner) -> int:
-            before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # what an earlier attempt has done stays done
+            before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # done by earlier attempts
 
             def tick(seconds: float, waited_s: float) -> None:
                 progress_meter.at(base_s + before_s + seconds, test.label, waited_s)
 
-            how = How(runner, attempt, runner.journal, live)
+            context = AttemptContext(runner, attempt, runner.journal, live)
             try:
-                return await measure_test(session, store, site, under_way, left, tick, progress_meter.clock, how)
+                return await measure_test(session, store, site, under_way, left, tick, progress_meter.clock, context)
             except DriverError as error:
                 await breaks.wait(error, runner, runner.journal)
                 raise
@@ -327,7 +323,7 @@ def _once(
     return of
 
 
-async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it goes, and how
+async def measure_test(  # noqa: PLR0913 - a test, its devices, its destination, and its context
     session: Session,
     store: Store,
     site: Site,
@@ -335,10 +331,11 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
     test: TestPlan,
     tick: Tick,
     clock: Clock,
-    how: How | None = None,
+    context: AttemptContext | None = None,
 ) -> int:
-    """One test as one run; whatever ends it early is written into the run before it is raised again."""
-    runner, attempt, journal = (how.runner, how.attempt, how.journal) if how is not None else (Runner(session), Attempt(), NoJournal())
+    """Measure one test as one run; an early end is written into the run before its error leaves."""
+    context = context or AttemptContext(Runner(session), Attempt(), NoJournal())
+    runner, attempt, journal = context.runner, context.attempt, context.journal
     doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
     if attempt.remainder is not None:
         doc["path"] |= attempt.remainder.doc()
@@ -351,7 +348,7 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
             await journal.add(RUN, test=attempt.test, run=run_id, label=test.label, setup=attempt.setup, mounting=attempt.mounting)
             with run_named(session, f"run {run_id} {test.label}"):
                 await bar_ready(session, test)
-                with shown(how.live if how is not None else None, test, recorder):
+                with live_view(context.live, test, recorder):
                     end = dict(await runner.run(test, recorder, tick, replace(attempt, run_id=run_id)))
         status, reason = "complete", ""
     except DiskFull as error:
@@ -361,7 +358,7 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
         status, reason = RUN_STATUS.get(type(error), "failed"), f"{error.code}: {error}"
         raise
     except Exception as error:
-        status, reason = "failed", repr(error)  # a defect: what it was must not get lost behind "stopped"
+        status, reason = "failed", repr(error)  # a defect: keep its text instead of "stopped"
         raise
     except BaseException as error:
         reason = "; ".join(["stopped", *warnings_of(error)])
@@ -378,8 +375,8 @@ async def measure_test(  # noqa: PLR0913 - a test, on what it is run, where it g
 
 
 @contextmanager
-def shown(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) -> Iterator[None]:
-    """Live views get what the test's path reads, beside the way to the disk."""
+def live_view(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) -> Iterator[None]:
+    """Feed live views with the readings of the test's path, beside the recording."""
     path = next((step for step in test.steps if isinstance(step, RecordPath)), None)
     if live is None or path is None:
         yield
@@ -393,7 +390,7 @@ def shown(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) -> I
 
 
 async def start_document(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
-    """What is known before the first step. A test that mounts is taken to mount now; the end document knows better (`mounted_us`)."""
+    """Return the start document of a run. Its mounting time is preliminary for a test that mounts; the end document has `mounted_us`."""
     status = await session.controller.status()
     comp = await session.controller.comp_status()
     ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
@@ -423,6 +420,6 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
 
 
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
-    """How many readings at standstill a whole run has: those of its steps, and those carried over, the last of which is read again."""
+    """Number of readings at standstill in a whole run: those of its steps and the carried ones, of which the last is read again."""
     count = sum(isinstance(step, ReadLaser | ReadBar) for step in test.steps)
     return {"standstills": count + max(0, len(attempt.resume_trail.carried) - 1)} if count else {}

@@ -1,4 +1,4 @@
-"""Plan a campaign for a machine: the planner's choice as a recipe that the sequencer runs, checked by its dry run, and as a document."""
+"""Plans a campaign for a machine: the planner's choice as a recipe for the sequencer, checked by its dry run, and as a document."""
 
 from __future__ import annotations
 
@@ -35,10 +35,7 @@ BOUND_NOTE = (
 
 @dataclass(frozen=True)
 class PlannedCampaign:
-    """A plan with what the sequencer makes of it: recipes, campaign, dry run of every test, and the recipe file's text.
-
-    ``notes``: what a person has to know before it runs.
-    """
+    """A plan with its recipes, campaign, dry run of every test, and recipe file text. ``notes``: for a person, before it runs."""
 
     plan: Plan
     recipes: tuple[Recipe, ...]
@@ -61,17 +58,17 @@ def plan_for(
     Raises
     ------
     ConfigError
-        Nothing can be planned: minutes too few, strokes too small, numbers impossible.
+        No plan is possible: too few minutes, too small strokes, or invalid numbers.
     StrokeError
-        The dry run refuses what was planned.
+        The dry run refuses the plan.
     """
 
     def tick(share: float) -> None:
-        progress(Progress("plan", share, 1.0, None, "looking for the measurements that tell most"))
+        progress(Progress("plan", share, 1.0, None, "selecting the most informative measurements"))
 
     vertical = AXES.index(str(site.doc.get("vertical_axis", "Z")))
     goal_mm = None if goal_um is None else goal_um * 1e-3
-    tools, said = at_this_machine(tools or Instruments(), site)
+    tools, notes = at_this_machine(tools or Instruments(), site)
     try:
         plan = plan_campaign(site.machine, minutes=minutes, goal_mm=goal_mm, tools=tools, vertical=vertical, progress=tick)
     except ValueError as error:
@@ -83,11 +80,11 @@ def plan_for(
     campaign = paced(CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes)), site.max_feed_mm_min)
     dry = dry_run_campaign(site.machine, campaign, site.max_feed_mm_min)
     note = f"for {site.name}, {plan.minutes:.0f} minutes with set-ups; expected worst U {_um(COVERAGE * plan.u_worst_mm)} um"
-    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*said, *plan.doubts))
+    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*notes, *plan.doubts))
 
 
 def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
-    """The sequencer's recipe for a planned measurement with these instruments."""
+    """Return the sequencer's recipe for a planned measurement with these instruments."""
     test: Measurement = step.test
     feed = feed_mm_min(tools, test)
     if isinstance(test, HelixTest):
@@ -109,8 +106,8 @@ def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
     return Linear(step.label, step.setup_id, "identify", test.axis, at_share=test.at, positions=test.n, feed_mm_min=feed)
 
 
-def words(test: Measurement) -> str:
-    """A measurement as an operator reads it."""
+def describe(test: Measurement) -> str:
+    """Describe a measurement for an operator."""
     if isinstance(test, HelixTest):
         at = ", ".join(f"{v:g}" for v in test.centre_mm)
         opens = "" if (test.axis, test.opens) == (2, 1) else f", opening along {'+' if test.opens > 0 else '-'}{AXES[test.axis]}"
@@ -122,8 +119,8 @@ def words(test: Measurement) -> str:
     return f"laser along {AXES[test.axis]}, {at} of the stroke"
 
 
-def temperature_words(plan: Plan) -> str:
-    """What part of U no measurement takes away."""
+def temperature_note(plan: Plan) -> str:
+    """Describe the part of U that no measurement can reduce."""
     inputs = plan.tools.inputs
     return (
         f"in every U: scales known to {inputs.u_scale_temperature_k:g} K ({inputs.scale_expansion_per_k * 1e6:g} µm/m/K), "
@@ -131,8 +128,8 @@ def temperature_words(plan: Plan) -> str:
     )
 
 
-def goal_words(plan: Plan) -> list[str]:
-    """What became of the goal, in sentences; none without a goal."""
+def goal_lines(plan: Plan) -> list[str]:
+    """Report on the goal, one sentence each; empty without a goal."""
     goal = plan.goal
     if goal is None:
         return []
@@ -149,23 +146,23 @@ def goal_words(plan: Plan) -> list[str]:
 
 
 def step_rows(plan: Plan) -> list[tuple[str, ...]]:
-    """The table of a plan: set-up, label, measurement, minutes, minutes so far, worst and mean U (k = 2) after it, µm."""
+    """Table of a plan: set-up, label, measurement, minutes, minutes so far, worst and mean U (k = 2) after it, µm."""
     before = tuple(_um(COVERAGE * u) for u in plan.u_before_mm)
     rows: list[tuple[str, ...]] = [("", "", "from the priors alone", "", "0", *before)]
     for s in plan.steps:
         u = (_um(COVERAGE * s.u_worst_mm), _um(COVERAGE * s.u_mean_mm))
-        rows.append((s.setup_id.removeprefix("S"), s.label, words(s.test), f"{s.minutes:.1f}", f"{s.until_min:.1f}", *u))
+        rows.append((s.setup_id.removeprefix("S"), s.label, describe(s.test), f"{s.minutes:.1f}", f"{s.until_min:.1f}", *u))
     return rows
 
 
 def plan_report(site: Site, planned: PlannedCampaign) -> Document:
-    """The picture of the set-ups and what each measurement buys."""
+    """Report with the picture of the set-ups and the gain of each measurement."""
     plan = planned.plan
     paths = [
-        DrawnTest(int(s.setup_id.removeprefix("S")), _kind(s.test), words(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
+        DrawnTest(int(s.setup_id.removeprefix("S")), _kind(s.test), describe(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
         for s, run in zip(plan.steps, plan.runs, strict=True)
     ]
-    lead = [f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_words(plan), *planned.notes]
+    lead = [f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_lines(plan), *planned.notes]
     headings = ("No", "Label", "Measurement", "min", "until min", "worst U µm", "mean U µm")
     picture = Picture(
         "Numbers: set-ups in the order of measuring. Rest the pointer on a dot to read what is set up there.",
@@ -173,7 +170,7 @@ def plan_report(site: Site, planned: PlannedCampaign) -> Document:
         "wide",
     )
     table = TextTable(headings, step_rows(plan))
-    note = f"{BOUND_NOTE}. {temperature_words(plan)}."
+    note = f"{BOUND_NOTE}. {temperature_note(plan)}."
     sections = (
         Section("Set-ups", [*lead, picture]),
         Section("Measurements in order", [table, note]),
@@ -191,13 +188,13 @@ def _mount_mm(test: Measurement, path_mm: F2) -> F1:
 
 
 def plan_doc(planned: PlannedCampaign) -> dict[str, Any]:
-    """The plan for programs, micrometres and minutes."""
+    """Plan as JSON object, in micrometres and minutes."""
     plan, goal = planned.plan, planned.plan.goal
     steps = [
         {
             "label": s.label,
             "setup": s.setup_id,
-            "what": words(s.test),
+            "what": describe(s.test),
             "minutes": s.minutes,
             "until_min": s.until_min,
             "machine_s": d.duration_s,

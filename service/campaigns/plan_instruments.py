@@ -1,4 +1,4 @@
-"""The instruments file of `abbe plan --instruments FILE.toml`: which bars there are, how well they read, how long set-ups take."""
+"""The instruments file of `abbe plan --instruments FILE.toml`: available bars, noise of the instruments, duration of set-ups."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Table(BaseModel):
 
 
 class SetupTable(_Table):
-    """``[setup]``: minutes a person needs."""
+    """``[setup]``: minutes that a person needs."""
 
     cup_min: Minutes = USUAL.cup
     bar_min: Minutes = USUAL.bar
@@ -35,7 +35,7 @@ class SetupTable(_Table):
 
 
 class InstrumentsFile(_Table):
-    """What there is to measure with; a key left out keeps its default."""
+    """Available instruments; an omitted key keeps its default."""
 
     bar_lengths_mm: tuple[Length, ...] = BAR_LENGTHS_MM
     laser: bool = True
@@ -46,13 +46,7 @@ class InstrumentsFile(_Table):
 
 
 def read_instruments(path: Path | None) -> Instruments:
-    """Instruments from a file; without one, the planner's defaults.
-
-    Raises
-    ------
-    ConfigError
-        File, key and what is expected there.
-    """
+    """Read instruments from a file, or return the planner's defaults. Raises ConfigError with file, key and expected value."""
     if path is None:
         return Instruments()
     if not path.exists():
@@ -81,26 +75,26 @@ def read_instruments(path: Path | None) -> Instruments:
 
 
 def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[str, ...]]:
-    """What of the instruments a machine can use, and what is left out, in words.
+    """Return the instruments that a machine can use, and messages about those left out.
 
     A machine file that names a ball-bar or a laser under ``[devices]`` has no other; one that names neither is planned with all.
 
     Raises
     ------
     ConfigError
-        Nothing is left.
+        No instrument is left.
     """
     tools = replace(tools, max_feed_mm_min=site.max_feed_mm_min)
     has_bar, has_laser = site.urls.ballbar is not None, site.urls.laser is not None
     if not has_bar and not has_laser:
         return tools, ()
-    said = []
+    messages = []
     if tools.laser and not has_laser:
-        said.append("planned without laser: the machine file names none under [devices]")
+        messages.append("planned without laser: the machine file names none under [devices]")
     if tools.bar_lengths_mm and not has_bar:
-        said.append("planned without ball-bar: the machine file names none under [devices]")
+        messages.append("planned without ball-bar: the machine file names none under [devices]")
     try:
-        return replace(tools, laser=tools.laser and has_laser, bar_lengths_mm=tools.bar_lengths_mm if has_bar else ()), tuple(said)
+        return replace(tools, laser=tools.laser and has_laser, bar_lengths_mm=tools.bar_lengths_mm if has_bar else ()), tuple(messages)
     except ValueError:
         remedy = "correct the instruments file, or name under [devices] what it lists"
-        raise ConfigError(f"nothing to measure with: {'; '.join(said)}", remedy) from None
+        raise ConfigError(f"nothing to measure with: {'; '.join(messages)}", remedy) from None

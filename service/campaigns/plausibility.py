@@ -1,6 +1,6 @@
-"""What of a machine file cannot work, and what is probably not meant: said before a machine is asked to move, not at night by a schedule.
+"""Finds errors and probable mistakes in a machine file before a machine moves, not at night by a schedule.
 
-What no machine can be (a stroke of 1e9 mm, 68 degrees C) is refused where the file is read (`abbe.service.config_schema`).
+`abbe.service.config_schema` refuses impossible values (a stroke of 1e9 mm, 68 degrees C) when it reads the file.
 """
 
 from __future__ import annotations
@@ -21,56 +21,42 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 
 SMALL_MM, LARGE_MM = 200.0, 20_000.0
-"""A machine whose longest axis is shorter, or that has a longer one, is possible and rare."""
+"""A longest axis outside these limits is possible but rare."""
 ROOM_C = (10.0, 35.0)
-"""A window of the air's temperature beyond this is possible and rare."""
+"""A window of the air temperature beyond this is possible but rare."""
 LONG_VALID_YEARS = 10
 INSTRUMENTS = {BALLBAR: "ball-bar", LASER: "laser"}
 
 
 @dataclass(frozen=True, slots=True)
 class Plausibility:
-    """What cannot work, and what can but is rarely meant; one line each."""
+    """Errors, and values that are valid but rarely intended; one line each."""
 
     errors: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
     @property
     def good(self) -> bool:
-        """Whether there is nothing to say."""
+        """Whether there are no errors and no warnings."""
         return not self.errors and not self.warnings
 
 
 def check_plausibility(config: MachineFile, folder: Path, today: date) -> Plausibility:
-    """Look at all of a machine file; nothing is connected.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the machine file: recipe files lie beside it.
-    today : date
-        For certificates.
-    """
+    """Check a whole machine file without connecting to anything. ``folder``: of the machine file, with the recipe files."""
     site = site_of(config)
     rare = [*_strokes(config), *_window(config), *certificates(site, today), *_far(site, today), *_none(site)]
     return Plausibility(tuple(unattended(config, site, folder)), tuple(rare))
 
 
 def check_unattended(config: MachineFile, folder: Path) -> None:
-    """Refuse a timetable that cannot be kept.
-
-    Raises
-    ------
-    ConfigError
-        All that is wrong, in one line.
-    """
+    """Raise ConfigError with all reasons why a schedule could not run, in one line."""
     found = unattended(config, site_of(config), folder)
     if found:
-        raise ConfigError("; ".join(found), "correct the machine file; `abbe check-config` says all of this")
+        raise ConfigError("; ".join(found), "correct the machine file; `abbe check-config` lists all of this")
 
 
 def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
-    """Why scheduled checks, and what follows them by itself, could not run: recipe, strokes, feed, devices, who mounts."""
+    """Reasons why scheduled checks and their automatic follow-ups could not run: recipe, strokes, feed, devices, fixture."""
     found = []
     for entry in config.schedule:
         found += _lines(entry, site, lambda entry=entry: recipe_plan(entry.recipe, site.machine))  # type: ignore[misc]
@@ -82,7 +68,7 @@ def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
 
 
 def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> list[str]:
-    """Certificates of these instruments that have ended."""
+    """Messages about expired certificates of these instruments."""
     return [
         f"the certificate of the {INSTRUMENTS[role]} has ended on {day}: what is measured now goes into no table ([calibration] {role})"
         for role, day in ended_certificates(site, today, roles).items()
@@ -90,7 +76,7 @@ def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) ->
 
 
 def ended_certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> dict[str, date]:
-    """Last days of those certificates of these instruments that have ended."""
+    """Last valid days of the expired certificates of these instruments, by role."""
     return {role: day for role, day in site.calibrated_until.items() if role in roles and day < today}
 
 
@@ -100,7 +86,7 @@ def _lines(entry: Schedule, site: Site, plan: Callable[[], CampaignPlan]) -> lis
         dry_run_campaign(site.machine, made, site.max_feed_mm_min)
         check_configured(needed_by(made, air=site.watching.air_c is not None), site.urls.named())
         if site.urls.fixture is not None and isinstance(parse_url(site.urls.fixture), FixtureConsoleUrl):
-            raise ConfigError("the fixture is the console, where nobody answers a schedule", "configure a remote fixture under [devices]")
+            raise ConfigError("the fixture is the console, which is unattended in a schedule", "configure a remote fixture under [devices]")
     except AbbeError as error:
         return [f"schedule {entry.name!r}: {error}"]
     return []

@@ -1,6 +1,6 @@
-"""Resumes a campaign that was broken off by Ctrl-C, an interlock, a crash or a power cut. Complete runs are used, none twice.
+"""Resumes a campaign after Ctrl-C, an interlock, a crash or a power cut. Every complete run is used, and used once.
 
-Everything is checked again and reported; a change that makes resuming impossible is refused in one line.
+All preconditions are checked again and reported; a change that prevents resuming is refused in one line.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ MOUNTS = ("MountBar", "MountLaser")
 
 
 @dataclass(frozen=True, slots=True)
-class Lines:
-    """A campaign's journal: the last beginning, what was done by hand, and which run is of which test."""
+class JournalEntries:
+    """A campaign's journal: the latest ``begun`` line, the manual steps, and the lines of runs by run number."""
 
     begun: Doc
     ended: bool
@@ -52,14 +52,8 @@ class Lines:
     runs: dict[int, Doc]
 
 
-def read_journal(store: Store, campaign: CampaignRecord) -> Lines:
-    """The journal of a campaign.
-
-    Raises
-    ------
-    WorldChanged
-        It has none.
-    """
+def read_journal(store: Store, campaign: CampaignRecord) -> JournalEntries:
+    """Read the journal of a campaign. Raises PreconditionsChanged if there is none."""
     found: list[CheckpointRecord] = store.checkpoints.of_campaign(campaign.id)
     begun = [one.doc for one in found if one.kind == BEGUN]
     if not begun:
@@ -70,17 +64,11 @@ def read_journal(store: Store, campaign: CampaignRecord) -> Lines:
     hand = tuple(one.doc for one in found if one.kind == HAND)
     last = max(k for k, one in enumerate(found) if one.kind == BEGUN)
     ended = any(one.kind == ENDED for one in found[last:])
-    return Lines(begun[-1], ended, hand, {int(one.doc["run"]): one.doc for one in found if one.kind == RUN})
+    return JournalEntries(begun[-1], ended, hand, {int(one.doc["run"]): one.doc for one in found if one.kind == RUN})
 
 
 def begun_source(store: Store, name: str) -> RecipeSource:
-    """Return what the plan of an interrupted campaign was made from.
-
-    Raises
-    ------
-    WorldChanged
-        Its journal does not say.
-    """
+    """Return the source of an interrupted campaign's plan. Raises PreconditionsChanged if the journal does not name it."""
     source: Doc = read_journal(store, store.campaigns.find(name)).begun.get("source") or {}
     if "recipe" not in source:
         raise PreconditionsChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
@@ -88,21 +76,16 @@ def begun_source(store: Store, name: str) -> RecipeSource:
 
 
 async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan, name: str, confirm: Confirm) -> Resumed:
-    """Find out where a campaign goes on. A motion that is still under way is stopped; nothing else moves.
+    """Find out where a campaign resumes. Stops a motion that is still running; nothing else moves.
 
-    Parameters
-    ----------
-    plan : CampaignPlan
-        The same as when it was begun.
-    confirm : callable
-        Asked whether a set-up with complete runs was not touched; a no has it mounted anew.
+    ``plan`` must be the original one. ``confirm`` asks whether a set-up with complete runs is untouched; if not, it is mounted anew.
 
     Raises
     ------
-    WorldChanged
-        Another plan, machine, table or run of the controller.
+    PreconditionsChanged
+        The plan, the machine, the table or the run of the controller is another.
     UnsafeToMove
-        Another process is measuring it, or an interlock holds.
+        Another process is measuring the campaign, or an interlock holds.
     """
     campaign = store.campaigns.find(name)
     lines = read_journal(store, campaign)
@@ -110,23 +93,23 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     comp = await session.controller.comp_status()
     expected = ExpectedTable(lines.begun["boot_id"], lines.begun["table_crc"])
     check_expected(expected, comp.boot_id, comp.bank_crc[comp.active_bank])
-    said = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
+    messages = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
     status = await session.controller.status()
     check_ours(status)
     if status.moving:
         await session.controller.abort()
-        said.append("the machine was still moving: it was stopped")
+        messages.append("the machine was still moving: it was stopped")
     check_interlocks(await session.controller.status())
     found = _Finder(store, campaign.id, plan, lines, {run.id: run.visible_status for run in store.runs.all(campaign.id)})
-    start = await found.starts(session, confirm, said)
-    said.insert(1, f"{len(found.done)} of {len(plan.tests)} tests are complete")
+    start = await found.starts(session, confirm, messages)
+    messages.insert(1, f"{len(found.done)} of {len(plan.tests)} tests are complete")
     ctrl0_us = int(campaign.doc["ctrl0_us"])
     return Resumed(
-        (campaign.id, ctrl0_us), found.done, start, found.mountings, frozenset(found.used), found.mounted_us, tuple(said), expected
+        (campaign.id, ctrl0_us), found.done, start, found.mountings, frozenset(found.used), found.mounted_us, tuple(messages), expected
     )
 
 
-def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site, plan: CampaignPlan) -> None:
+def _same_plan(store: Store, campaign: CampaignRecord, lines: JournalEntries, site: Site, plan: CampaignPlan) -> None:
     owner = Owner(**lines.begun["owner"]) if "owner" in lines.begun else None
     if owner is not None and not lines.ended and not owner.is_gone():
         raise UnsafeToMove(f"campaign {campaign.name!r} is being measured (process {owner.pid} on {owner.host})", "wait until it has ended")
@@ -138,7 +121,7 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site,
     if lines.begun["plan"] != plan_hash(plan):
         raise PreconditionsChanged(
             f"campaign {campaign.name!r} was begun with another recipe (or feed limit, or version of Abbe)",
-            "go on with the recipe that it was begun with, or measure a new campaign",
+            "resume with the original recipe, or measure a new campaign",
         )
     if store.machines.get(campaign.machine_id).doc != site.doc:
         raise PreconditionsChanged(
@@ -147,9 +130,9 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: Lines, site: Site,
 
 
 class _Finder:
-    """What of a plan is done, what is mounted, and where the rest begins."""
+    """Finds which tests of a plan are done, what is mounted, and where the rest begins."""
 
-    def __init__(self, store: Store, campaign: int, plan: CampaignPlan, lines: Lines, states: dict[int, str]) -> None:
+    def __init__(self, store: Store, campaign: int, plan: CampaignPlan, lines: JournalEntries, states: dict[int, str]) -> None:
         self._store, self._campaign, self._lines, self._items = store, campaign, lines, items(plan)
         complete = {n: one for n, one in lines.runs.items() if states.get(n) == COMPLETE}
         self.done = {str(one["test"]): n for n, one in complete.items()}
@@ -162,32 +145,32 @@ class _Finder:
             if one["phase"] == "done" and one["what"] in MOUNTS:
                 self.mounted_us[setup if number == 1 else f"{setup}-{number}"] = int(one["ctrl_us"])
 
-    async def starts(self, session: Session, confirm: Confirm, said: list[str]) -> dict[str, Item]:
-        """The first test that is left of every set-up that was begun."""
+    async def starts(self, session: Session, confirm: Confirm, messages: list[str]) -> dict[str, Item]:
+        """Return the first remaining test of every begun set-up."""
         start: dict[str, Item] = {}
         for setup in self.mountings:
             item = next((i for i in self._items if i.setup == setup and i.test.label not in self.done), None)
             if item is not None:
-                start[item.test.label] = await self._start(session, item, confirm, said)
+                start[item.test.label] = await self._start(session, item, confirm, messages)
         return start
 
-    async def _start(self, session: Session, item: Item, confirm: Confirm, said: list[str]) -> Item:
+    async def _start(self, session: Session, item: Item, confirm: Confirm, messages: list[str]) -> Item:
         setup, number = item.setup, self.mountings[item.setup]
         hand = [one for one in self._lines.hand if one["setup"] == setup and one["mounting"] == number]
         why = ""
         if hand[-1]["phase"] != "done":
-            why = "nobody knows how far whoever mounts had come"
+            why = "its mounting was not confirmed as done"
         elif hand[-1]["what"] == "Unmount":
             why = "it was cleared away"
         else:
             item = await self._in_place(session, item, number, hand[-1])
             if (setup, number) in self.used and not item.resume_trail.carried:
-                asked = f"Set-up {setup} was left mounted and has complete runs. Has nobody touched it since?"
-                why = "" if await confirm(asked) else "nobody vouches for it, and runs of it are complete"
+                question = f"Set-up {setup} was left mounted and has complete runs. Is it still untouched?"
+                why = "" if await confirm(question) else "it is not confirmed as untouched, and has complete runs"
             elif item.remainder is not None and not await confirm(halfway(item)):
                 item = resumed_item(item, item.hand, ())
         if why:
-            said.append(f"set-up {setup} is mounted anew for {item.test.label}: {why}")
+            messages.append(f"set-up {setup} is mounted anew for {item.test.label}: {why}")
             self.mountings[setup] = number + 1
             return mounted_anew(item, number + 1)
         kept = len(item.resume_trail.carried)
@@ -195,11 +178,11 @@ class _Finder:
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
             how = f"goes on at {at} of its path, a stretch of which is read again"
-        said.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
+        messages.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
         return item
 
     async def _in_place(self, session: Session, item: Item, number: int, last: Doc) -> Item:
-        """The test with what is mounted, from its last checkpoint."""
+        """Return the test from its last checkpoint, in the present mounting."""
         label = item.test.label
         mounted_it = any(one["test"] == label and one["mounting"] == number and one["what"] in MOUNTS for one in self._lines.hand)
         if number > 1 and mounted_it:
@@ -214,7 +197,7 @@ class _Finder:
         return resumed_item(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
 
     def _records(self, label: str, number: int) -> tuple[dict[str, Any], ...]:
-        """Laser records of the last run of a test in this mounting."""
+        """Return the laser records of the last run of a test in this mounting."""
         runs = [n for n, one in self._lines.runs.items() if one["test"] == label and one["mounting"] == number]
         if not runs:
             return ()
@@ -222,7 +205,7 @@ class _Finder:
 
 
 async def counting(session: Session) -> bool:
-    """Whether the laser still counts from the zero that it was given."""
+    """Whether the laser still counts from its last zero."""
     if session.laser is None:
         return False
     try:

@@ -157,7 +157,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
     confirm = yes if said.untouched else ask
     async with ready_session(store, site, accept_table=said.accept_table) as session:
         found = await find(session, store, site, plan, plan.name, confirm) if said.resume else None
-        for line in found.said if found is not None else ():
+        for line in found.messages if found is not None else ():
             typer.echo(line, err=True)
         with display() as sink:
             await work(session, store, site, plan, progress=sink, manner=Manner(control, confirm, source, found))

@@ -73,14 +73,14 @@ def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None,
 
 
 def _print(planned: PlannedCampaign, out: Path | None, picture: Path | None) -> None:
-    from abbe.service.campaigns.plan import BOUND_NOTE, goal_words, step_rows, temperature_words
+    from abbe.service.campaigns.plan import BOUND_NOTE, goal_lines, step_rows, temperature_note
 
     print_table(HEADINGS, step_rows(planned.plan), f"{planned.plan.minutes:.0f} minutes, set-ups included")
     typer.echo(BOUND_NOTE)
-    typer.echo(temperature_words(planned.plan))
+    typer.echo(temperature_note(planned.plan))
     for line in planned.notes:
         typer.echo(f"note: {line}")
-    for line in goal_words(planned.plan):
+    for line in goal_lines(planned.plan):
         typer.echo(line)
     typer.echo("this campaign cannot tell:")
     for text in planned.plan.open_questions:

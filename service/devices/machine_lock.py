@@ -1,7 +1,7 @@
-"""One process a machine: two that command the same axes would each drive a bar that the other believes elsewhere.
+"""One process per machine: of two that command the same axes, each would drive a bar that the other believes elsewhere.
 
-Who has the machine holds a lock on a file in a folder that all accounts of this computer see, also a service that sees no processes but its
-own and no ``/tmp`` but its own, as under systemd.
+The process that uses the machine locks a file in a folder shared by all accounts of this computer, including a systemd service with private
+processes and a private ``/tmp``.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from abbe.service.devices.urls import address_of
 from abbe.service.errors import MachineInUse, UnsafeToMove
 
 ENVIRONMENT = "ABBE_LOCK_FOLDER"
-"""Names another folder, for a computer or a container where the usual ones do not serve."""
+"""Environment variable with another folder, for computers or containers where the default ones do not work."""
 INSTALLED = Path("/run/abbe")
-"""Made at boot by deploy/abbe-tmpfiles.conf, for a group. Where it exists, no other is used; an account without access gets an error."""
+"""Made at boot by deploy/abbe-tmpfiles.conf, for a group. If it exists, it is the only choice; an account without access gets an error."""
 WITHOUT_INSTALLATION = Path("/tmp/abbe-machines")  # noqa: S108 - the same for all accounts, whatever TMPDIR says
-"""Open to every account. A service with a ``/tmp`` of its own needs the other one."""
+"""Open to every account. A service with a private ``/tmp`` needs the other one."""
 SHARED = 0o1777
-"""Mode of a folder in which every account makes files and removes only its own."""
+"""Mode of a folder in which every account may create files and remove only its own."""
 TRIES = 100
 
 
 @contextmanager
 def lock_machine(url: str | None) -> Iterator[None]:
-    """Hold the machine behind a controller's URL for this process. It is given back when the process ends, however it ends.
+    """Lock the machine behind a controller's URL for this process. The end of the process, of any kind, releases the lock.
 
-    Processes of all accounts on one computer are kept apart, if they name the machine by the same URL; other computers are not.
+    The lock separates processes of all accounts on one computer that use the same URL. It does not cover other computers.
 
     Raises
     ------
     MachineInUse
-        Another process, or another job of this one, has it.
+        Another process, or another job of this one, has the lock.
     UnsafeToMove
         The lock cannot be opened, so it is unknown whether the machine is in use.
     """
@@ -52,12 +52,12 @@ def lock_machine(url: str | None) -> Iterator[None]:
         handle = _locked(path)
     except OSError as error:
         raise UnsafeToMove(
-            f"nobody can say whether the machine at {url} is in use: {path} cannot be used ({error.strerror})", _remedy(path.parent)
+            f"it is unknown whether the machine at {url} is in use: {path} cannot be used ({error.strerror})", _remedy(path.parent)
         ) from None
-    except _Held as held:
-        raise MachineInUse(f"the machine at {url} is in use by {held}", "wait until it has ended") from None
+    except _LockHeld as holder:
+        raise MachineInUse(f"the machine at {url} is in use by {holder}", "wait until it has ended") from None
     try:
-        with suppress(OSError):  # the lock is held; a full disk keeps only its holder's name from others
+        with suppress(OSError):  # the lock is held; on a full disk only the holder's name is missing
             os.ftruncate(handle, 0)
             os.pwrite(handle, f"process {os.getpid()} ({' '.join([Path(sys.argv[0]).name, *sys.argv[1:2]])})\n".encode()[:200], 0)
         yield
@@ -66,13 +66,12 @@ def lock_machine(url: str | None) -> Iterator[None]:
 
 
 def lock_folder() -> Path:
-    """Where the locks of machines lie: the folder that ``ABBE_LOCK_FOLDER`` names, ``/run/abbe`` where it is, else one among the temporary
-    files.
+    """Return the folder of the machine locks: ``ABBE_LOCK_FOLDER``, else ``/run/abbe`` if it exists, else a temporary folder.
 
     Raises
     ------
     UnsafeToMove
-        The last of them is not what all accounts of this computer can share.
+        The accounts of this computer cannot share the temporary folder.
     """
     given = os.environ.get(ENVIRONMENT)
     if given:
@@ -83,18 +82,18 @@ def lock_folder() -> Path:
         return _shared(WITHOUT_INSTALLATION)
     except OSError as error:
         raise UnsafeToMove(
-            f"nobody can say whether the machine is in use: {WITHOUT_INSTALLATION} cannot be used ({error.strerror})",
+            f"it is unknown whether the machine is in use: {WITHOUT_INSTALLATION} cannot be used ({error.strerror})",
             _remedy(WITHOUT_INSTALLATION),
         ) from None
 
 
 def _shared(folder: Path) -> Path:
-    """Make a folder for all accounts, or look whether the one that is there keeps them from each other's files."""
+    """Make a folder for all accounts, or check that the existing one protects their files from each other."""
     with suppress(FileExistsError):
         folder.mkdir()
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode):
-        raise UnsafeToMove(f"{folder} is no folder, so nobody can say whether the machine is in use", "remove it")
+        raise UnsafeToMove(f"{folder} is no folder, so it is unknown whether the machine is in use", "remove it")
     if found.st_mode & SHARED != SHARED:
         if found.st_uid != os.geteuid():
             raise UnsafeToMove(
@@ -105,12 +104,12 @@ def _shared(folder: Path) -> Path:
     return folder
 
 
-class _Held(Exception):  # noqa: N818 - reads as what it is
-    """The lock is held; the text is what its holder wrote into it."""
+class _LockHeld(Exception):  # noqa: N818 - a state, not an error
+    """Another process holds the lock; the text names it."""
 
 
 def _locked(path: Path) -> int:
-    """Open and lock a file; a file that was removed from its name meanwhile locks nothing, and does not count."""
+    """Open and lock a file; retry if it was removed from its path in between, because such a lock protects nothing."""
     for _ in range(TRIES):
         handle = _opened(path)
         try:
@@ -120,7 +119,7 @@ def _locked(path: Path) -> int:
         except BlockingIOError:
             who = os.pread(handle, 200, 0).decode(errors="replace").strip() or "another process"
             os.close(handle)
-            raise _Held(who) from None
+            raise _LockHeld(who) from None
         except FileNotFoundError:
             pass
         except BaseException:
@@ -131,7 +130,7 @@ def _locked(path: Path) -> int:
 
 
 def _opened(path: Path) -> int:
-    """Open the lock of a machine; make it if it is missing, with the rights of its folder, in one step."""
+    """Open the lock file of a machine; create it atomically with the rights of its folder if it is missing."""
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     with suppress(FileNotFoundError):
         return _plain(os.open(path, flags))
@@ -148,7 +147,7 @@ def _opened(path: Path) -> int:
 
 
 def _plain(handle: int) -> int:
-    """A lock is a plain file: anything else that lies under its name (a FIFO) is not taken for one."""
+    """Return the handle of a regular file; refuse anything else (a FIFO)."""
     if stat.S_ISREG(os.fstat(handle).st_mode):
         return handle
     os.close(handle)
@@ -159,4 +158,4 @@ def _remedy(folder: Path) -> str:
     with suppress(OSError):
         if folder.stat().st_mode & 0o020 and not folder.stat().st_mode & 0o002:
             return f"{folder} is for a group: become a member of it, see docs/how-to/serve.md"
-    return f"make {folder} writable for whoever uses the machine, or name another folder by {ENVIRONMENT}; see docs/how-to/serve.md"
+    return f"make {folder} writable for all users of the machine, or name another folder by {ENVIRONMENT}; see docs/how-to/serve.md"

@@ -1,6 +1,6 @@
-"""All devices of one machine behind one open/close: nothing stays open when one of them fails.
+"""Opens and closes all devices of one machine together: nothing stays open when one of them fails.
 
-Every status of the controller is noted with its arrival (`notes_since`): two clocks are compared by many such pairs, never by one.
+Every controller status is noted with its arrival time (`notes_since`): the comparison of two clocks uses many such pairs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ KEPT = 500
 
 
 class _Noted:
-    """A controller that does what it always did; the stamp and the arrival of every status are noted."""
+    """A controller that also notes the stamp and the arrival of every status."""
 
     def __init__(self, controller: Controller) -> None:
         self.noted_controller = controller
@@ -33,7 +33,7 @@ class _Noted:
         return getattr(self.noted_controller, name)
 
     async def status(self) -> ControllerStatus:
-        """Ask for the status, and note its stamp."""
+        """Read the status and note its stamp."""
         status = await self.noted_controller.status()
         self.clock_notes.append((status.ctrl_us, status.host_s))
         self.latest_status = status
@@ -41,17 +41,17 @@ class _Noted:
 
 
 def noted(controller: Controller) -> Controller:
-    """The same controller, noting stamp and arrival of every status."""
+    """Wrap a controller to note stamp and arrival of every status."""
     return cast(Controller, _Noted(controller))
 
 
 def latest_status(controller: Controller) -> ControllerStatus | None:
-    """The last status that was read from a noted controller; None before the first, or where nothing is noted."""
+    """Last status read from a noted controller; None before the first, or for other controllers."""
     return controller.latest_status if isinstance(controller, _Noted) else None
 
 
 def notes_since(controller: Controller, ctrl_us: int) -> list[list[float]]:
-    """Pairs [controller time in us, host time in s] noted from an instant of the controller on, the promptest of each of 500 stretches."""
+    """Pairs [controller time in us, host time in s] since a controller time: the promptest pair of each of 500 intervals."""
     if not isinstance(controller, _Noted):
         return []
     pairs = [(float(c), h) for c, h in controller.clock_notes if c >= ctrl_us]
@@ -71,10 +71,9 @@ D = TypeVar("D", Controller, BallBar, DisplacementMeter, Fixture)
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Open devices. A test that needs an absent one is refused by name (`need`).
+    """Open devices; the `need` methods refuse a test whose device is missing.
 
-    ``attended``: a person can answer a question at the console. ``recovered``: what an interrupted push left in the controller was finished
-    when it was opened.
+    ``attended``: a person can answer questions at the console. ``recovered``: opening finished an interrupted push.
     """
 
     controller: Controller
@@ -85,50 +84,44 @@ class Session:
     recovered: bool = False
 
     def need_ballbar(self) -> BallBar:
-        """The ball-bar, or one clear line that it is not configured."""
+        """Return the ball-bar, or raise ConfigError if the machine file names none."""
         if self.ballbar is None:
             raise ConfigError("this test needs a ball-bar, but the machine file names none", "add ballbar = ... under [devices]")
         return self.ballbar
 
     def need_laser(self) -> DisplacementMeter:
-        """The laser, or one clear line that it is not configured."""
+        """Return the laser, or raise ConfigError if the machine file names none."""
         if self.laser is None:
             raise ConfigError("this test needs a laser, but the machine file names none", "add laser = ... under [devices]")
         return self.laser
 
     def need_fixture(self) -> Fixture:
-        """The fixture, or one clear line that none is configured."""
+        """Return the fixture, or raise ConfigError if the machine file names none."""
         if self.fixture is None:
-            raise ConfigError("nobody can mount the instrument: no fixture configured", 'add fixture = "fixture+console:" under [devices]')
+            raise ConfigError("no fixture is configured to mount the instrument", 'add fixture = "fixture+console:" under [devices]')
         return self.fixture
 
 
 async def no_console(text: str) -> None:
-    """For unattended sessions: asking a person is an error that names the request."""
-    raise ConfigError(f"nobody is at the console to: {text}", "run this test attended, or configure a remote fixture")
+    """Refuse a question to a person, for unattended sessions. Raises ConfigError with the question."""
+    raise ConfigError(f"the console is unattended, but a person has to: {text}", "run this test attended, or configure a remote fixture")
 
 
 @asynccontextmanager
 async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First | None = None) -> AsyncIterator[Session]:
-    """Open every configured device and identify it; close all of them at the end, whatever happens.
+    """Open and identify every configured device; always close all of them at the end.
 
-    Parameters
-    ----------
-    urls : DeviceUrls
-        Where they are.
-    ask : callable
-        Asks the person at the console.
-    first : callable, optional
-        Gets the open controller before any other device is opened (`abbe.service.compensation.recovered_session`). What it raises ends it.
+    ``ask`` asks the person at the console. ``first`` runs on the open controller before any other device is opened
+    (`abbe.service.compensation.recovered_session`); its errors end the session.
 
     Raises
     ------
     ConfigError
         No controller configured.
     DriverError
-        A device cannot be opened or is not what its protocol demands.
+        A device cannot be opened or does not follow its protocol.
     DevicesNotReady
-        The same of several: all are tried, and named in one line.
+        Several devices failed; all are tried, and named in one line.
     """
     if urls.cnc is None:
         raise ConfigError("no controller configured", "add cnc = ... under [devices] of the machine file")
@@ -157,13 +150,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First 
 
 
 def raise_all(troubles: Sequence[AbbeError | DriverError]) -> None:
-    """Raise what is wrong with devices: one error as it is, several as one line.
-
-    Raises
-    ------
-    AbbeError, DriverError
-        As above.
-    """
+    """Raise a single device error as it is, several as one DevicesNotReady."""
     if len(troubles) == 1:
         raise troubles[0]
     if troubles:

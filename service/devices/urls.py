@@ -1,4 +1,4 @@
-"""Where the devices of a machine are: known also to those who have no way to them."""
+"""Addresses of the devices of a machine, without any code that connects to them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ UNIT = "1"
 
 @dataclass(frozen=True, slots=True)
 class DeviceUrls:
-    """Where the devices of a machine are; None: not connected."""
+    """Device URLs of a machine; None: not connected."""
 
     cnc: str | None = None
     ballbar: str | None = None
@@ -24,11 +24,11 @@ class DeviceUrls:
 
 
 def control_of(url: str | None) -> str:
-    """Which control a URL leads to: its identity for the push journal; empty for no URL.
+    """Return the identity of a control for the push journal; empty for no URL.
 
-    The register map has no serial number, and a boot id is gone with the next start, so the address stands for the control: `address_of`,
-    and the Modbus unit where it is not 1, for a gateway has several controls behind one address. A number that the control states itself
-    would take its place here. One control under two addresses (a host name and its IP) is two: docs/decisions/0030-whose-table-it-is.md.
+    The register map has no serial number, and a boot id changes at every start, so the address identifies the control: `address_of`, plus
+    the Modbus unit if it is not 1, because a gateway has several controls behind one address. One control under two addresses (a host name
+    and its IP) counts as two: docs/decisions/0030-whose-table-it-is.md.
     """
     address = address_of(url)
     unit = parse_qs((url or "").partition("?")[2]).get("unit", [UNIT])[0].strip().lstrip("0") or "0"
@@ -36,7 +36,7 @@ def control_of(url: str | None) -> str:
 
 
 def address_of(url: str | None) -> str:
-    """Where a URL leads, for the lock of the machine: scheme, host and port (or the path of a line), host in lower case, without the query.
+    """Return the address in a URL for the machine lock: scheme, host in lower case and port (or the path of a line), without the query.
 
     All units behind one address share one lock.
     """

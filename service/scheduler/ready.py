@@ -14,7 +14,7 @@ from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.windows import covering
-from abbe.service.sequences.interlocks import somebody_at_work, tripped
+from abbe.service.sequences.interlocks import person_may_be_inside, tripped
 
 LOOK_S = 60.0
 """How often the controller is looked at where a schedule needs a warm machine."""
@@ -98,7 +98,7 @@ class Ready:
             return f"the devices cannot be asked: {trouble}"
 
     def _of_devices(self, needs: Needs, seen: SeenDevices) -> str:
-        if needs.operator == "absent" and somebody_at_work(seen.status):
+        if needs.operator == "absent" and person_may_be_inside(seen.status):
             return "somebody is at the machine: the door is open, or the mode is not remote"
         if needs.idle:
             trouble = tripped(seen.status)

@@ -57,7 +57,7 @@ def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
 
 
 def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
-    """Machine seconds of a step from a position, and the position after it."""
+    """Machine time of a step in s from a position, and the position after the step."""
     match step:
         case MoveTo(target, feed):
             return (0.0 if here is None else math.dist(here, target) / feed * 60.0), target
@@ -73,12 +73,12 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
 
 
 def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
-    """Lowest and highest commanded position of each axis; refuses what the strokes or the controller's path memory do not hold.
+    """Return the lowest and highest commanded position of each axis, mm.
 
     Raises
     ------
     StrokeError
-        Which test, which axis, by how much; or how many points.
+        A position lies beyond a stroke, or a path has more points than the controller's memory holds.
     """
     for step in plan.steps:
         if isinstance(step, RecordPath | FollowPath) and len(step.points_mm) > MAX_PATH_POINTS:
@@ -103,7 +103,7 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
 def paced(plan: CampaignPlan, max_feed_mm_min: float) -> CampaignPlan:
     """The same campaign, moving between readings no faster than the machine file allows.
 
-    Positions are read at standstill: a slower way there changes no reading. A path that is recorded keeps the feed of its recipe.
+    Positions are read at standstill, so a slower approach changes no reading. A recorded path keeps the feed of its recipe.
     """
 
     def slowed(step: Step) -> Step:
@@ -115,12 +115,12 @@ def paced(plan: CampaignPlan, max_feed_mm_min: float) -> CampaignPlan:
 
 
 def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> DryRun:
-    """Check a test against the strokes and say how long it takes.
+    """Check a test against the strokes and compute its duration.
 
     Raises
     ------
     StrokeError
-        As `check_positions`; or a ball-bar goes below its cup and the recipe does not say that there is room.
+        As `check_positions`; or a ball-bar goes below its cup and the recipe does not set ``under_the_cup``.
     """
     lowest, highest = check_positions(machine, plan)
     _check_cup(plan)
@@ -158,12 +158,12 @@ def fastest(plan: TestPlan) -> float:
 
 
 def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: float = math.inf) -> tuple[DryRun, ...]:
-    """Check all tests of a campaign; the first that leaves the strokes or is faster than the machine file allows raises.
+    """Dry-run all tests of a campaign.
 
     Raises
     ------
     StrokeError
-        Which test, what it would do, what is allowed. Nothing has moved.
+        A test leaves the strokes or exceeds the feed limit of the machine file.
     """
     for test in plan.tests:
         feed = fastest(test)

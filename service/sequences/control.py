@@ -1,6 +1,6 @@
 """Control of a measurement from outside: pause, resume, stop, abort, and a state that can be watched.
 
-All calls belong into the event loop of the measurement; from a signal handler or another thread use ``loop.call_soon_threadsafe``.
+Call everything in the event loop of the measurement; from a signal handler or another thread use ``loop.call_soon_threadsafe``.
 """
 
 from __future__ import annotations
@@ -14,21 +14,17 @@ from typing import Any, TypeVar
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import Aborted, Stopped
 
-# What a measurement asks a person to do when its console is unattended, and the word that it is done: for the prompt that stands alone.
-#
-# All calls belong into the event loop of the measurement.
-
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """Something to be done by hand. ``number`` counts from 1 within one measurement, and no number comes twice."""
+    """A manual task for a person. ``number`` is unique within one measurement and counts from 1."""
 
     number: int
     text: str
 
 
 class Prompts:
-    """Asks for one thing at a time."""
+    """Asks a person for manual work while the console is unattended, one task at a time."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -37,12 +33,12 @@ class Prompts:
 
     @property
     def now(self) -> Prompt | None:
-        """What is waited for; None: nothing."""
+        """The open prompt, or None."""
         return self._now
 
     async def ask(self, text: str) -> None:
-        """Wait until a person says that it is done. Cancelling the wait withdraws the request."""
-        assert self._now is None, "one thing at a time"
+        """Show a prompt and wait until a person confirms it. Cancelling the wait withdraws the prompt."""
+        assert self._now is None, "one prompt at a time"
         self._count += 1
         self._now, self._done = Prompt(self._count, text), asyncio.get_running_loop().create_future()
         try:
@@ -51,10 +47,10 @@ class Prompts:
             self._now = self._done = None
 
     def answer(self, number: int) -> bool:
-        """Take the word that a prompt is done; False: it is not the one that stands, and nothing happens."""
+        """Confirm the open prompt. Returns False and changes nothing if ``number`` is not that of the open prompt."""
         if self._now is None or self._done is None or self._now.number != number:
             return False
-        self._now = None  # at once: the same word a second time answers nothing
+        self._now = None  # at once: a repeated confirmation has no effect
         if not self._done.done():
             self._done.set_result(None)
         return True
@@ -85,22 +81,22 @@ class Control:
         self._now = Progress(state=State.READY)
         self._pause = self._stop = self._abort = False
         self.hurry = ""
-        """Why it cannot be paused now; empty: it can. What was asked for before stays asked for: look at `gate` first."""
+        """Why the measurement cannot pause now; empty: it can. Earlier requests stay in force: call `gate` first."""
         self.prompts = Prompts()
-        """What is asked of a person who is not at the console."""
+        """Prompts for a person who is not at the console."""
         self._asked = asyncio.Event()
         self._changed: asyncio.Event = asyncio.Event()
 
-    # ---- what a person asks for -----------------------------------------------------------------------------------
+    # ---- requests of a person -------------------------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Hold at the next safe place: between points at once; a path that is being recorded is held and measured again later."""
+        """Pause at the next safe place: between points at once; a path under recording is stopped and measured again later."""
         if not (self._stop or self._abort or self._pause or self.hurry):
             self._pause = True
             self._to(State.PAUSING)
 
     def resume(self) -> None:
-        """Go on after a pause, once the preconditions were looked at again."""
+        """Resume after a pause, once the preconditions are checked again."""
         if self._pause:
             self._pause = False
             if self._now.state == State.PAUSING:  # taken back before it took effect
@@ -108,90 +104,78 @@ class Control:
             self._ask()
 
     def stop(self) -> None:
-        """Finish the point in hand, or hold the path, then end: the run in hand is closed as stopped."""
+        """Finish the current point or stop the path, then end; the current run is closed as stopped."""
         if not (self._stop or self._abort):
             self._stop, self._pause = True, False
             self._to(State.STOPPING)
 
     def abort(self) -> None:
-        """Stop the axes at once and end: the run in hand is closed as aborted."""
+        """Stop the axes at once and end; the current run is closed as aborted."""
         if not self._abort:
             self._abort, self._pause = True, False
             self._to(State.ABORTING)
 
-    # ---- what can be watched --------------------------------------------------------------------------------------
+    # ---- state for watchers ---------------------------------------------------------------------------------------
 
     @property
     def progress(self) -> Progress:
-        """State now, why it waits, and how far the test in hand is."""
+        """Current state, why the measurement waits, and how far the current test is."""
         return self._now
 
     @property
     def state(self) -> State:
-        """State now."""
+        """Current state."""
         return State(self._now.state)
 
     async def watch(self) -> AsyncIterator[Progress]:
-        """Every state from now on, the present one first; ends with the measurement. A slow watcher sees the newest, not all."""
-        seen: Progress | None = None
+        """Yield the current state and every change until the measurement ends. A slow watcher skips states and gets the newest."""
+        last: Progress | None = None
         while True:
             changed = self._changed
-            if seen is None or (self._now.state, self._now.why) != (seen.state, seen.why):
-                seen = self._now
-                yield seen
-                if seen.state == State.ENDED:
+            if last is None or (self._now.state, self._now.why) != (last.state, last.why):
+                last = self._now
+                yield last
+                if last.state == State.ENDED:
                     return
                 continue
             await changed.wait()
 
-    # ---- what the sequencer asks ----------------------------------------------------------------------------------
+    # ---- for the sequencer ----------------------------------------------------------------------------------------
 
     @property
     def pausing(self) -> bool:
-        """A pause was asked for."""
+        """Whether a pause is requested."""
         return self._pause
 
     @property
     def stopping(self) -> bool:
-        """A stop was asked for."""
+        """Whether a stop is requested."""
         return self._stop
 
     @property
     def aborting(self) -> bool:
-        """An abort was asked for."""
+        """Whether an abort is requested."""
         return self._abort
 
     def now(self, state: State, why: str = "") -> None:
-        """Tell watchers what the sequencer does; what was asked for meanwhile stays visible."""
+        """Report the sequencer's state to watchers; a pending request stays visible instead of it."""
         asked = (State.ABORTING, self._abort), (State.STOPPING, self._stop), (State.PAUSING, self._pause and state == State.RUNNING)
         wanted = next((one for one, is_asked in asked if is_asked), state)
         self._set(replace(self._now, state=state if state == State.ENDED else wanted, why=why))
 
     def place(self, step: int, steps: int, points: int) -> None:
-        """Note how far the test in hand is: step (from 1) and points read. Watchers are not woken for it."""
+        """Note how far the current test is: step (from 1) and points read. Does not wake watchers."""
         self._now = replace(self._now, step=step, steps=steps, points=points)
 
     def check(self) -> None:
-        """End here if that was asked for.
-
-        Raises
-        ------
-        Stopped, Aborted
-            It was.
-        """
+        """Raise ``Stopped`` or ``Aborted`` if a stop or an abort is requested."""
         if self._abort:
             raise Aborted(ABORTED.detail, ABORTED.remedy)
         if self._stop:
             raise Stopped(STOPPED.detail, STOPPED.remedy)
 
     async def gate(self) -> None:
-        """A safe place between two pieces of work: wait here, or end, if that was asked for.
-
-        Raises
-        ------
-        Stopped, Aborted
-            It was.
-        """
+        """Wait here while a pause is requested; a safe place between two pieces of work. Raises as `check`."""
         self.check()
         if self._pause:
             self.now(State.PAUSED)
@@ -199,24 +183,18 @@ class Control:
             self.now(State.RUNNING)
 
     async def asked(self) -> None:
-        """Wait until a person asks for something."""
+        """Wait for the next request of a person."""
         event = self._asked
         await event.wait()
 
     async def resumed(self) -> None:
-        """Wait until a pause is taken back.
-
-        Raises
-        ------
-        Stopped, Aborted
-            That was asked for instead.
-        """
+        """Wait until the pause is withdrawn. Raises as `check`."""
         while self._pause:
             await self.asked()
         self.check()
 
     async def aborted(self) -> None:
-        """Wait for an abort, and raise it."""
+        """Wait for an abort, and raise ``Aborted``."""
         await self._until_aborted()
         self.check()
 
@@ -225,17 +203,11 @@ class Control:
             await self.asked()
 
     async def unless_stopped(self, work: Awaitable[T]) -> T:
-        """Wait for something that a person does, or until stopped: then the work is cancelled.
-
-        Raises
-        ------
-        Stopped, Aborted
-            That was asked for.
-        """
+        """Wait for a person's work; a stop or an abort cancels it. Raises as `check`."""
         task = asyncio.ensure_future(work)
         try:
             while not task.done():
-                event = self._asked  # before looking: what is asked for from here on sets this one
+                event = self._asked  # before the check: every later request sets this event
                 self.check()
                 asked = asyncio.ensure_future(event.wait())
                 try:
@@ -249,12 +221,12 @@ class Control:
                 await asyncio.wait({task})
 
     async def unless_aborted(self, work: Coroutine[Any, Any, T]) -> T:
-        """Wait for work that ends by itself where it is stopped; an abort cancels it. Whatever it does on its way out is waited for.
+        """Wait for work that handles a stop by itself; an abort cancels it. Its clean-up always runs to the end.
 
         Raises
         ------
         Aborted
-            That was asked for; its notes are those of the work.
+            An abort was requested; the error carries the notes of the work.
         """
         task, aborting = asyncio.create_task(work), asyncio.create_task(self._until_aborted())
         cancelled: asyncio.CancelledError | None = None
@@ -287,14 +259,14 @@ class Control:
 
 
 def _ended(task: asyncio.Task[T], cancelled: asyncio.CancelledError | None) -> T:
-    """What became of work that may have been cancelled, with what it has to say."""
+    """Return the result of the work, or raise its error; a cancellation keeps the notes of the work."""
     if cancelled is None and not task.cancelled():
         return task.result()
     try:
         task.result()
     except asyncio.CancelledError as error:
         notes = getattr(error, "__notes__", [])
-    except Exception as error:  # noqa: BLE001 - who cancelled it waits for nothing else any more, but may hear of it
+    except Exception as error:  # noqa: BLE001 - the cancellation wins; the error becomes a note of it
         notes = [str(error), *getattr(error, "__notes__", [])]
     else:
         notes = []

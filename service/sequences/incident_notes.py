@@ -1,4 +1,4 @@
-"""Trouble on the links during a measurement becomes lines of the campaign's journal, written by a task of its own: no link waits for it."""
+"""Writes link incidents during a measurement into the campaign's journal, in a task of its own: no link waits for the database."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from abbe.service.sequences.journal import INCIDENT, OUTCOME, Journal
 
 LINKS = {"controller": "controller", "laser": "laser", "ballbar": "ball-bar"}
 STILL_OPEN = "open"
-"""How a trouble ended that was not over when the measurement was."""
+"""Outcome of an incident that lasts beyond the end of the measurement."""
 MOST_WAITING = 1000
-"""So many lines may wait for a locked database; what comes then is only counted."""
+"""Longest queue of lines while the database is locked; further incidents are only counted."""
 LAST_LINES_S = 5.0
-"""So long the end of a measurement waits for lines that the database has not taken."""
+"""Longest wait at the end of a measurement for the last lines to reach the database."""
 
 
 def links_of(session: Session) -> dict[str, Incidents]:
-    """The accounts of the links of a session, by the name of the device; a device without one is left out."""
+    """Return the incident lists of a session's links by device name; devices without one are left out."""
     found = {name: getattr(getattr(session, attribute, None), "incidents", None) for attribute, name in LINKS.items()}
     return {name: one for name, one in found.items() if isinstance(one, Incidents)}
 
 
 @contextmanager
 def run_named(session: Session, name: str) -> Iterator[None]:
-    """Errors and incidents in this block name the run, also those that no request of ours met: a heartbeat, a cable that is pulled."""
+    """Attach the run's name to every error and incident in this block, also those outside our requests (heartbeat, pulled cable)."""
     links = links_of(session)
     for one in links.values():
         one.run = name
@@ -51,14 +51,14 @@ def run_named(session: Session, name: str) -> Iterator[None]:
 async def incidents_noted(session: Session, notes: IncidentNotes) -> AsyncIterator[None]:
     """Write every incident of a session's links into the journal while the block lasts.
 
-    The end waits a few seconds for the last lines, not longer: a database that is locked must not keep a measurement from ending.
+    The exit waits at most ``LAST_LINES_S`` for the last lines: a locked database must not keep a measurement from ending.
     """
     with ExitStack() as undo:
         links = links_of(session)
         for name, one in links.items():
             before, one.listen = one.listen, partial(notes.hear, name)
             undo.callback(setattr, one, "listen", before)
-            if one.open is not None and one.entries:  # it began before the measurement, and is not over
+            if one.open is not None and one.entries:  # it began before the measurement and is still open
                 notes.hear(name, one.entries[-1])
         writer = asyncio.create_task(notes.write())
         try:
@@ -72,10 +72,7 @@ async def incidents_noted(session: Session, notes: IncidentNotes) -> AsyncIterat
 class IncidentNotes:
     """A queue of incidents and the task that empties it.
 
-    Attributes
-    ----------
-    not_written : int
-        Incidents that are not in the journal: too many waited, or the database took none until the end.
+    ``not_written`` counts incidents missing from the journal: the queue was full, or the database took none until the end.
     """
 
     def __init__(self, journal: Journal, clock: Clock) -> None:
@@ -87,7 +84,7 @@ class IncidentNotes:
         self._empty.set()
 
     def hear(self, link: str, entry: Incident) -> None:
-        """Take an incident; returns at once. Called in the event loop."""
+        """Queue an incident; returns at once. Call it in the event loop."""
         at = self._clock.utc() - timedelta(seconds=max(time.monotonic() - entry.host_s, 0.0))
         line: dict[str, Any] = {
             "phase": entry.kind,
@@ -102,7 +99,7 @@ class IncidentNotes:
         self._put(link, line)
 
     def still_open(self, links: set[str]) -> None:
-        """The measurement ends before the trouble of these links is over: that is its outcome here."""
+        """Record the outcome "open" for links whose incident lasts beyond the end of the measurement."""
         now = {"phase": OUTCOME, "state": STILL_OPEN, "at_utc": self._clock.utc().isoformat(timespec="milliseconds")}
         for link in sorted(links & self._latest.keys()):
             self._put(link, self._latest[link] | now | {"host_s": time.monotonic()})
@@ -117,20 +114,20 @@ class IncidentNotes:
         self._news.set()
 
     async def write(self) -> None:
-        """Write what waits, one line after the other, until cancelled. A line that the database does not take is counted and left out."""
+        """Write queued lines in order until cancelled. A line that the database refuses is counted and left out."""
         while True:
             await self._news.wait()
             self._news.clear()
             while self._waiting:
                 try:
                     await self._journal.add(INCIDENT, **self._waiting[0])
-                except Exception:  # noqa: BLE001 - whatever it is, a note about a link must not end a measurement
+                except Exception:  # noqa: BLE001 - a note about a link must not end a measurement
                     self.not_written += 1
                 self._waiting.popleft()
             self._empty.set()
 
     async def finish(self, writer: asyncio.Task[None]) -> None:
-        """Wait for the last lines as long as may be, and end the task."""
+        """Wait up to ``LAST_LINES_S`` for the last lines, then end the task."""
         with suppress(TimeoutError):
             async with asyncio.timeout(LAST_LINES_S):
                 waited = asyncio.create_task(self._empty.wait())

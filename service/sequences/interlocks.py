@@ -1,4 +1,4 @@
-"""Which conditions forbid motion, read from what the devices say. Pure: no waiting, no sending."""
+"""Which conditions forbid motion, read from device status. Pure: no waiting, no sending."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ NEEDED: tuple[tuple[Condition, type[Interlock], str], ...] = (
 )
 
 AT_WORK = frozenset({"door"})
-"""What a person may do who mounts something: nothing moves meanwhile."""
+"""Conditions that mounting may cause; nothing moves during it."""
 PAUSED = frozenset({"door", "mode", "drives", "program", "spindle", "temperature", "beam"})
-"""What a person may do while the measurement is paused; looked at again before it goes on."""
+"""Conditions that a person may cause during a pause; checked again before the measurement resumes."""
 CAN_CLEAR = frozenset({"door", "beam", "temperature"})
-"""Conditions that may suspend instead of ending the run. E-stop and alarm never."""
+"""Conditions that may suspend a run instead of ending it. E-stop and alarm never do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Suspending:
-    """What suspends a measurement and lets it go on by itself. ``conditions``: of `CAN_CLEAR`; none: every condition ends the run.
+    """Conditions (of `CAN_CLEAR`) that suspend a measurement until they clear; without any, every condition ends the run.
 
-    ``longest_s``: longest suspension; ``settle_s``: how long all must be well before it goes on (seconds of this computer).
+    ``longest_s``: longest suspension; ``settle_s``: how long all conditions must be clear before the measurement resumes (host s).
     """
 
     conditions: frozenset[str] = frozenset()
@@ -56,9 +56,9 @@ class Suspending:
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """What the watcher looks at, and how often. ``air_c``: window of the air's temperature, None: not watched.
+    """What the watcher checks, and how often. ``air_c``: allowed air temperature in degrees C, None: not watched.
 
-    ``unknown_s``: longest silence of the controller; ``air_unknown_s``: of the laser while only the air is asked of it.
+    ``unknown_s``: longest silence of the controller; ``air_unknown_s``: longest silence of the laser while only the air is watched.
     """
 
     air_c: tuple[float, float] | None = None
@@ -80,25 +80,19 @@ def tripped(status: ControllerStatus, tolerated: frozenset[str] = frozenset()) -
 
 
 def check_interlocks(status: ControllerStatus) -> None:
-    """Refuse to move (or to go on) unless the controller says that it is safe.
-
-    Raises
-    ------
-    Interlock
-        Which condition, and that nothing moves until it is cleared.
-    """
+    """Raise the ``Interlock`` of the first condition that forbids motion."""
     trouble = tripped(status)
     if trouble is not None:
         raise trouble
 
 
 def check_ours(status: ControllerStatus) -> None:
-    """Refuse to send anything, a stop included, to a machine that another program works with.
+    """Refuse to send anything, a stop included, to a machine that another program controls.
 
     Raises
     ------
     ProgramRuns, RemoteLost
-        It runs its own program, or is not in remote mode.
+        The controller runs an NC program, or is not in remote mode.
     """
     if status.program_runs:
         raise ProgramRuns("an NC program runs", "wait until it has ended, then start again; nothing was sent to the machine")
@@ -106,13 +100,13 @@ def check_ours(status: ControllerStatus) -> None:
         raise RemoteLost("the controller is not in remote mode", READY)
 
 
-def somebody_at_work(status: ControllerStatus) -> bool:
+def person_may_be_inside(status: ControllerStatus) -> bool:
     """Whether the door is open or the mode is not remote: a person may touch what is mounted."""
     return Condition.DOOR_OPEN in status.conditions or not status.remote
 
 
 def beam_trouble(reading: LaserReading) -> BeamLost | None:
-    """Whether the laser's count can still be trusted: the beam was not lost, is strong enough and has a reflector."""
+    """Return why the laser's count is not valid: beam lost, too weak or without reflector; None: it is valid."""
     if beam_is_good(reading.status):
         return None
     what = "lost" if beam_is_gone(reading.status) else f"too weak ({reading.signal_permille} permille)"
@@ -120,7 +114,7 @@ def beam_trouble(reading: LaserReading) -> BeamLost | None:
 
 
 def air_trouble(reading: LaserReading, window_c: tuple[float, float] | None) -> TemperatureOutside | None:
-    """Whether the air is as warm as a measurement allows."""
+    """Return the interlock of an air temperature outside the window (degrees C); None: inside, or not watched."""
     if window_c is None or window_c[0] <= reading.air_temp_c <= window_c[1]:
         return None
     low, high = window_c

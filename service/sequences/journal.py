@@ -1,9 +1,8 @@
-"""The journal of a campaign: what cannot be undone is written down, so that another process can go on.
+"""The journal of a campaign: it records what cannot be undone, so that another process can resume.
 
 Kinds of lines: ``begun`` (plan's hash and source, controller's boot id, table, process), ``hand`` (a person was asked, and when it was
 done), ``run`` (a run of a test was opened), ``point`` (a point was read), ``done`` (a test is complete), ``waits`` and ``goes-on`` (pause,
-suspension), ``incident`` (trouble on a link was noticed, or is over), ``ended``. ``docs/decisions/0016-checkpoints.md`` says what each is
-good for.
+suspension), ``incident`` (a link failed, or recovered), ``ended``. ``docs/decisions/0016-checkpoints.md`` gives the use of each.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from abbe.service.storage.store import Store
 BEGUN, HAND, RUN, POINT, DONE, WAITS, GOES_ON, ENDED = "begun", "hand", "run", "point", "done", "waits", "goes-on", "ended"
 INCIDENT = "incident"
 DETECTED, OUTCOME = "detected", "outcome"
-"""The two lines of an incident: it is noticed, and how it ended."""
+"""The two lines of an incident: its detection and its outcome."""
 
 
 LONGEST_S = CATCH_UP_S
-"""As long as samples may wait for the database."""
+"""Longest retry of a write: as long as samples may wait for the database."""
 AGAIN_S = 0.2
 
 
@@ -35,7 +34,7 @@ class Journal(Protocol):
     """Where checkpoints go."""
 
     async def add(self, kind: str, **doc: Any) -> None:
-        """Write a line. On return it is on disk."""
+        """Write a line; on return it is on disk."""
         ...
 
 
@@ -46,13 +45,7 @@ class StoreJournal:
         self._store, self.campaign, self.longest_s = store, campaign_id, longest_s
 
     async def add(self, kind: str, **doc: Any) -> None:
-        """Write a line. On return it is on disk. A database that is locked is asked again for `LONGEST_S`; the axes stand meanwhile.
-
-        Raises
-        ------
-        StoreError
-            It did not take the line.
-        """
+        """Write a line; on return it is on disk. Retries a locked database for ``longest_s``, then raises StoreError."""
         clock = asyncio.get_running_loop().time
         until_s = clock() + self.longest_s
         while True:
@@ -66,22 +59,22 @@ class StoreJournal:
 
 
 class NoJournal:
-    """For tests that never resume."""
+    """Discards all lines: for tests that never resume."""
 
     async def add(self, kind: str, **doc: Any) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 UNKNOWN = "no outcome"
-"""The process ended before the trouble did."""
+"""Outcome of an incident that was open when the process ended."""
 
 
 @dataclass(slots=True)
 class Trouble:
     """All incidents of one code on one link.
 
-    ``times``: how often it was noticed; ``ends``: how often it ended how; ``errors``: single errors that belonged to it, as far as is
-    known; ``runs``: that it happened to; ``last``: the latest text.
+    ``times``: number of detections; ``ends``: number of each outcome; ``errors``: known number of single errors; ``runs``: affected
+    runs; ``last``: the latest text.
     """
 
     link: str
@@ -100,7 +93,7 @@ class Trouble:
 
 
 def troubles(journal: Iterable[CheckpointRecord]) -> list[Trouble]:
-    """The incidents of a journal, in the order in which each kind came first."""
+    """Group the incidents of a journal by link, device and code, in order of first occurrence."""
     found: dict[tuple[str, str, str], Trouble] = {}
     for one in journal:
         if one.kind == INCIDENT:
@@ -122,5 +115,5 @@ def troubles(journal: Iterable[CheckpointRecord]) -> list[Trouble]:
 
 
 def not_written(journal: Iterable[CheckpointRecord]) -> int:
-    """Incidents that the database did not take in time."""
+    """Number of incidents that did not reach the database in time."""
     return sum(int(one.doc.get("incidents_not_written", 0)) for one in journal if one.kind == ENDED)

@@ -1,6 +1,6 @@
-"""Which devices a campaign needs, and whether all of them are there and answer: asked before anything moves.
+"""Which devices a campaign needs, and whether all of them answer: checked before anything moves.
 
-A laser is asked for a reading, never for its beam: it is aligned and zeroed when it is mounted, in the middle of the campaign.
+The laser check takes a reading and ignores the beam, which is aligned and zeroed only when the laser is mounted during the campaign.
 """
 
 from __future__ import annotations
@@ -19,39 +19,33 @@ from abbe.service.sequences.resume_plan import BY_HAND
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, ReadBar, ReadLaser, RecordPath, ZeroLaser
 
 CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"
-IN_WORDS = {CNC: "a controller", BALLBAR: "a ball-bar", LASER: "a laser", FIXTURE: "a fixture"}
+ROLE_NAMES = {CNC: "a controller", BALLBAR: "a ball-bar", LASER: "a laser", FIXTURE: "a fixture"}
 USED_BY: dict[str, Any] = {
     BALLBAR: MountBar | ChangeBar | RecordPath | ReadBar,
     LASER: MountLaser | ZeroLaser | ReadLaser,
     FIXTURE: BY_HAND,
 }
 BEFORE_S = 5.0
-"""So long the ball-bar's box is looked for before a run."""
+"""Longest search for the ball-bar's box before a run."""
 BAR_RANGE_MM = 0.1
-"""Stroke of the bar to either side that a test needs at least: machines are off by tens of micrometres, a clamped reading says nothing."""
+"""Least stroke of the bar to either side: machine errors are tens of micrometres, and a clamped reading has no information."""
 LASER_S = 2.0
-"""Longest wait for a new sample of the laser, which gives twenty a second."""
+"""Longest wait for a new sample of the laser, which delivers twenty per second."""
 POLL_S = 0.02
 AIR_C, AIR_PA = (-20.0, 60.0), (50_000.0, 120_000.0)
-"""What the laser's sensors can read where a machine stands. Outside of it a sensor is broken, and every length with it."""
+"""Plausible readings of the laser's sensors in a workshop. Outside them a sensor is broken, and every length is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
 class Needed:
-    """What a campaign is measured with. ``first``: role to what needs it first; ``rate_hz``: fastest stream of the ball-bar, 0: none."""
+    """Devices of a campaign. ``first``: role -> its first use; ``rate_hz``: fastest stream of the ball-bar, 0: none."""
 
     first: dict[str, str] = field(default_factory=dict)
     rate_hz: int = 0
 
 
 def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
-    """The devices that the steps of a campaign use.
-
-    Parameters
-    ----------
-    air : bool
-        The air is watched meanwhile (``run_temperature_c``): the laser has the sensor.
-    """
+    """Return the devices that the steps of a campaign use; watching the ``air`` (``run_temperature_c``) needs the laser's sensor."""
     first = {CNC: "all motion"}
     for role, kinds in USED_BY.items():
         test = next((t for t in plan.tests if any(isinstance(s, kinds) for s in t.steps)), None)
@@ -64,34 +58,23 @@ def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
 
 
 def check_configured(needed: Needed, there: Collection[str]) -> None:
-    """Refuse a campaign for which the machine file names too few devices; nothing is connected.
-
-    Parameters
-    ----------
-    there : collection of str
-        Roles that the machine file names.
-
-    Raises
-    ------
-    ConfigError
-        All that are missing, and what needs them first.
-    """
+    """Raise ConfigError naming every needed role that the machine file does not name (``there``). Connects to nothing."""
     missing = [role for role in needed.first if role not in there]
     if missing:
-        listed = " and ".join(f"{IN_WORDS[role]} for {needed.first[role]}" for role in missing)
+        listed = " and ".join(f"{ROLE_NAMES[role]} for {needed.first[role]}" for role in missing)
         keys = ", ".join(f"{role} = ..." for role in missing)
         raise ConfigError(f"this needs {listed}, and the machine file names none", f"add {keys} under [devices]")
 
 
 async def check_devices(session: Session, plan: CampaignPlan, *, air: bool = False) -> None:
-    """Every device that a campaign needs is configured, answers now, and can do what is asked of it; else nothing begins.
+    """Check that every device of a campaign is configured, answers, and has the needed rate and range.
 
     Raises
     ------
     ConfigError, DriverError
-        The one thing that is wrong.
+        One device is not ready.
     DevicesNotReady
-        All that is wrong, in one line.
+        Several are not ready; all are named in one line.
     """
     needed = needed_by(plan, air=air)
     there = [role for role in needed.first if role != CNC and getattr(session, role) is not None]
@@ -129,13 +112,7 @@ async def _laser(session: Session, needed: Needed) -> None:
 
 
 def check_sensors(name: str, reading: LaserReading) -> None:
-    """Refuse a laser whose sensors read what no air in a workshop can be: it counts lengths with them.
-
-    Raises
-    ------
-    WrongDevice
-        Which sensor, what it reads.
-    """
+    """Raise WrongDevice if an air sensor of the laser, which corrects its lengths, reads an implausible value."""
     for what, value, (low, high), unit in (
         ("air temperature", reading.air_temp_c, AIR_C, "C"),
         ("air pressure", reading.air_pressure_pa, AIR_PA, "Pa"),
@@ -149,7 +126,7 @@ async def _fixture(session: Session, needed: Needed) -> None:
     fixture = session.need_fixture()
     if isinstance(fixture, ConsoleFixture) and not session.attended:
         raise ConfigError(
-            "bar and mirror are mounted by the person at the console, and nobody is there",
+            "a person at the console mounts bar and mirror, and the console is unattended",
             "run it from a terminal, or configure a remote fixture; nothing has moved",
         )
     await fixture.identify()

@@ -1,10 +1,10 @@
-"""A path that was broken off goes on where it was, and how that is proved. Pure.
+"""Resumes an interrupted path where it was, and proves that the set-up is unchanged. Pure.
 
-While the ball-bar records, the controller's statuses tell how far the axes had come at constant feed (`Way`). When the path is broken
-off there, with bar and cup as they are, it need not be driven again from its beginning: the machine drives back along it, a lead and a
-stretch farther than what counts, and comes forward once more. On the lead every axis takes up its lost motion as it did before; on the
-stretch the bar must read what it has read there (`SameStretch`). What the runs have read up to their stretches, and the last one, are
-one path: what a broken run has read just before the break counts for nothing, and is only compared with.
+While the ball-bar records, the controller's statuses show how far the axes came at constant feed (`PathProgress`). If the path is
+interrupted and bar and cup stay in place, the machine need not begin again: it drives back along the path beyond the last valid point, by a
+stretch and a lead, and comes forward again. On the lead every axis takes up its lost motion as before; on the stretch the bar must repeat
+its readings (`StretchComparison`). The runs up to their stretches, and the last run, form one path. Readings just before the interruption
+serve only for this comparison.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, RunP
 from abbe.service.sequences.steps import Point, RecordPath
 
 LEAD_S, LEAD_MM = 0.5, 5.0
-"""So long, and at least so far, the axes drive before readings count: they have speeded up, and their lost motion is taken up."""
+"""Least time and length of the lead before readings count: the axes reach constant feed and take up their lost motion."""
 SAME_MM = 0.0015
-"""So much the mean of the stretch may differ: minutes of drift, not a cup that was knocked."""
+"""Allowed difference of the stretch's median: minutes of drift, but not a displaced cup."""
 STEADY_MM = 0.1
-"""So far the position may fall back behind (or run ahead of) where it was at constant feed."""
+"""Allowed change of the lag behind constant feed, either way."""
 BEHIND_S, BEHIND_MM = 0.15, 0.5
-"""So far a machine at constant feed is behind its command: what speeding up and its position control take."""
+"""Largest lag of a machine at constant feed behind its command, from acceleration and position control: seconds of feed plus a constant."""
 AROUND_MM = 100.0
 
 
-class Way:
-    """How far a path has come at constant feed, by the controller's statuses; `doc` goes into the run that was broken off."""
+class PathProgress:
+    """How far a path has come at constant feed, from the controller's statuses; an interrupted run stores `doc`."""
 
     def __init__(self, step: RecordPath) -> None:
         self._points, self._arc = np.asarray(step.points_mm, dtype=np.float64), arc_of(step.points_mm)
@@ -46,13 +46,13 @@ class Way:
 
     @property
     def good_mm(self) -> float:
-        """Length that was driven at constant feed."""
+        """Length driven at constant feed, mm."""
         if self.good_us is None or self.start_us is None:
             return 0.0
         return (self.good_us - self.start_us) * 1e-6 * self._feed_mm_s
 
-    def see(self, status: ControllerStatus) -> None:
-        """Take a status at which the path ran and nothing spoke against it."""
+    def add(self, status: ControllerStatus) -> None:
+        """Add a status that was read while the path ran without trouble."""
         if self._lost or status.path_start_us <= 0:
             return
         gone_s = (status.ctrl_us - status.path_start_us) * 1e-6
@@ -63,12 +63,12 @@ class Way:
             return
         self._lag_mm = lag_mm if self._lag_mm is None else self._lag_mm
         if abs(lag_mm - self._lag_mm) > STEADY_MM or abs(self._lag_mm) > BEHIND_S * self._feed_mm_s + BEHIND_MM:
-            self._lost = True  # feed changed, or the axes stand: from here on the place of a sample is unknown
+            self._lost = True  # the feed changed, or the axes stand: from here on the position of a sample is unknown
             return
         self.start_us, self.good_us = status.path_start_us, status.ctrl_us
 
     def _lag(self, gone_mm: float, position_mm: Point) -> float | None:
-        """How far the position is behind where constant feed would have it; None if it is not on the path near there."""
+        """Lag of the position behind constant feed, mm; None if the position is not on the path near there."""
         first, last = np.searchsorted(self._arc, (gone_mm - AROUND_MM, gone_mm + AROUND_MM))
         points, arc = self._points[max(first - 1, 0) : last + 1], self._arc[max(first - 1, 0) : last + 1]
         if len(points) < 2:
@@ -81,7 +81,7 @@ class Way:
         return float(gone_mm - at[near][np.argmin(np.abs(at[near] - gone_mm))]) if off.min() < STEADY_MM else None
 
     def doc(self) -> dict[str, Any]:
-        """What the end document of a run that was broken off needs; empty when the path cannot resume."""
+        """Fields for the end document of an interrupted run; empty when the path cannot resume."""
         if self.good_us is None or self.boot_id is None:
             return {}
         return {"path_start_us": self.start_us, "good_us": self.good_us, "box_boot_id": self.boot_id}
@@ -89,10 +89,9 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class PathRemainder:
-    """Where a path goes on: ``pieces`` as they count now, ``offset_mm`` of the whole path at which the rest begins, what is read twice.
+    """Rest of an interrupted path: valid ``pieces``, and ``offset_mm``, the length of the whole path at which the rest begins.
 
-    ``arc_mm`` and ``deviation_mm``, shape (n,): what the bar has read on the stretch, along the rest of the path; ``boot_id`` of the box
-    that has.
+    ``arc_mm`` and ``deviation_mm``, shape (n,): earlier readings on the stretch, by length along the rest; ``boot_id``: of their box.
     """
 
     pieces: tuple[RunPiece, ...]
@@ -104,14 +103,14 @@ class PathRemainder:
     boot_id: int
 
     def doc(self) -> dict[str, Any]:
-        """What the start document's ``path`` says of it."""
+        """As JSON object for ``path`` in the start document."""
         return {"offset_mm": self.offset_mm, "pieces": [{"run": p.run, "to_mm": p.to_mm} for p in self.pieces]}
 
 
 def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, PathRemainder] | None:
-    """What is left of a path, the number of the point at which it begins, and what is known of the rest.
+    """Return the rest of a path, the number of its first point, and its `PathRemainder`.
 
-    None: going on saves nothing, or there is not enough to compare with.
+    None: resuming saves nothing, or there are too few readings to compare with.
     """
     arc, feed_mm_s = arc_of(step.points_mm), step.feed_mm_min / 60.0
     last = len(arc) - 1 if step.measured is None else step.measured[1]
@@ -135,8 +134,8 @@ def _before(arc: F1, at_mm: float) -> int:
     return int(np.searchsorted(arc, at_mm + 1e-9, side="right")) - 1
 
 
-class SameStretch:
-    """Compares what the bar reads on the stretch with what it has read there."""
+class StretchComparison:
+    """Compares the bar's readings on the stretch with its earlier readings there."""
 
     def __init__(self, remainder: PathRemainder, rate_hz: int) -> None:
         self._on, self._half_s = remainder, 0.5 / rate_hz
@@ -144,30 +143,18 @@ class SameStretch:
         self._last: BarSample | None = None
         self._off: list[float] = []
         slope, _ = np.polyfit(remainder.arc_mm, remainder.deviation_mm, 1)
-        # The instant at which either path began is known to half a period of the samples.
+        # The start of each path is known to half a sample period.
         self._allowed_mm = SAME_MM + abs(float(slope)) * remainder.feed_mm_s / rate_hz
         self.off_mm: float | None = None
-        """By how much the stretch reads otherwise, once it is read."""
+        """Difference of the stretch's readings, mm, once it is read."""
 
     def from_box(self, boot_id: int) -> None:
-        """Hear which box reads.
-
-        Raises
-        ------
-        RunInterrupted
-            It was restarted since: nothing is joined to what it read before.
-        """
+        """Raise RunInterrupted if the box was restarted: its earlier readings must not be joined to new ones."""
         if boot_id != self._on.boot_id:
             raise RunInterrupted("the ball-bar's box was restarted since the path was broken off", "the path begins again")
 
-    def see(self, sample: BarSample) -> None:
-        """Take a sample in order.
-
-        Raises
-        ------
-        StretchDiffers
-            The stretch was read otherwise, or could not be read.
-        """
+    def add(self, sample: BarSample) -> None:
+        """Add the next sample. Raises StretchDiffers if the stretch reads otherwise, or could not be read."""
         before, self._last = self._last, sample
         if self.off_mm is not None or not on_path(sample.status):
             return
@@ -182,12 +169,12 @@ class SameStretch:
             self._off.append(sample.reading_nm * 1e-6 - float(np.interp(at_mm, self._on.arc_mm, self._on.deviation_mm)))
 
     def judge(self) -> None:
-        """Say whether it is the same; called by itself when the stretch is behind, and when the path has ended.
+        """Compare the stretch; called when the stretch has passed, and when the path has ended.
 
         Raises
         ------
         StretchDiffers
-            It is not, or there are too few readings to tell.
+            The stretch reads otherwise, or has too few readings.
         """
         if self.off_mm is not None:
             return
@@ -200,5 +187,5 @@ class SameStretch:
             raise StretchDiffers(
                 f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um otherwise than before the break "
                 f"(allowed: {1e3 * self._allowed_mm:.1f})",
-                "cup or bar were knocked, or the machine has drifted: the path begins again, or is mounted anew",
+                "cup or bar was displaced, or the machine has drifted: the path begins again, or is mounted anew",
             )

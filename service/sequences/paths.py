@@ -1,6 +1,6 @@
-"""Paths: the ball-bar streams while the axes run a polyline, and an error on the way ends both.
+"""Paths: the ball-bar streams while the axes run a polyline; an error ends both.
 
-Motion never outlives the block that commanded it (`motion_guard`); when the stop does not get through, the error says so.
+Motion never outlives the block that commanded it (`motion_guard`); if the stop fails, the error tells the person to press e-stop.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from abbe.service.errors import AbbeError, BarOutOfRange, MeasurementFault, RunI
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import check_interlocks
-from abbe.service.sequences.path_resume import PathRemainder, SameStretch, Way
+from abbe.service.sequences.path_resume import PathProgress, PathRemainder, StretchComparison
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
 
@@ -30,17 +30,9 @@ UNDELIVERED = "the stop could not be delivered: press e-stop"
 
 @asynccontextmanager
 async def motion_guard(controller: Motion, spare: Spare | None = None) -> AsyncIterator[None]:
-    """Whatever ends this block early also stops the axes: abort is sent although the task is being cancelled.
+    """Stop the axes when an error or a cancellation ends this block. The error leaves with a warning if the stop failed.
 
-    Parameters
-    ----------
-    spare : callable, optional
-        Whether nothing of ours can move and another program works with the machine: then it is left alone.
-
-    Raises
-    ------
-    BaseException
-        What ended the block. When the stop did not get through, its text says so: the axes may still move.
+    ``spare`` returns whether another program controls the machine and nothing of ours can move: then no stop is sent.
     """
     try:
         yield
@@ -54,10 +46,10 @@ async def motion_guard(controller: Motion, spare: Spare | None = None) -> AsyncI
             raise with_warning(cancelled) from error
         if stopped.is_set():
             raise
-        told = with_warning(error)
-        if told is error:
+        warned = with_warning(error)
+        if warned is error:
             raise
-        raise told from error
+        raise warned from error
 
 
 async def _stop(controller: Motion, stopped: asyncio.Event, spare: Spare | None) -> None:
@@ -65,13 +57,13 @@ async def _stop(controller: Motion, stopped: asyncio.Event, spare: Spare | None)
         async with asyncio.timeout(STOP_S):
             if spare is None or not await spare():
                 await controller.abort()
-    except Exception:  # noqa: BLE001 - why it failed is not what matters now: that the axes may run on is, and the caller says so
+    except Exception:  # noqa: BLE001 - whatever the cause, the axes may run on: the caller warns of that
         return
     stopped.set()
 
 
 def with_warning(error: BaseException) -> BaseException:
-    """The same kind of error, saying as well that the axes may still move; errors without a text for people get a note."""
+    """Return the same kind of error with a warning that the axes may still move; errors without a detail get a note."""
     if isinstance(error, AbbeError | DriverError):
         if UNDELIVERED in error.detail:
             return error
@@ -85,7 +77,7 @@ def with_warning(error: BaseException) -> BaseException:
 
 
 def warnings_of(error: BaseException) -> list[str]:
-    """What was added to an error on its way up."""
+    """Notes of an error."""
     return list(getattr(error, "__notes__", []))
 
 
@@ -94,11 +86,11 @@ STALL_S = 10.0
 STAND_S = 5.0
 BAD_IN_A_ROW = 25
 OUT_S = 0.03
-"""So long the bar may be out of range: long enough for a disturbed sample or two, short enough to stop in time."""
+"""Tolerated time out of range: long enough for one or two disturbed samples, short enough to stop in time."""
 
 
 def bar_trouble(status: int) -> BarOutOfRange:
-    """The ball-bar says that it does not read."""
+    """Return the error of a ball-bar that reports no valid reading."""
     return BarOutOfRange(
         f"the ball-bar is out of range or not mounted (status {status:#06x})",
         "check centre, radius and that the bar sits in both cups, then start the test again",
@@ -106,46 +98,46 @@ def bar_trouble(status: int) -> BarOutOfRange:
 
 
 async def record_path(
-    session: Session, step: RecordPath, recorder: Recorder, control: Control, way: Way, remainder: PathRemainder | None = None
+    session: Session, step: RecordPath, recorder: Recorder, control: Control, way: PathProgress, remainder: PathRemainder | None = None
 ) -> dict[str, int]:
-    """Run a path while the ball-bar streams; returns its start and end in controller time.
+    """Run a path while the ball-bar streams; return its start and end in controller time (us).
 
-    ``way`` learns how far it came; of the rest of a path that was broken off, ``onward`` says what must read as before.
+    Updates ``way`` with the progress; for the rest of an interrupted path, ``remainder`` holds the readings that must repeat.
 
     Raises
     ------
     BarOutOfRange, MeasurementFault, RunInterrupted, StretchDiffers, DriverError
-        The axes are stopped before the error leaves.
+        The axes stop before the error leaves.
     """
     controller = session.controller
     await controller.load_path(step.points_mm)
-    stretch = None if remainder is None else SameStretch(remainder, step.rate_hz)
+    stretch = None if remainder is None else StretchComparison(remainder, step.rate_hz)
     pump = Pump(recorder, step.rate_hz, way, stretch)
-    # The guard stands inside the stream: closing the stream of a mute box takes seconds, and the axes must not run on so long.
+    # The guard stands inside the stream: closing the stream of a silent box takes seconds, and the axes must stop before that.
     async with session.need_ballbar().stream(step.rate_hz, recorder.tap()) as batches, motion_guard(controller):
         try:
             async with asyncio.TaskGroup() as group:
                 pumping = group.create_task(pump.run(batches))
-                await pump.reads.wait()  # a bar that does not read is seen before anything moves
+                await pump.reads.wait()  # the bar must read before anything moves
                 await controller.start_path(feed_mm_min=step.feed_mm_min)
                 status = await follow(controller, control, way)
                 pump.finished.set()
-                await asyncio.wait({pumping})  # here, not in the group's end: there a cancellation from outside could get lost
+                await asyncio.wait({pumping})  # here, not at the group's exit: there an outside cancellation could get lost
         except BaseExceptionGroup as errors:
-            raise first_of(errors) from None  # one cause for one person; the others follow from it
+            raise first_of(errors) from None  # report one cause; the others follow from it
     found = {"path_start_us": status.path_start_us, "path_end_us": status.path_end_us}
     return found if stretch is None or stretch.off_mm is None else found | {"stretch_off_nm": round(stretch.off_mm * 1e6)}
 
 
 async def follow_path(controller: Paths, step: FollowPath, control: Control) -> None:
-    """Run a path that nothing is recorded on."""
+    """Run a path without recording."""
     await controller.load_path(step.points_mm)
     async with motion_guard(controller):
         await controller.start_path(feed_mm_min=step.feed_mm_min)
         await follow(controller, control)
 
 
-async def follow(controller: Motion, control: Control, way: Way | None = None) -> ControllerStatus:
+async def follow(controller: Motion, control: Control, way: PathProgress | None = None) -> ControllerStatus:
     """Poll until the path has ended; an interlock, a feed hold, a stall or a person ends the run."""
     loop = asyncio.get_running_loop()
     points, since = -1, loop.time()
@@ -159,11 +151,11 @@ async def follow(controller: Motion, control: Control, way: Way | None = None) -
         if not status.path_running and status.path_end_us > status.path_start_us:
             return status
         if way is not None and status.path_running:
-            way.see(status)
+            way.add(status)
         if control.pausing or control.stopping:
             await hold(controller)
             control.check()
-            raise RunInterrupted("paused on the path: what was read is kept as evidence", "the path is measured again after the pause")
+            raise RunInterrupted("paused on the path: its readings are kept as evidence", "the path is measured again after the pause")
         if status.path_points_done != points:
             points, since = status.path_points_done, loop.time()
         elif loop.time() - since > STALL_S:
@@ -172,7 +164,7 @@ async def follow(controller: Motion, control: Control, way: Way | None = None) -
 
 
 async def hold(controller: Motion) -> None:
-    """Feed hold, and wait until the axes stand: a real machine brakes along its path, which an abort need not do."""
+    """Apply feed hold and wait until the axes stand: a real machine then brakes along its path, which an abort need not do."""
     await controller.hold()
     until_s, last = asyncio.get_running_loop().time() + STAND_S, None
     while asyncio.get_running_loop().time() < until_s:
@@ -184,9 +176,9 @@ async def hold(controller: Motion) -> None:
 
 
 class Pump:
-    """Hands samples to the recorder until the path has ended and one sample without the sync level has been seen."""
+    """Passes samples to the recorder until the path has ended and one sample arrives without the sync level."""
 
-    def __init__(self, recorder: Recorder, rate_hz: int, way: Way | None = None, stretch: SameStretch | None = None) -> None:
+    def __init__(self, recorder: Recorder, rate_hz: int, way: PathProgress | None = None, stretch: StretchComparison | None = None) -> None:
         self._recorder = recorder
         self._way, self._stretch = way, stretch
         self._bad = self._out = 0
@@ -195,14 +187,14 @@ class Pump:
         self.finished = asyncio.Event()
 
     async def run(self, batches: AsyncIterator[BarBatch]) -> None:
-        """Record; `reads` is set as soon as the bar was seen to read.
+        """Record; set `reads` at the first valid reading.
 
         Raises
         ------
         BarOutOfRange, MeasurementFault
-            It does not read.
+            The bar is out of range, or samples are lost.
         StretchDiffers
-            It does not read what it has read.
+            The stretch reads otherwise than before the interruption.
         """
         async for batch in batches:
             await self._recorder.add_bar(batch)
@@ -213,7 +205,7 @@ class Pump:
             for sample in batch.samples:
                 self._look(sample.status)
                 if self._stretch is not None:
-                    self._stretch.see(sample)
+                    self._stretch.add(sample)
             if self.finished.is_set() and batch.samples and not on_path(batch.samples[-1].status):
                 if self._stretch is not None:
                     self._stretch.judge()

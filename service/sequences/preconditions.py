@@ -1,4 +1,4 @@
-"""What must be as it was before a measurement goes on after a break: the same controller run, the same table, and everything safe."""
+"""Preconditions for resuming a measurement: the same controller run, the same table, and no interlock."""
 
 from __future__ import annotations
 
@@ -19,19 +19,14 @@ class ExpectedTable:
 
 
 async def check_preconditions(session: Session, expected: ExpectedTable | None, watching: Watching, *, beam: bool) -> ControllerStatus:
-    """Look at everything again; gives the controller's status.
-
-    Parameters
-    ----------
-    beam : bool
-        A laser run is under way: its beam must not have been lost.
+    """Check all preconditions and return the controller's status. ``beam``: during a laser run, also check the beam.
 
     Raises
     ------
     PreconditionsChanged
         Another boot id or another table: the campaign cannot resume.
     Interlock
-        A condition that has to be cleared first.
+        A condition must clear first.
     """
     status = await session.controller.status()
     if expected is not None:
@@ -47,13 +42,7 @@ async def check_preconditions(session: Session, expected: ExpectedTable | None, 
 
 
 def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> None:
-    """Refuse another run of the controller, or another table.
-
-    Raises
-    ------
-    PreconditionsChanged
-        Which.
-    """
+    """Raise PreconditionsChanged if the controller was restarted or another table is active."""
     if boot_id != expected.boot_id:
         raise PreconditionsChanged(
             f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",

@@ -1,8 +1,8 @@
-"""Where a test that was broken off resumes, and how the machine gets there. Pure.
+"""Where an interrupted test resumes, and how the machine gets there. Pure.
 
-A bar must not be moved through its sphere, a mirror not out of its beam: the way back is the way that the test came, to the last
-checkpoint. A path with the ball-bar goes on where it was broken off (abbe.service.sequences.path_resume), or begins again; a run with the
-laser goes on after its last complete point, once that point was read again and says the same.
+A bar must not move through its sphere, nor a mirror out of its beam: the machine returns the way the test came, to the last checkpoint. A
+ball-bar path resumes where it was interrupted (abbe.service.sequences.path_resume), or begins again. A laser run resumes after its last
+complete point, once that point has been read again with the same result.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from abbe.service.sequences.steps import (
 
 BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
 STANDS = MountBar | TakeBarOut | ChangeBar | MountLaser
-"""After these something stands in the machine: a bar hangs in, a cup stands, a mirror is on the spindle."""
+"""Steps after which the machine holds a bar, a cup or a mirror."""
 OFF_PATH_MM = 0.05
-"""Farther than this beside the way it came, another program or person moved the machine, and what is mounted cannot be relied on."""
+"""Farther than this from the way it came, another program or person moved the machine, and the set-up is not reliable."""
 SAME_WAY_MM = 0.005
-"""Two passages of one place are as far apart as chords of a circle are beside it, and positions are rounded."""
+"""Tolerance for two passages of one place: chords of a circle run beside it, and positions are rounded."""
 KEEP_FROM = 2
-"""A laser run with fewer complete points begins again: there is nothing that a repeated reading could be compared with."""
+"""A laser run with fewer complete points begins again: a repeated reading has nothing to be compared with."""
 REFERENCE_MM = 0.003
-"""So much the repeated reading may differ: drift of minutes and noise, not a mirror that was knocked."""
+"""Allowed difference of the repeated reading: minutes of drift and noise, but not a displaced mirror."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResumeTrail:
-    """How to go on: along ``trail`` (oldest first) back to number ``to``, and forward again to number ``upto``.
+    """How to resume: along ``trail`` (oldest point first) back to number ``to``, then forward to number ``upto``.
 
-    With ``carried`` records the last of them is read again there. Going forward again, every axis comes as it came before, so that lost
-    motion is what it was. ``latest``: where the trail passes a place twice the machine stands on the later passage. An empty trail: nothing
-    is mounted. A trail of one point: it must stand there, and nothing moves.
+    With ``carried`` records the last of them is read again there. On the way forward every axis moves as before, so that its lost motion is
+    the same. ``latest``: where the trail passes a place twice, the machine stands on the later passage. Empty trail: nothing is mounted.
+    Trail of one point: the machine must stand there, and nothing moves.
     """
 
     trail: tuple[Point, ...] = ()
@@ -64,9 +64,9 @@ class ResumeTrail:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """Which part of a test is run.
+    """A part of a test to run.
 
-    ``test``: its label in the plan; ``offset``: number of its first step there; ``mounting``: number of the mounting of its set-up, from 1;
+    ``test``: label in the plan; ``offset``: number of the part's first step in it; ``mounting``: number of the set-up's mounting, from 1;
     ``run_id``: the run in the store.
     """
 
@@ -85,18 +85,18 @@ Rest = tuple[TestPlan, int, ResumeTrail, PathRemainder | None]
 def rest_of(
     test: TestPlan, hand: int | None, records: tuple[dict[str, Any], ...], before: Point | None, so_far: SoFar | None = None
 ) -> Rest:
-    """What is left of a test, the number of its first step, the way back to there, and how its path goes on if it does.
+    """Return the rest of a test, the number of its first step, the way back to it, and the rest of an interrupted path.
 
     Parameters
     ----------
     hand : int, optional
-        Last step by hand that was done; None: none was.
+        Last manual step done; None: none.
     records : tuple of dict
-        Laser records of complete points of this mounting and zero, oldest first; none for a ball-bar.
+        Laser records of complete points since this mounting's zero, oldest first; none for a ball-bar.
     before : tuple of float, optional
-        Where the test before it ended, if it left mounted what this one uses.
+        End position of the previous test, if both share the set-up.
     so_far : SoFar, optional
-        How far its path was read in this mounting.
+        How far the path was read in this mounting.
     """
     first = 0 if hand is None else hand + 1
     start = before if hand is None else _standing(test.steps[:first])
@@ -114,7 +114,7 @@ def rest_of(
 
 
 def _along_path(test: TestPlan, first: int, start: Point | None, so_far: SoFar) -> Rest | None:
-    """The rest from a point of the path on."""
+    """Return the rest that begins on the path, or None."""
     steps = _by_itself(test.steps[first:])
     k = next((k for k, step in enumerate(steps) if isinstance(step, RecordPath)), None)
     path = None if k is None else steps[k]
@@ -127,13 +127,13 @@ def _along_path(test: TestPlan, first: int, start: Point | None, so_far: SoFar) 
 
 
 def _to_beginning(trail: tuple[Point, ...], steps: tuple[Step, ...]) -> ResumeTrail:
-    """Back along the trail to where the first step of what is left begins or, if that is a straight move, ends."""
+    """Return along the trail to the start of the first remaining step or, if that is a straight move, to its end."""
     to = 0 if isinstance(steps[0], FollowPath | RecordPath) else min(1, len(trail) - 1)
     return ResumeTrail(trail, to, to, _feed(steps))
 
 
 def _by_itself(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps up to the first that a person does: from there on something else is mounted, and the way leads elsewhere."""
+    """Steps before the first manual one: after it the set-up, and so the way, is another."""
     cut = next((k for k, step in enumerate(steps) if isinstance(step, BY_HAND)), len(steps))
     return steps[:cut]
 
@@ -150,19 +150,13 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
 
 
 def _all_axes_from(trail: tuple[Point, ...]) -> int:
-    """From which point on every axis that moves at all makes its last motion to the trail's end."""
+    """Number of the point from which every moving axis makes its last motion to the trail's end."""
     moved = np.abs(np.diff(np.array(trail), axis=0)) > 0.0
     return min((int(np.flatnonzero(moved[:, a])[-1]) for a in range(3) if moved[:, a].any()), default=len(trail) - 1)
 
 
 def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]:
-    """Positions to go through from where the machine stands.
-
-    Raises
-    ------
-    SetupDisturbed
-        It does not stand on the way that it came.
-    """
+    """Return the positions to pass through from the current one. Raises SetupDisturbed if the machine is not on the way it came."""
     if not resume_trail.trail:
         return ()
     trail, here = np.array(resume_trail.trail), np.array(position_mm)
@@ -170,24 +164,24 @@ def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]
     if off_mm > OFF_PATH_MM:
         raise SetupDisturbed(
             f"the machine stands {off_mm:.3f} mm beside the way that the test came",
-            "it was moved meanwhile: what is mounted is mounted anew",
+            "it was moved during the break: the set-up is mounted anew",
         )
     if len(trail) == 1:
         return ()
     way, to = resume_trail.trail, resume_trail.to
-    points = way[to : segment + 1][::-1] or way[segment + 1 : to + 1]  # it may stand before it, too
+    points = way[to : segment + 1][::-1] or way[segment + 1 : to + 1]  # the machine may also stand before ``to``
     return tuple(p for k, p in enumerate(points) if k or np.abs(np.array(p) - here).max() > 1e-5)
 
 
 def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
-    """A test of a set-up that is mounted for the n-th time, mounting by itself; ``first`` is the test that mounted it the first time."""
+    """Return a test that itself mounts its set-up for the n-th time; ``first`` is the test that mounted it the first time."""
     named = anew(test, number)
     if test.mounts:
         return replace(named, steps=(Unmount(), *test.steps))
     k = next((k for k, step in enumerate(first.steps) if isinstance(step, MountBar | MountLaser)), None)
     if k is None:
         raise SetupDisturbed(
-            f"what test {test.label} uses was mounted by another campaign, and cannot be mounted anew in this one",
+            f"another campaign mounted the set-up of test {test.label}, and this one cannot mount it anew",
             "clear it away and begin again",
         )
     opening: tuple[Step, ...] = (Unmount(), *(s for s in first.steps[: k + 1] if not isinstance(s, Unmount)))
@@ -197,7 +191,7 @@ def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
 
 
 def _from_centre(test: TestPlan) -> tuple[Step, ...]:
-    """A test's steps with its bar hung in anew at the centre: by way of the pole instead of from where the test before ended."""
+    """Steps of a test whose bar is hung in anew at the centre: over the pole instead of from the end of the previous test."""
     first = next(k for k, step in enumerate(test.steps) if isinstance(step, RecordPath | ReadBar))
     near = [s for s in test.steps[:first] if isinstance(s, MoveTo)][-2:]  # beside the path's start, and that start
     start = near[-1]
@@ -205,14 +199,14 @@ def _from_centre(test: TestPlan) -> tuple[Step, ...]:
 
 
 def anew(test: TestPlan, number: int) -> TestPlan:
-    """A test under the name of the n-th mounting of its set-up."""
+    """Return a test whose set-up carries the number of its mounting in its name."""
     if number == 1:
         return test
     return replace(test, setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})
 
 
 def end_of(test: TestPlan) -> Point | None:
-    """Where the machine stands after a test."""
+    """Position of the machine after a test."""
     return _standing(test.steps)
 
 
@@ -232,14 +226,14 @@ def _trail(start: Point | None, steps: tuple[Step, ...]) -> tuple[Point, ...]:
 
 
 def _feed(steps: tuple[Step, ...]) -> float:
-    """The slowest feed of what is left: the way back is never driven faster than the way there."""
+    """Slowest feed of the remaining steps: the machine never returns faster than it came."""
     return min((s.feed_mm_min for s in steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=1000.0)
 
 
 def _nearest(trail: np.ndarray, here: np.ndarray, to: int, *, latest: bool) -> tuple[int, float]:
-    """Number of the nearest segment's first point, and the distance from it, mm.
+    """Return the number of the nearest segment's first point, and the distance from the segment, mm.
 
-    Where the trail passes the place more than once (a circle with feed-in): the passage from which ``to`` is nearest along the trail.
+    Where the trail passes the place more than once (a circle with feed-in), take the passage nearest to ``to`` along the trail.
     """
     if len(trail) == 1:
         return 0, float(np.linalg.norm(here - trail[0]))

@@ -17,7 +17,7 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
-from abbe.service.sequences.path_resume import PathRemainder, Way
+from abbe.service.sequences.path_resume import PathProgress, PathRemainder
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_guard, record_path
 from abbe.service.sequences.preconditions import ExpectedTable
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
@@ -43,14 +43,14 @@ from abbe.service.sequences.watch import NOTHING, Watch, watched
 
 
 async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, here: Point | None) -> dict[str, Any]:
-    """One record of a point-by-point test, with every sample that it is the mean of.
+    """Return one record of a point-by-point test, with every sample of its mean.
 
-    The stream is started after ``status`` said that the axes have settled, so no sample can be older than that: arrival times play no part.
+    The stream starts after ``status`` showed settled axes, so no sample is older than that, whatever the arrival times.
 
     Raises
     ------
     BarOutOfRange, MeasurementFault
-        The box itself says that a sample is none: out of range or no bar; samples lost.
+        The box flags a sample as out of range or without bar; samples are lost.
     """
     samples: list[BarSample] = []
     host_s = status.host_s
@@ -82,28 +82,14 @@ async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, he
 SAME_PLACE_MM = 1e-3
 MM_PER_COUNT = 1e-7
 BY_MOVES = 12
-"""A way back of so many points is driven in single moves, a longer one as a path."""
+"""A return of at most this many points uses single moves, a longer one a path."""
 
 Tick = Callable[[float, float], None]
-"""Called after each step: planned machine seconds done so far in the test, and wall seconds that this step waited for a person."""
+"""Called after each step with the planned machine seconds done so far in the test, and the wall seconds this step waited for a person."""
 
 
 class Runner:
-    """Runs tests on one session.
-
-    Parameters
-    ----------
-    session : Session
-        Open devices.
-    control : Control, optional
-        How a person pauses, stops and aborts; default: never.
-    watching : Watching, optional
-        What the watcher looks at.
-    journal : Journal, optional
-        Where checkpoints go.
-    expected : ExpectedTable, optional
-        What must not have changed when a pause ends.
-    """
+    """Runs tests on one session; ``expected`` is checked when a pause ends."""
 
     def __init__(
         self,
@@ -122,35 +108,35 @@ class Runner:
         self._points = 0
         self._still = self._stands = False
         self.touched = False
-        """A person may have touched what is mounted, in the pause that ended the run."""
+        """Whether a person may have touched the set-up in the pause that ended the run."""
         self.hand: int | None = None
-        """Last step by hand that was done; ``asked``: one that a person was asked for and that was not done."""
+        """Number of the last manual step done; ``asked``: of one requested and not yet done."""
         self.asked: int | None = None
         self.mounted_us: int | None = None
         self.gained = False
-        """A point was read that the attempts before had not; of paths only the store can say."""
-        self.way: Way | None = None
-        """How far the path that is recorded came."""
+        """Whether this attempt read a new point; for paths only the store knows."""
+        self.way: PathProgress | None = None
+        """Progress of the recorded path."""
         self._remainder: PathRemainder | None = None
         self.records: list[dict[str, Any]] = []
-        """Laser records since the zero: what a continued run can begin with."""
+        """Laser records since the zero: a resumed run can begin with them."""
 
     async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick, attempt: Attempt | None = None) -> dict[str, int]:
-        """Execute a test, or what is left of it; returns what the end document needs, in controller time.
+        """Execute a test, or the rest of it; return the controller times (us) for the end document.
 
-        ``mounted_us``: when a cup or a laser was mounted, if this test mounts one; ``path_start_us``, ``path_end_us``: of a ball-bar run.
+        ``mounted_us``: mounting of a cup or a laser, if this test mounts one; ``path_start_us``, ``path_end_us``: of a ball-bar run.
 
         Raises
         ------
         Interlock, Stopped, Aborted, RunInterrupted, SetupDisturbed, MeasurementFault, DriverError
-            The axes are stopped before the error leaves.
+            The axes stop before the error leaves.
         """
         attempt = attempt or Attempt()
         self._remainder = attempt.remainder
         result: dict[str, int] = {}
         done, clock = 0.0, asyncio.get_running_loop().time
-        # The guard stands outside: what it has to say of a stop that did not get through must not be lost with the watcher's own errors.
-        check_ours(await self._s.controller.status())  # before the guard: its stop would end another program
+        # The guard is outermost: its warning of a failed stop must not be lost among the watcher's errors.
+        check_ours(await self._s.controller.status())  # before the guard, whose stop would end another program
         self._stands = not plan.mounts
         async with motion_guard(self._s.controller, self._spared), watched(self._s, self._control, self._watching) as watch:
             check_interlocks(await self._s.controller.status())
@@ -160,7 +146,7 @@ class Runner:
                     continue
                 self._control.place(k + 1, len(plan.steps), self._points)
                 await self._safe_place(step, watch)
-                await self._nobody_inside(step, watch)
+                await self._check_door_closed(step, watch)
                 seconds, after = step_seconds(step, here)
                 began = clock()
                 if isinstance(step, BY_HAND):
@@ -177,7 +163,7 @@ class Runner:
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     async def _safe_place(self, step: Step, watch: Watch) -> None:
-        """Before a motion or a person's work: here it may wait or end. A point in hand is read first."""
+        """Pause or end here if requested, before a motion or manual work. Pending readings are taken first."""
         if isinstance(step, ReadLaser | ReadBar | ZeroLaser):
             return
         self._control.check()
@@ -185,26 +171,26 @@ class Runner:
             await self._paused(watch)
 
     async def _paused(self, watch: Watch) -> None:
-        where = (await self._s.controller.status()).position_mm
+        before_mm = (await self._s.controller.status()).position_mm
         watch.tolerated, self._still = PAUSED, True
         touched = await paused(self._s, self._control, self._watching, self._expected, self.journal, beam=watch.beam)
         watch.tolerated, self._still = NOTHING, False
         if touched and self._stands:
             self.touched = True
-            raise RunInterrupted("the door was open during the pause", "what is mounted is looked at again before the test goes on")
+            raise RunInterrupted("the door was open during the pause", "the set-up is checked again before the test resumes")
         status = await self._s.controller.status()
-        if math.dist(status.position_mm, where) > SAME_PLACE_MM:
-            raise RunInterrupted("the axes were moved during the pause", "the test goes on from its last checkpoint")
+        if math.dist(status.position_mm, before_mm) > SAME_PLACE_MM:
+            raise RunInterrupted("the axes were moved during the pause", "the test resumes from its last checkpoint")
 
     async def _spared(self) -> bool:
-        """Whether nothing of ours can move, and another program works with the machine: a stop would end that program."""
+        """Whether nothing of ours can move and another program controls the machine: a stop would end that program."""
         if not self._still:
             return False
         status = await self._s.controller.status()
         return status.program_runs or not status.remote
 
-    async def _nobody_inside(self, step: Step, watch: Watch) -> None:
-        """After a person has worked inside, the first motion does not wait: the door is closed, or the test ends here."""
+    async def _check_door_closed(self, step: Step, watch: Watch) -> None:
+        """End the test if the door is not closed at the first motion after manual work."""
         if watch.tolerated and not isinstance(step, BY_HAND):
             check_interlocks(await self._s.controller.status())
             watch.tolerated = NOTHING
@@ -220,7 +206,7 @@ class Runner:
                 await self.journal.add(POINT, test=attempt.test, run=attempt.run_id, step=attempt.offset + k, points=self._points)
 
     async def _by_hand(self, step: Step, k: int, attempt: Attempt, watch: Watch) -> dict[str, int]:
-        """Something that a person does: the door may be open meanwhile, and nothing moves until it is closed."""
+        """Have a person do a manual step: the door may be open, and nothing moves until it is closed."""
         line = {"test": attempt.test, "setup": attempt.setup, "mounting": attempt.mounting, "step": attempt.offset + k}
         line |= {"what": type(step).__name__}
         watch.beam = False
@@ -230,7 +216,7 @@ class Runner:
         self._still = True
         await self._control.unless_stopped(self._done_by_hand(step))
         self._still, self._stands = False, not isinstance(step, Unmount)
-        status = await self._s.controller.status()  # mounting takes minutes: the clock is read when it is done
+        status = await self._s.controller.status()  # mounting takes minutes: read the clock afterwards
         await self.journal.add(HAND, phase="done", ctrl_us=status.ctrl_us, **line)
         self.hand, self.asked = attempt.offset + k, None
         if not isinstance(step, MountBar | MountLaser):
@@ -238,10 +224,10 @@ class Runner:
         self.mounted_us = status.ctrl_us
         return {"mounted_us": status.ctrl_us}
 
-    # ---- going on after a break ------------------------------------------------------------------------------------
+    # ---- resuming --------------------------------------------------------------------------------------------------
 
     async def _gone_back(self, attempt: Attempt, recorder: Recorder, watch: Watch) -> Point | None:
-        """Back to the last checkpoint, along the way that the test came; gives where the machine stands then, None if it did not move."""
+        """Return to the last checkpoint along the way that the test came; the new position, or None if the machine did not move."""
         resume_trail = attempt.resume_trail
         if not resume_trail.trail:
             return None
@@ -262,14 +248,14 @@ class Runner:
         return resume_trail.trail[resume_trail.upto]
 
     async def _same_as(self, last: dict[str, Any], recorder: Recorder, carried: tuple[dict[str, Any], ...]) -> None:
-        """Read the last complete point again: only if it says the same, nothing was knocked and no count was lost."""
+        """Read the last complete point again: only an equal reading proves an undisturbed set-up and an unbroken count."""
         status = await self._settled(0.3)
         record = await self._laser_record(status, tuple(last["target_mm"]), int(last["direction"]))
         off_mm = abs(record["displacement_tenth_nm"] - last["displacement_tenth_nm"]) * MM_PER_COUNT
         if off_mm > REFERENCE_MM:
             raise SetupDisturbed(
                 f"the last point reads {1e3 * off_mm:.1f} um otherwise than before the break (allowed: {1e3 * REFERENCE_MM:.0f})",
-                "laser or mirror was knocked: it is mounted anew",
+                "laser or mirror was displaced: the set-up is mounted anew",
             )
         for one in carried:
             await self._kept(one, recorder)
@@ -311,7 +297,7 @@ class Runner:
         return {}
 
     async def _stands_at(self, start_mm: Point) -> None:
-        """A path is driven from where it begins: from elsewhere the way to its second point may lead through the sphere."""
+        """Refuse a path unless the machine stands at its start: from elsewhere the first move may lead through the sphere."""
         off_mm = math.dist((await self._s.controller.status()).position_mm, start_mm)
         if off_mm > OFF_PATH_MM:
             raise MeasurementFault(
@@ -320,7 +306,7 @@ class Runner:
 
     async def _recorded(self, step: RecordPath, recorder: Recorder) -> dict[str, int]:
         await self._stands_at(step.points_mm[0])
-        self.way = Way(step)
+        self.way = PathProgress(step)
         return await record_path(self._s, step, recorder, self._control, self.way, self._remainder)
 
     async def _zeroed(self) -> None:

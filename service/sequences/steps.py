@@ -20,33 +20,33 @@ class MoveTo:
 
 @dataclass(frozen=True, slots=True)
 class MountBar:
-    """The machine stands at the sphere's centre: cup and bar are mounted."""
+    """The machine stands at the sphere's centre: a person mounts cup and bar."""
 
     radius_mm: float
 
 
 @dataclass(frozen=True, slots=True)
 class TakeBarOut:
-    """The bar is taken out, before the machine moves off its sphere; the cup stays where it stands."""
+    """A person takes the bar out before the machine leaves its sphere; the cup stays in place."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeBar:
-    """Another bar is hung in at the cup that stands; the machine stands at the start of its path."""
+    """A person hangs another bar in at the same cup; the machine stands at the start of its path."""
 
     radius_mm: float
 
 
 @dataclass(frozen=True, slots=True)
 class MountLaser:
-    """The machine stands at the start of the line: laser and mirror are set up along ``beam``."""
+    """The machine stands at the start of the line: a person sets up laser and mirror along ``beam`` (unit vector)."""
 
     beam: Point
 
 
 @dataclass(frozen=True, slots=True)
 class Unmount:
-    """Bar and mirror are taken away, before anything moves fast again. Left out when the test fails: a person is there anyway."""
+    """A person takes bar and mirror away before anything moves fast again. Skipped when the test fails: a person is there anyway."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class RecordPath:
 
 @dataclass(frozen=True, slots=True)
 class FollowPath:
-    """Run a polyline with the bar hung in and nothing recorded: on the sphere to where the next path begins."""
+    """Run a polyline on the sphere, with the bar hung in and without recording, to the start of the next path."""
 
     points_mm: tuple[Point, ...]
     feed_mm_min: float
@@ -99,7 +99,7 @@ Step = MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroL
 
 @dataclass(frozen=True, slots=True)
 class TestPlan:
-    """One run: what it is, how it is set up (run-format.md 3), and its steps."""
+    """One run: its kind, its set-up (run-format.md 3), and its steps."""
 
     __test__ = False  # not a pytest class
 
@@ -111,7 +111,7 @@ class TestPlan:
 
     @property
     def mounts(self) -> bool:
-        """Whether it begins a set-up; else it uses what an earlier test has mounted."""
+        """Whether the test begins a set-up; else it uses that of an earlier test."""
         return any(isinstance(step, MountBar | MountLaser) for step in self.steps)
 
 

@@ -1,4 +1,4 @@
-"""Waiting for a person (pause) or for a condition to clear (suspension), and looking at everything again before it goes on."""
+"""Waits for a person (pause) or for a condition to clear (suspension), and checks all preconditions again before resuming."""
 
 from __future__ import annotations
 
@@ -10,34 +10,35 @@ from abbe.drivers.flags import signal_is_there
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, DoorOpen, Interlock
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, somebody_at_work
+from abbe.service.sequences.interlocks import CAN_CLEAR, Suspending, Watching, person_may_be_inside
 from abbe.service.sequences.journal import GOES_ON, WAITS, Journal
 from abbe.service.sequences.preconditions import ExpectedTable, check_preconditions
 
 LOOK_S = 0.1
-"""How often a pause looks at devices and at what was asked."""
+"""Polling interval of a pause: devices and requests."""
 
 
 async def paused(
     session: Session, control: Control, watching: Watching, expected: ExpectedTable | None, journal: Journal, *, beam: bool = False
 ) -> bool:
-    """Wait until a pause is taken back and everything is as it has to be; what is not is said, and the pause goes on.
+    """Wait until the pause is withdrawn and all preconditions hold; an unmet one is reported, and the pause continues.
 
-    Where no pause is allowed (`Control.hurry`) it does not go on: a closed door alone, without a person's word, moves nothing.
+    Where no pause is allowed (`Control.hurry`) an unmet precondition ends the run: a closed door alone, without a person's confirmation,
+    must not start motion.
 
     Returns
     -------
     bool
-        Whether a person may have touched what is mounted: the door was open, the mode another, or the controller did not say.
+        Whether a person may have touched the set-up: the door was open, the mode was not remote, or the controller did not answer.
 
     Raises
     ------
     Stopped, Aborted
-        That was asked for instead.
-    WorldChanged, BeamLost
-        Not to be cleared by waiting.
+        A person requested it.
+    PreconditionsChanged, BeamLost
+        Waiting cannot clear it.
     Interlock
-        In a hurry: something is not as it has to be.
+        A precondition is not met, and no pause is allowed.
     """
     why = "paused as asked"
     await journal.add(WAITS, why=why)
@@ -50,31 +51,31 @@ async def paused(
         except Interlock as trouble:
             if isinstance(trouble, BeamLost) or control.hurry:
                 raise
-            why = f"cannot go on: {trouble.detail}"
+            why = f"cannot resume: {trouble.detail}"
             control.pause()
             continue
         break
-    await journal.add(GOES_ON, touched=visits.seen)
+    await journal.add(GOES_ON, touched=visits.touched)
     control.now(State.RUNNING)
-    return visits.seen
+    return visits.touched
 
 
 class Visits:
-    """Looks whether a person works in the machine, while nothing moves."""
+    """Detects whether a person works in the machine while nothing moves."""
 
     def __init__(self, session: Session) -> None:
         self._controller = session.controller
-        self.seen = False
+        self.touched = False
 
     async def look(self) -> None:
-        """Look once."""
+        """Check once."""
         try:
-            self.seen = self.seen or somebody_at_work(await self._controller.status())
+            self.touched = self.touched or person_may_be_inside(await self._controller.status())
         except DriverError:
-            self.seen = True  # unknown counts as touched
+            self.touched = True  # unknown counts as touched
 
     async def during(self, work: Awaitable[None]) -> None:
-        """Wait for something, and look again and again meanwhile."""
+        """Wait for work, and check repeatedly until it is done."""
         task = asyncio.ensure_future(work)
         try:
             while not task.done():
@@ -89,35 +90,30 @@ class Visits:
 
 
 def may_suspend(trouble: Interlock, suspending: Suspending) -> bool:
-    """Whether a condition only suspends: it can clear by itself, and the machine file permits it."""
+    """Whether a condition only suspends: it can clear by itself, and the machine file allows it."""
     return trouble.condition in CAN_CLEAR & suspending.conditions
 
 
 async def suspended(
     session: Session, control: Control, watching: Watching, expected: ExpectedTable | None, journal: Journal, trouble: Interlock
 ) -> bool:
-    """Wait until a condition has cleared and all has been well for the settle time.
-
-    Returns
-    -------
-    bool
-        Whether a person may have touched what is mounted meanwhile.
+    """Wait until all preconditions have held for the settle time; return whether a person may have touched the set-up.
 
     Raises
     ------
     Interlock
-        It did not clear in time, or a condition came up that never goes on by itself.
+        The condition did not clear in time, or one came up that never clears by itself.
     Stopped, Aborted
-        A person asked for that.
-    WorldChanged
-        The controller or its table is not what it was.
+        A person requested it.
+    PreconditionsChanged
+        The controller was restarted, or another table is active.
     """
     clock, how = asyncio.get_running_loop().time, watching.suspending
     until_s, well_s = clock() + how.longest_s, clock()
     control.now(State.SUSPENDED, trouble.detail)
     await journal.add(WAITS, why=trouble.detail, condition=trouble.condition)
     beam, visits = isinstance(trouble, BeamLost), Visits(session)
-    visits.seen = isinstance(trouble, DoorOpen)
+    visits.touched = isinstance(trouble, DoorOpen)
     while True:
         control.check()
         await visits.look()
@@ -139,9 +135,9 @@ async def suspended(
                 await control.asked()
         except TimeoutError:
             continue
-    await journal.add(GOES_ON, touched=visits.seen)
+    await journal.add(GOES_ON, touched=visits.touched)
     control.now(State.RUNNING)
-    return visits.seen
+    return visits.touched
 
 
 async def _signal(session: Session) -> None:

@@ -1,8 +1,8 @@
-"""The watcher beside a running test: asks controller and laser how they are, and ends the test when one of them says no, or nothing.
+"""The watcher beside a running test: polls controller and laser, and ends the test at an interlock or when one does not answer.
 
-From an event to the end of the motion command stream: one period, one exchange, and the stop. The controller's link carries one request
-at a time, so the watcher waits its turn like everybody else and never has more than one request under way. While others ask more often than
-it (a path is followed), it uses their answers, and asks only when the last one is a period old.
+The latency from an event to the end of the motion command stream is one period, one exchange, and the stop. The controller's link carries
+one request at a time, so the watcher waits its turn and never has more than one request pending. While other tasks poll more often (along a
+path), the watcher uses their answers, and asks only when the latest is a period old.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from abbe.service.sequences.interlocks import Watching, air_trouble, beam_troubl
 
 AIR_PERIOD_S = 1.0
 LASER_UNKNOWN_S = 2.5
-"""A laser on a serial line is silent for a second after one lost reply; nothing but a reading hangs on it."""
+"""Longest silence of the laser: on a serial line one lost reply costs a second, and only a reading depends on it."""
 RETRY_S = 0.02
 LATE_S = 0.1
-"""If we wake up later than this, it was this computer that stood still: it asks once more before it calls the status unknown."""
+"""A later wake-up means that this computer stalled: the watcher asks once more before it calls the status unknown."""
 NOTHING: frozenset[str] = frozenset()
 END_S = 5.0
-"""So long the watchers may take for the look that they are at when the test has ended."""
+"""Longest wait for the watchers' current poll when the test has ended."""
 
 
 class Watch:
-    """What is being watched. The sequencer says which conditions are a person's right just now (``tolerated``) and whether the laser counts
+    """Watches controller and laser. The sequencer sets which conditions a person may cause now (``tolerated``) and whether the beam matters
     (``beam``)."""
 
     def __init__(self, session: Session, watching: Watching) -> None:
@@ -44,26 +44,26 @@ class Watch:
 
     @property
     def tolerated(self) -> frozenset[str]:
-        """Conditions that are a person's right just now."""
+        """Conditions that a person may cause now."""
         return self._tolerated
 
     @tolerated.setter
     def tolerated(self, conditions: frozenset[str]) -> None:
-        self._tolerated, self._since_s = conditions, time.monotonic()  # what was heard before is not judged by it
+        self._tolerated, self._since_s = conditions, time.monotonic()  # earlier statuses are not judged by the new set
 
     def end(self) -> None:
-        """Let the watchers end after the look that they are at."""
+        """Let the watchers end after their current poll."""
         self._ended.set()
 
     async def controller(self) -> None:
-        """Ask the controller again and again.
+        """Poll the controller until the test ends.
 
         Raises
         ------
         Interlock
-            A condition forbids motion, or the controller said nothing for too long.
+            A condition forbids motion, or the controller was silent for too long.
         Rebooted
-            It restarted.
+            The controller restarted.
         """
         while not self._ended.is_set():
             status = self._just_heard()
@@ -74,19 +74,19 @@ class Watch:
             await self._rest(left_s)
 
     def _just_heard(self) -> ControllerStatus | None:
-        """A status that another task read less than a period ago."""
+        """Status that another task read less than a period ago, or None."""
         status = latest_status(self._s.controller)
         if status is None or status.host_s <= max(self._since_s, time.monotonic() - self._w.period_s):
             return None
         return status
 
     async def laser(self, laser: DisplacementMeter) -> None:
-        """Ask the laser again and again: for its beam while it counts, for the air always.
+        """Poll the laser until the test ends: its beam while that matters, the air always.
 
         Raises
         ------
         Interlock
-            Beam lost, air outside the window, or the laser said nothing for too long.
+            Beam lost, air outside the window, or the laser was silent for too long.
         """
         clock = asyncio.get_running_loop().time
         heard_s = clock()
@@ -112,7 +112,7 @@ class Watch:
             await self._rest(self._w.period_s if self.beam else AIR_PERIOD_S)
 
     async def named(self, error: BaseException) -> BaseException:
-        """What stands behind an error of a device: the interlock, if one holds; else the error itself."""
+        """Return the cause of a device error: the interlock if one holds, else the error itself."""
         if not isinstance(error, DriverError | MeasurementFault) or isinstance(error, Rebooted):
             return error
         try:
@@ -139,12 +139,12 @@ class Watch:
 
 @asynccontextmanager
 async def watched(session: Session, control: Control, watching: Watching) -> AsyncIterator[Watch]:
-    """A block that ends as soon as a watcher objects or a person aborts. Code that moves axes inside stops them when it is cancelled.
+    """Cancel this block as soon as a watcher fails or a person aborts; code inside stops its axes when it is cancelled.
 
     Raises
     ------
     Interlock, Aborted, DriverError
-        What ended the block, by its own name.
+        The cause that ended the block.
     """
     watch, me = Watch(session, watching), asyncio.current_task()
     assert me is not None
@@ -157,24 +157,24 @@ async def watched(session: Session, control: Control, watching: Watching) -> Asy
     body: BaseException | None = None
     try:
         yield watch
-    except BaseException as error:  # noqa: BLE001 - raised again below, by the name of its cause
+    except BaseException as error:  # noqa: BLE001 - raised again below as its cause
         body = error
     watch.end()
     aborting.cancel()
     await beside.ended()
-    if me.cancelling() > before:  # a cancellation from outside goes first, whatever came together with it
+    if me.cancelling() > before:  # an outside cancellation takes precedence over everything else
         raise body if isinstance(body, asyncio.CancelledError) else asyncio.CancelledError
     if body is not None and not isinstance(body, asyncio.CancelledError):
         raise await watch.named(body) from body
     if beside.errors:
-        raise beside.errors[0] from None  # one cause for one person; the others follow from it
+        raise beside.errors[0] from None  # report one cause; the others follow from it
     if body is not None:
         raise body
 
 
 class Beside:
-    """Tasks beside a block, the first failure of which cancels the block. Unlike a TaskGroup it never takes a cancellation from outside
-    for its own: while the axes are being stopped both may come."""
+    """Tasks beside a block; their first failure cancels the block. Unlike a TaskGroup it never takes an outside cancellation for its own:
+    both may come while the axes are being stopped."""
 
     def __init__(self, block: asyncio.Task[Any]) -> None:
         self._block, self._open, self._cancelled = block, True, False
@@ -182,7 +182,7 @@ class Beside:
         self.errors: list[BaseException] = []
 
     def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Begin a task."""
+        """Start a task."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._done)
@@ -197,7 +197,7 @@ class Beside:
             self._block.cancel()
 
     async def ended(self) -> None:
-        """The block has ended: take back our own cancellation and wait for the tasks."""
+        """Withdraw our own cancellation after the block, and wait for the tasks."""
         self._open = False
         if self._cancelled:
             self._block.uncancel()
@@ -206,7 +206,7 @@ class Beside:
             try:
                 await asyncio.wait(pending, timeout=END_S)
             except asyncio.CancelledError:
-                until_s = 0.0  # noted by the task itself; who cancels twice does not wait for a look
+                until_s = 0.0  # the task itself keeps the cancellation; after a second one do not wait for the poll
             if asyncio.get_running_loop().time() >= until_s:
                 for task in pending:
                     task.cancel()
@@ -215,12 +215,12 @@ class Beside:
 
 
 async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s: float) -> ControllerStatus:
-    """One status, asked again after a lost reply until it has been unknown for too long.
+    """Read one status; retry lost replies until the status has been unknown for ``unknown_s``.
 
     Raises
     ------
     StatusUnknown
-        Nothing was heard for ``unknown_s``. Time in which this computer itself stood still is not counted against the controller.
+        No reply within ``unknown_s``. A stall of this computer does not count against the controller.
     Rebooted
         The controller restarted.
     """
@@ -249,7 +249,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
 
 
 def first_of(error: BaseException) -> BaseException:
-    """The first cause in a group of errors."""
+    """First leaf error of an exception group."""
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
     return error

@@ -69,7 +69,7 @@ async def at_work(urls: DeviceUrls, store: Store, site: Site, campaign: Campaign
         await recover(session.controller, store, site)
         begun = any(c.name == campaign.name and store.checkpoints.of_campaign(c.id) for c in store.campaigns.all())
         found = await resume(session, store, site, campaign, campaign.name, confirm) if begun else None
-        for line in found.said if found is not None else ():
+        for line in found.messages if found is not None else ():
             print(line, file=sys.stderr)  # noqa: T201
         # killed between a campaign's first line and its journal's: there is nothing to go on with, and nothing was measured
         empty = next((c for c in store.campaigns.all() if c.name == campaign.name and found is None), None)

@@ -248,12 +248,12 @@ async def test_what_is_not_safe_keeps_the_pause(place):
             b.sim.world.controller.set_door(is_open=True)
             control.resume()
         elif now.state == State.PAUSED:
-            assert now.why == "cannot go on: the door is open"
+            assert now.why == "cannot resume: the door is open"
             b.sim.world.controller.set_door(is_open=False)
             control.resume()
     _, error = await task
     assert error is None
-    assert (State.PAUSED, "cannot go on: the door is open") in seen
+    assert (State.PAUSED, "cannot resume: the door is open") in seen
 
 
 async def test_where_nobody_may_pause_a_pause_does_not_go_on(place):

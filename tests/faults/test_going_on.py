@@ -148,7 +148,7 @@ async def going_on(b: Bench, store: Store, plan: CampaignPlan, confirm=decline) 
 async def test_after_an_e_stop_a_laser_run_goes_on_and_says_so(place):
     b, store = place
     found = await going_on(b, store, await broken_off(b, store))
-    assert found.said[-1].startswith("set-up S is still mounted: test goes on after point")
+    assert found.messages[-1].startswith("set-up S is still mounted: test goes on after point")
     assert statuses(store) == [("test", "failed"), ("test-2", "complete")]
 
 
@@ -169,7 +169,7 @@ async def test_a_lost_count_begins_again_with_a_new_zero(place):
     b.sim.world.laser.block(blocked=True)
     b.sim.world.laser.block(blocked=False)
     found = await going_on(b, store, plan)
-    assert found.said[-1] == "set-up S is still mounted: test begins again"
+    assert found.messages[-1] == "set-up S is still mounted: test begins again"
     assert statuses(store)[-1] == ("test-2", "complete")
 
 

@@ -94,7 +94,7 @@ async def resumed_item(b: Bench, store: Store, plan: CampaignPlan, confirm=yes, 
         assert again_s is not None
         freed(b)
     b.sim.pace(SPEED)
-    return found.said[-1]
+    return found.messages[-1]
 
 
 def runs(store: Store) -> list[RunRecord]:

@@ -1,4 +1,4 @@
-"""A plan as blocks that every NC dialect can say: lines, arcs, dwells, stops for a person, words."""
+"""A plan as blocks that every NC dialect can express: lines, arcs, dwells, stops for a person, comments."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ LASER_DWELL_S = 0.7
 """After settling: 14 output samples of the laser, so that a few may be lost at either end of a standstill."""
 BAR_DWELL_S = 0.3
 PATH_REST_S = 2.0
-"""Standstill before and after a path that is recorded as it runs: the listener sees where it begins and ends."""
+"""Standstill before and after a recorded path: it shows the listener where the path begins and ends."""
 
 
 @dataclass(frozen=True, slots=True)
-class Say:
+class Comment:
     """A comment for the reader of the program."""
 
     text: str
@@ -45,7 +45,7 @@ class Say:
 
 @dataclass(frozen=True, slots=True)
 class Halt:
-    """The program stops until a person goes on; what there is to do."""
+    """The program stops until a person has done the task in ``text``."""
 
     text: str
 
@@ -60,7 +60,7 @@ class Go:
 
 @dataclass(frozen=True, slots=True)
 class Arc:
-    """Along a circle in a plane of two axes to a point, less than a whole turn; ``positive``: from the plane's first axis to its second."""
+    """Arc of less than a full turn in a plane of two axes; ``positive``: from the plane's first axis to its second."""
 
     plane: str
     start_mm: Point
@@ -72,7 +72,7 @@ class Arc:
 
 @dataclass(frozen=True, slots=True)
 class Dwell:
-    """Stand still; ``reading``: number of the reading that is taken meanwhile, 0 for none."""
+    """Stand still; ``reading``: number of the reading taken during it, 0 for none."""
 
     seconds: float
     reading: int = 0
@@ -80,17 +80,17 @@ class Dwell:
 
 @dataclass(frozen=True, slots=True)
 class Smooth:
-    """From here on run through corners at constant feed, or (``on`` False) stop exactly in each."""
+    """Pass corners at constant feed from here on, or (``on`` False) stop exactly in each."""
 
     on: bool
 
 
-Block = Say | Halt | Go | Arc | Dwell | Smooth
+Block = Comment | Halt | Go | Arc | Dwell | Smooth
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """Name, words for its head, and blocks."""
+    """An NC program: name, comments of its head, and blocks."""
 
     name: str
     head: tuple[str, ...]
@@ -98,15 +98,14 @@ class Program:
 
     @property
     def halts(self) -> int:
-        """How often it waits for a person."""
+        """Number of stops for a person."""
         return sum(isinstance(block, Halt) for block in self.blocks)
 
 
 def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[str, ...] = PLANES) -> Program:
-    """The NC program of a campaign: every position of its plan in order, a dwell at each reading, a stop wherever a person is needed.
+    """Return the NC program of a campaign: every position of its plan in order, a dwell at each reading, a stop for each manual step.
 
-    ``arcs``: planes in which circles are written as arcs. How long it takes is said by who knows the controller
-    (`abbe.service.sequences.nc.write`).
+    ``arcs``: planes in which circles become arcs. `abbe.service.sequences.nc.write` computes the run time.
     """
     moves = [s.feed_mm_min for t in plan.tests for s in t.steps if isinstance(s, MoveTo | RecordPath | FollowPath)]
     readings = sum(isinstance(s, ReadLaser | ReadBar) for t in plan.tests for s in t.steps)
@@ -121,7 +120,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
     count = 0
     blocks: list[Block] = []
     for test in plan.tests:
-        blocks.append(Say(f"test {test.label}: {test.test} in set-up {test.setup['setup_id']}"))
+        blocks.append(Comment(f"test {test.label}: {test.test} in set-up {test.setup['setup_id']}"))
         for block in _test(test, arcs):
             if isinstance(block, Dwell) and block.reading:
                 count += 1
@@ -131,7 +130,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
 
 
 def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """A test's blocks. A bar of R cannot hang in at the centre: the cup is put there, the bar is hung in beside the path's start."""
+    """Blocks of a test. A bar cannot hang in at the centre: the cup is placed there, and the bar is hung in beside the path's start."""
     here: Point | None = None
     steps = test.steps
     first = next((k for k, s in enumerate(steps) if isinstance(s, RecordPath | ReadBar)), 0)
@@ -140,7 +139,7 @@ def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
     feed = min((s.feed_mm_min for s in steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=0.0)
     for k, step in enumerate(steps):
         if isinstance(step, ZeroLaser) and k and isinstance(steps[k - 1], MountLaser):
-            continue  # one halt for both: a start of the program between them would be taken for the measurement
+            continue  # one halt for both: the listener would take a program start between them for the measurement
         if mount is not None and k == hang:
             radius = test.setup["radius_mm"]
             yield Halt(f"hang in the bar of {radius:g} mm")
@@ -173,9 +172,9 @@ def _step(test: TestPlan, step: Step, here: Point | None, arcs: tuple[str, ...])
             yield from (Go(p, feed) for a, p in pairwise(points) if p != a)
             yield Smooth(False)
         case _:
-            words = _by_hand(step)
-            if words:
-                yield Halt(words)
+            task = _by_hand(step)
+            if task:
+                yield Halt(task)
 
 
 def _by_hand(step: Step) -> str:
@@ -197,7 +196,7 @@ def _by_hand(step: Step) -> str:
 
 
 def _path(test: TestPlan, step: RecordPath, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """A circle as arcs, which are exact; anything else as the polyline that it is."""
+    """Blocks of a path: exact arcs for a circle, else the polyline."""
     plane = test.setup.get("plane")
     if test.test != "ballbar_circle" or plane not in arcs:
         yield from (Go(p, step.feed_mm_min) for a, p in pairwise(step.points_mm) if p != a)

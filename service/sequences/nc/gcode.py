@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from abbe.models.machine import AXES
-from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Halt, Program, Say, Smooth
+from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Halt, Program, Smooth
 from abbe.service.sequences.steps import Point
 
 LAST_NUMBER = 999
-"""Block numbers begin again after N9990: four digits are what old controllers take."""
+"""Block numbers restart after N9990: old controllers take four digits."""
 PLANE_CODES = {"XY": "G17", "ZX": "G18", "YZ": "G19"}
 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How one controller says it. ``start`` and ``end``: first and last lines; ``safe``: modes; ``smooth``, ``exact``: corners."""
+    """G-code of one controller. ``start`` and ``end``: first and last lines; ``safe``: modes; ``smooth``, ``exact``: corners."""
 
     title: str
     suffix: str
@@ -51,7 +51,7 @@ DIALECTS = {"siemens": SIEMENS, "fanuc": FANUC, "linuxcnc": LINUXCNC, "iso": ISO
 
 
 def gcode(made: Program, dialect: Dialect, number: int = 1) -> str:
-    """The program as text."""
+    """Return the program text."""
     writer = _Writer(dialect)
     lines = [line.format(number=number, name=plain(made.name, dialect)[:30]) for line in dialect.start]
     body = [_comment(dialect, f"{dialect.title} program written by Abbe"), *(_comment(dialect, text) for text in made.head)]
@@ -64,7 +64,7 @@ def gcode(made: Program, dialect: Dialect, number: int = 1) -> str:
 
 
 def plain(text: str, dialect: Dialect) -> str:
-    """Words as old controllers can hold them: ASCII, no brackets or quotes, Fanuc in capitals."""
+    """Text for old controllers: ASCII, no brackets or quotes, capitals for Fanuc and ISO."""
     ascii_text = text.replace("µ", "u").encode("ascii", "replace").decode()
     kept = "".join(c if c.isalnum() or c in " .,:;+-/=" else " " for c in ascii_text).replace(";", ",")
     kept = " ".join(kept.split())
@@ -76,7 +76,7 @@ def _comment(dialect: Dialect, text: str) -> str:
 
 
 class _Writer:
-    """Turns blocks into lines; remembers what is modal."""
+    """Turns blocks into lines; keeps the modal state."""
 
     def __init__(self, dialect: Dialect) -> None:
         self._d = dialect
@@ -85,7 +85,7 @@ class _Writer:
 
     def lines(self, block: Block) -> list[str]:
         match block:
-            case Say(text):
+            case Comment(text):
                 return [_comment(self._d, text)]
             case Halt(text):
                 return [line.format(text=plain(text, self._d)[:100]) for line in self._d.message]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abbe.models.machine import AXES
-from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Halt, Program, Say, Smooth
+from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Halt, Program, Smooth
 from abbe.service.sequences.nc.gcode import ISO, plain
 from abbe.service.sequences.steps import Point
 
@@ -11,11 +11,10 @@ TOLERANCE_MM = 0.001
 
 
 def heidenhain(made: Program, tool: int | None = None) -> str:
-    """The program as text; blocks are numbered from 0, as the controller does.
+    """Return the program text; blocks are numbered from 0, as on the controller.
 
-    ``tool``: row of the tool table for what is in the spindle. TOOL CALL gives the plane of the arcs its axis, and the length; which row
-    that is only the operator knows, and tool 0 would have the spindle emptied. Without it the program says where the block belongs and
-    stops there.
+    ``tool``: row of the tool table for the holder in the spindle. TOOL CALL sets the axis of the arcs' plane and the length. Only the
+    operator knows the row, and tool 0 would empty the spindle; without a row the program marks the place of the block and stops there.
     """
     name = "".join(c for c in plain(made.name, ISO) if c.isalnum())[:16] or "ABBE"
     lines = [f"BEGIN PGM {name} MM", "; Heidenhain program written by Abbe", *(f"; {plain(text, ISO)}" for text in made.head)]
@@ -40,7 +39,7 @@ def _tool_call(tool: int | None) -> list[str]:
 
 def _lines(block: Block) -> list[str]:
     match block:
-        case Say(text):
+        case Comment(text):
             return [f"; {plain(text, ISO)}"]
         case Halt(text):
             return [f"; {plain(text, ISO)}", "L M0"]

@@ -16,13 +16,12 @@ from abbe.service.sequences.nc.heidenhain import heidenhain
 from abbe.service.sequences.nc.settings import NcSettings
 from abbe.service.sequences.steps import CampaignPlan, Point
 
-# How long an NC program runs: every block of it, as a controller drives it, not the plan's way at full feed.
+# The run time counts every block as a controller drives it, not the plan's length at full feed.
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What is taken for granted of a controller: acceleration along the path, and the time of an exact stop until the axes are in
-    position."""
+    """Assumptions about a controller: acceleration along the path, and the time of an exact stop until the axes are in position."""
 
     acceleration_mm_s2: float = 500.0
     stop_s: float = 0.1
@@ -30,20 +29,20 @@ class Pace:
 
 @dataclass(frozen=True, slots=True)
 class Runtime:
-    """Seconds that the axes move (stops included) and that the program rests. What lies before the first position, and what people take
-    at a halt, is in neither."""
+    """Time in s that the axes move (stops included) and that the program dwells. Both exclude the way to the first position and the halts
+    for a person."""
 
     moving_s: float
     resting_s: float
 
     @property
     def total_s(self) -> float:
-        """Both."""
+        """Sum of both."""
         return self.moving_s + self.resting_s
 
 
 def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
-    """Time of all blocks: each straight line or arc from standstill to standstill, those run through without a stop as one."""
+    """Time of all blocks: each line or arc from standstill to standstill; a sequence without stops counts as one."""
     moving, resting, here = 0.0, 0.0, None
     smooth, run_mm, run_feed = False, 0.0, 0.0
     for block in blocks:
@@ -64,7 +63,7 @@ def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
 
 
 def one_move_s(way_mm: float, feed_mm_min: float, pace: Pace) -> float:
-    """From standstill to standstill: speed up, go at the feed if there is way enough to reach it, slow down, stop exactly."""
+    """Time in s from standstill to standstill: accelerate, run at the feed if the length allows it, brake, stop exactly."""
     if way_mm <= 0.0:
         return 0.0
     speed, rise = feed_mm_min / 60.0, pace.acceleration_mm_s2
@@ -87,7 +86,7 @@ NAMES = (*DIALECTS, "heidenhain")
 
 @dataclass(frozen=True, slots=True)
 class NcProgram:
-    """The text, how long it runs, and what the operator should know about its size."""
+    """Program text, run time, and a warning for the operator about its size."""
 
     text: str
     runtime: Runtime
@@ -96,13 +95,7 @@ class NcProgram:
 
 
 def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, settings: NcSettings | None = None) -> NcProgram:
-    """The NC program of a checked plan.
-
-    Raises
-    ------
-    ConfigError
-        There is no such dialect.
-    """
+    """Return the NC program of a checked plan. Raises ConfigError for an unknown dialect."""
     if dialect not in NAMES:
         raise ConfigError(f"there is no NC dialect {dialect!r}", f"use one of: {', '.join(sorted(NAMES))}")
     settings = settings or NcSettings()
@@ -110,7 +103,7 @@ def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, se
     made = program(name, plan, machine.stroke_mm, arcs)
     pace = Pace(settings.acceleration_mm_s2)
     took = runtime(made.blocks, pace)
-    made = replace(made, head=(*made.head, *_time_words(took, pace)))
+    made = replace(made, head=(*made.head, *_runtime_comments(took, pace)))
     text = heidenhain(made, settings.heidenhain_tool) if dialect == "heidenhain" else gcode(made, DIALECTS[dialect])
     size, blocks = len(text.encode()), text.count("\n")
     memory = settings.memory_of(dialect)
@@ -122,8 +115,8 @@ def _minutes(made: Program, took: Runtime) -> str:
     return f"about {math.ceil(took.total_s / 60.0)} min without the {made.halts} stops for a person"
 
 
-def _time_words(took: Runtime, pace: Pace) -> tuple[str, str]:
-    """Rounded up: the operator should wait less than was said, not longer."""
+def _runtime_comments(took: Runtime, pace: Pace) -> tuple[str, str]:
+    """Comments with the run time, rounded up: the operator should wait less than announced, not longer."""
     return (
         f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells; not counted are"
         " the stops for a person and the way to the first position",

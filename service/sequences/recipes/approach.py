@@ -1,4 +1,4 @@
-"""What all recipes share: the controller's grid, where a path is approached from, and how a ball-bar gets to where its path begins."""
+"""Shared by all recipes: the controller's grid, approach positions, and how a ball-bar reaches the start of its path."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo
 Array = NDArray[np.float64]
 RAPID_MM_MIN = 6000.0
 BAR_APPROACH_MM = 0.5
-"""With the bar hung in: far more than any lost motion, and the bar stays within its stroke of 1 mm either way."""
+"""Approach with the bar hung in: far more than any lost motion, and within the bar's stroke of 1 mm either way."""
 LINK_CHORD_MM = 2.0
-"""Of the way on the sphere between two paths: at a radius of 50 mm its chords run 10 um inside the sphere."""
+"""Chord of the way on the sphere between two paths: at a radius of 50 mm it runs 10 um inside the sphere."""
 SAME_PLACE_MM = 0.01
 NEAR_POLE_MM = 2.0
-"""A path that begins so near the pole is approached from the centre straight: the way up is the same."""
+"""A path that starts this near the pole is approached straight from the centre: the way up is the same."""
 LOW_SHARE = 0.4
-"""Lower below the cup's centre than this share of the bar the spindle meets whatever carries the cup (ISO 230-4's partial arc of 220
-degrees with its feed-in stays above)."""
+"""Lowest allowed depth below the cup's centre, as a share of the bar: deeper, the spindle hits the cup's support (the partial arc of 220
+degrees of ISO 230-4 with its feed-in stays above)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,22 +40,22 @@ class Cup:
 
     @property
     def pole(self) -> Array:
-        """Its pole."""
+        """Pole of the sphere, mm."""
         return np.asarray(self.centre + self.radius_mm * self.up)
 
     def lowest(self, points: Iterable[Point]) -> float:
-        """How far the lowest of the points lies above the equator, as a share of the radius; negative: below."""
+        """Height of the lowest point above the equator, as a share of the radius; negative: below."""
         return float(((np.array(list(points)) - self.centre) @ self.up).min()) / self.radius_mm
 
 
 @dataclass(frozen=True, slots=True)
 class CupTest(TestRecipe):
-    """A ball-bar test: where its cup stands and what bar hangs in it.
+    """A ball-bar test: position of its cup, and its bar.
 
     ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
     ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: the length was never measured.
-    ``change_bar``: the test before had another radius; the cup stays, the bar is taken out before the machine moves and the other one is
-    hung in where its path starts. ``link_mm``: where the test before has left the machine, if this one begins elsewhere on the same sphere.
+    ``change_bar``: the previous test had another radius; the cup stays, a person takes the bar out before the machine moves and hangs the
+    other one in at the start of its path. ``link_mm``: end of the previous test, if this one starts elsewhere on the same sphere.
     """
 
     centre_mm: tuple[Coordinate, Coordinate, Coordinate]
@@ -79,7 +79,7 @@ def as_point(v: Array) -> Point:
 
 
 def before(path: tuple[Point, ...], machine: Machine) -> Point:
-    """Where to come from: beside the path's start, against the first motion of each axis, inside the strokes."""
+    """Approach position: beside the path's start, against the first motion of each axis, inside the strokes."""
     points = np.array(path)
     steps = np.diff(points, axis=0)
     first = np.array([next((np.sign(s) for s in steps[:, a] if s), 0.0) for a in range(3)])
@@ -87,16 +87,16 @@ def before(path: tuple[Point, ...], machine: Machine) -> Point:
 
 
 def pole_of(recipe: CupTest) -> tuple[Point, Array]:
-    """The pole of a test's hemisphere, where the spindle is, and the unit vector that points to it."""
+    """Return the pole of a test's hemisphere, where the spindle is, and the unit vector from the centre to it."""
     up = np.zeros(3)
     up[recipe.axis] = float(recipe.opens)
     return as_point(np.array(recipe.centre_mm) + recipe.radius_mm * up), up
 
 
 def over_pole(cup: Cup, target_mm: Point, feed_mm_min: float) -> list[Step]:
-    """Steps from the centre, or from anywhere on the axis above it, to a point of the sphere: up to the pole, down along the sphere.
+    """Steps from the centre, or from the axis above it, to a point of the sphere: up to the pole, down along the sphere.
 
-    A straight way from the centre to a point below the equator would lead through the cup.
+    A straight move from the centre to a point below the equator would pass through the cup.
     """
     pole = as_point(cup.pole)
     if math.dist(pole, target_mm) < NEAR_POLE_MM:
@@ -105,7 +105,7 @@ def over_pole(cup: Cup, target_mm: Point, feed_mm_min: float) -> list[Step]:
 
 
 def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -> list[Step]:
-    """The way on a sphere from one of its points to another; none where they are the same."""
+    """Steps along a sphere from one of its points to another; none if they coincide."""
     if math.dist(start_mm, end_mm) <= SAME_PLACE_MM:
         return []
     way = way_on_sphere(cup.centre, np.array(start_mm), np.array(end_mm), cup.up, LINK_CHORD_MM)
@@ -113,18 +113,17 @@ def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -
 
 
 def cup_of(setup: dict[str, Any]) -> Cup:
-    """The sphere of a ball-bar test by its set-up (run-format.md 3)."""
+    """Sphere of a ball-bar test from its set-up (run-format.md 3)."""
     up = np.zeros(3)
     up[AXES.index(setup["axis"])] = float(setup["opens"])
     return Cup(np.array(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"]), up)
 
 
 def to_path(recipe: CupTest, path: tuple[Point, ...], machine: Machine) -> list[Step]:
-    """Steps up to the first point of a ball-bar path: mount, change the bar or come along the sphere, and approach.
+    """Steps to the first point of a ball-bar path: mount, change the bar or move along the sphere, and approach.
 
-    Nothing goes straight past the cup: from the centre, and with another bar, the machine goes by way of the pole and along the sphere.
-    ``link_mm``: where the test before has left the machine, on this sphere or (``change_bar``) on that of the bar before; a straight way
-    from there would lead through the sphere.
+    No move passes the cup straight: from the centre, and after a change of the bar, the machine moves over the pole and along the sphere.
+    ``link_mm`` lies on this sphere or (``change_bar``) on that of the previous bar; a straight move from there would cut the sphere.
     """
     up = pole_of(recipe)[1]
     centre, feed = np.array(recipe.centre_mm), recipe.feed_mm_min

@@ -1,4 +1,4 @@
-"""Ball-bar recipes: helices in one go or point by point, and circles in the planes of two axes."""
+"""Ball-bar recipes: continuous or point-by-point helices, and circles in the planes of two axes."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from abbe.service.sequences.steps import MAX_PATH_POINTS, FollowPath, MoveTo, Po
 MIN_TURNS = 3.0
 """Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition 28 at 3 turns, 58 at 2, 1900 at 1; math.md 4.5)."""
 PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
-"""ISO 230-4's partial arc, and what comes before and after it."""
+"""Partial arc of ISO 230-4, and its feed-in and feed-out."""
 Turns = Annotated[float, Limits(ge=3.0, le=50.0)]
 Lead = Annotated[float, Limits(ge=0.0, le=90.0)]
 Arc = Annotated[float, Limits(ge=0.0, le=360.0)]
 Path = tuple[tuple[Point, ...], tuple[int, int] | None]
-"""Points of a path, and the first and last that count; None: all."""
+"""Points of a path, and the numbers of the first and last measured point; None: all."""
 
 
 def joined(arcs: tuple[Array, Array, Array]) -> Path:
-    """Feed-in, measured part and feed-out (each begins where the one before ends) as one path."""
+    """Join feed-in, measured part and feed-out, whose ends coincide, into one path."""
     lead, middle, tail = arcs
     points = np.concatenate([lead[:-1], middle, tail[1:]])
     first = max(len(lead) - 1, 0)
@@ -48,12 +48,12 @@ def reversed_path(path: Path) -> Path:
 class Helix(CupTest):
     """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back.
 
-    ``chord_mm`` is the wanted mean distance of the path's points; a long path gets longer chords, so that the controller can hold it. The
+    ``chord_mm`` is the wanted mean spacing of the path's points; a long path gets longer chords to fit into the controller's memory. The
     polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
-    23 um. Columns and solvers take the commanded position on the polyline, not on the sphere: that costs accuracy only
-    where a sample's place on the path is uncertain by a part of a chord. ``even``: points almost equally far apart along the same curve.
-    ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles that touch the path's ends, driven before and after it in one go with
-    it, so that what is recorded in between is at constant feed; ``feed_in_deg`` comes first in either direction.
+    23 um. Columns and solvers use the commanded position on the polyline, not on the sphere: that costs accuracy only where the position
+    of a sample on the path is uncertain by a part of a chord. ``even``: almost equal spacing along the same curve.
+    ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles tangent to the path's ends, driven continuously with it, so that the
+    recorded part is at constant feed; ``feed_in_deg`` comes first in either direction.
     """
 
     _: KW_ONLY
@@ -88,7 +88,7 @@ class Helix(CupTest):
         Raises
         ------
         ConfigError
-            Fewer than three turns: their solution would be no measurement.
+            Fewer than three turns: the solution would be ill-conditioned.
         """
         _check_turns(self.label, self.turns)
         path, measured = self.path()
@@ -96,7 +96,7 @@ class Helix(CupTest):
         steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction, measured))
         if self.unmount:
             steps.append(Unmount())
-        # what it takes to drive the same path again
+        # everything needed to drive the same path again
         again = {"law": self.law, "even": self.even, "chord_mm": self.chord_mm, "rate_hz": self.rate_hz}
         if measured is not None:
             again |= {"feed_in_deg": self.feed_in_deg, "feed_out_deg": self.feed_out_deg}
@@ -105,11 +105,11 @@ class Helix(CupTest):
 
 @dataclass(frozen=True, slots=True)
 class HelixPoints(CupTest):
-    """The same helix point by point: ``points`` places from pole to equator (direction -1: back), each read at standstill.
+    """The same helix point by point: ``points`` positions from pole to equator (direction -1: back), each read at standstill.
 
-    Between two places the machine goes along the sphere, so that the bar stays within its stroke, stops half a millimetre before the next
-    one against the motion of each axis from place to place, and goes there straight: every axis arrives in the direction in which
-    the places follow each other. There the mean of ``samples`` readings is taken after ``settle_s``.
+    Between two positions the machine moves along the sphere, so that the bar stays within its stroke, stops half a millimetre before the
+    next one against the motion of each axis, and moves there straight: every axis arrives in its direction of travel between positions.
+    There it takes the mean of ``samples`` readings after ``settle_s``.
     """
 
     _: KW_ONLY
@@ -122,20 +122,14 @@ class HelixPoints(CupTest):
     kind: Literal["helix_points"] = "helix_points"
 
     def path(self) -> Path:
-        """The places in the order of reading."""
+        """Positions in the order of reading."""
         curve = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=self.points, law=self.law, axis=self.axis)
         if self.opens < 0:
             curve[:, self.axis] = 2.0 * self.centre_mm[self.axis] - curve[:, self.axis]
         return tuple(as_point(p) for p in curve[:: self.direction]), None
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: to the centre, mount, out to the first place; read, go on along the sphere, read; clear away.
-
-        Raises
-        ------
-        ConfigError
-            Fewer than three turns.
-        """
+        """Steps: to the centre, mount, out to the first position; read, move along the sphere, read; clear away. Raises as `Helix`."""
         _check_turns(self.label, self.turns)
         path, _ = self.path()
         up = pole_of(self)[1]
@@ -158,11 +152,11 @@ class Circle(CupTest):
     """Circular test (ISO 230-4) in the plane of two axes: ``span_deg`` from ``start_deg``, angles from the plane's first axis to its
     second.
 
-    ``direction`` 1: the way the angles count; -1: the same arc back. ``feed_in_deg`` and ``feed_out_deg`` prolong the arc along the same
-    circle and do not count (ISO 230-4: 180 degrees for a full circle). Where nothing is said, the plane across ``axis`` has a full circle
-    from 0 degrees, and the two planes that hold it the partial arc of 220 degrees about the pole with 2 degrees before and after it: what
-    carries the cup stands below. ``under_the_cup``: points lower than that are wanted; the user has made sure that there is room.
-    The machine takes the way over the pole between two arcs about one cup.
+    ``direction`` 1: increasing angles; -1: the same arc back. ``feed_in_deg`` and ``feed_out_deg`` extend the arc along the same circle
+    outside the measured part (ISO 230-4: 180 degrees for a full circle). By default the plane normal to ``axis`` has a full circle from
+    0 degrees, and the two planes that contain ``axis`` have the partial arc of 220 degrees about the pole with 2 degrees before and after
+    it: the cup's support is below. ``under_the_cup``: lower points are wanted, and the user has checked that there is room.
+    The machine moves over the pole between two arcs about one cup.
     """
 
     plane: Plane
@@ -177,7 +171,7 @@ class Circle(CupTest):
     chord_mm: float = inner(0.5)
 
     def arc(self) -> dict[str, float]:
-        """Where the arc begins, how long it is, feed-in and feed-out, degrees; fields without a value are chosen."""
+        """Start, span, feed-in and feed-out of the arc, degrees, with defaults for fields without a value."""
         upright = AXES[self.axis] in self.plane
         span = self.span_deg if self.span_deg is not None else PARTIAL_DEG if upright else 360.0
         pole = (0.0 if self.plane[0] == AXES[self.axis] else 90.0) + (0.0 if self.opens > 0 else 180.0)
@@ -224,7 +218,7 @@ BarRecipe = Helix | HelixPoints | Circle
 
 
 def _setup(recipe: BarRecipe, machine: Machine, **own: Any) -> dict[str, Any]:
-    """What run-format.md 3 wants of every ball-bar set-up, and where the spindle was."""
+    """Set-up document of a ball-bar test (run-format.md 3), with the side of the spindle."""
     return {
         "setup_id": recipe.setup_id,
         "centre_mm": list(recipe.centre_mm),

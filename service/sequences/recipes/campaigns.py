@@ -1,8 +1,8 @@
-"""Shipped campaigns, laid out in any machine's strokes.
+"""Built-in campaigns, scaled to any machine's strokes.
 
-The identification campaign is what the joint solution needs to see every error that nine tables can correct: helices about five centres,
+The identification campaign lets the joint solution determine every error that nine tables can correct: helices about five centres,
 each axis on two opposite edges, step diagonals in two step orders (math.md 5.5: rank 67 of 67 for translations and one-tool angles).
-The verification uses positions that were not used to identify.
+The verification uses positions that the identification does not use.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from abbe.service.sequences.steps import CampaignPlan, Point
 
 
 def hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) -> tuple[Point, float]:
-    """Centre at relative place ``rel`` and the largest radius (whole mm, times ``share``) whose upper hemisphere stays inside."""
+    """Return the centre at relative position ``rel`` and ``share`` times the largest radius (whole mm) whose upper hemisphere fits."""
     centre = machine.stroke_mm[:, 0] + np.array(rel) * machine.length_mm
     below = centre - machine.stroke_mm[:, 0]
     above = machine.stroke_mm[:, 1] - centre
@@ -40,7 +40,7 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
 
 
 def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", role: str = "holdout") -> CampaignPlan:
-    """One helix (another centre and radius than any used to identify) and the four plain body diagonals."""
+    """One helix (with a centre and radius that the identification does not use) and the four plain body diagonals."""
     recipes: list[Recipe] = [verification_helix(machine, rate_hz=rate_hz, role=role)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", role, d, 20, "") for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
@@ -53,7 +53,7 @@ def verification_helix(machine: Machine, *, rate_hz: int = 100, role: str = "hol
 
 
 def quick_check(machine: Machine, *, rate_hz: int = 100, name: str = "quick-check") -> CampaignPlan:
-    """The unattended check: the same figures as the verification with half the positions, a few minutes of machine time."""
+    """The unattended check: the tests of the verification with half the positions, a few minutes of machine time."""
     centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
     recipes: list[Recipe] = [Helix("check-helix", "VB", "holdout", centre, radius, turns=3, rate_hz=rate_hz)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 10, "") for d in DIAGONALS]

@@ -1,4 +1,4 @@
-"""The campaign of the demonstration of a discovery: what tells most of the suspects apart in one session (effects.md 4)."""
+"""The campaign of the discovery demonstration: it separates most candidate effects in one session (effects.md 4)."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ STEPS, LINE_N = 12, 13
 JUDGED = "pnp"
 BACK = "check-back"
 CHORD_MM = 0.5
-"""A sample is placed on its path to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. By the area law the usual chords are 1 mm long
-at the equator and 3 mm at the pole, and run 0.9 and 10 um inside the sphere: readings put beside their place scatter there, and a clean
-machine seems to be disturbed. Even chords of 0.4 mm are 0.24 um inside at most."""
+"""The position of a sample on its path is known to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. By the area law the usual
+chords are 1 mm long at the equator and 3 mm at the pole, and run 0.9 and 10 um inside the sphere: misplaced readings scatter there, and a
+clean machine seems disturbed. Even chords of 0.4 mm run at most 0.24 um inside."""
 ROUND: tuple[Literal[1, -1], ...] = (1, -1)
 
 
 def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "discover") -> CampaignPlan:
-    """Helices at two feeds both ways about one origin, both ways about another, step diagonals; the axes and the first origin again, late.
+    """Helices at two feeds both ways about one origin, both ways about another, step diagonals; late repeats of the axes and first origin.
 
     About 20 minutes of machine time for a 600 x 500 x 450 mm machine. A late helix of another feed and the second step order of a diagonal
-    have the role holdout: they share a mounting with fitted runs, so that nothing but the model can be wrong about them.
+    have the role holdout: they share a mounting with fitted runs, so that only the model can cause their deviation.
     """
     first = _helix(machine, "A", (0.5, 0.5, 0.3), 0.6, rate_hz)
     second = _helix(machine, "B", (0.34, 0.38, 0.2), 0.65, rate_hz)
@@ -45,9 +45,9 @@ def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "dis
 
 
 def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew") -> CampaignPlan:
-    """The verification, its helix run back as well, slowly and with the bar left in: what changes while a bar hangs shows between the two.
+    """The verification, with its helix also run back slowly with the bar left in: the difference shows what changes while a bar hangs.
 
-    One helix alone takes a bar that is warm all the time for a longer one.
+    One helix alone cannot tell a constantly warm bar from a longer one.
     """
     plan = verification(machine, rate_hz=rate_hz, name=name)
     check = replace(verification_helix(machine, rate_hz=rate_hz), chord_mm=CHORD_MM, even=True)
@@ -57,7 +57,7 @@ def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew")
 
 
 def _lines(machine: Machine, when: str) -> list[Recipe]:
-    """Every axis alone: what grows with the session shows in its length, whatever the squareness does."""
+    """One line per axis: its length shows growth during the session, independent of squareness."""
     return [
         Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, at_share=(0.5, 0.5), positions=LINE_N)
         for a in range(len(machine.stroke_mm))
@@ -70,7 +70,7 @@ def _helix(machine: Machine, setup: str, rel: tuple[float, float, float], share:
 
 
 def _series(like: Helix, name: str, ways: list[tuple[float, Literal[1, -1], str]]) -> list[Recipe]:
-    """Helices one after another with the bar mounted once."""
+    """Consecutive helices with one mounting of the bar."""
     last = len(ways) - 1
     return [
         replace(like, label=_label(name, feed, way), role=role, feed_mm_min=feed, direction=way, mount=k == 0, unmount=k == last)

@@ -1,7 +1,7 @@
-"""What every test of a recipe has in common: fields with the limits that a file has to keep, and how the file names them.
+"""Common fields of all recipe tests, with their limits and keys in a recipe file.
 
-A recipe is the same object whether a program makes it or a file holds it (`abbe.service.sequences.recipes.recipe_file`). The limits in the
-annotations are those of a file; programs may go beyond, as tests do.
+Programs and files (`abbe.service.sequences.recipes.recipe_file`) make the same recipe objects. The limits in the annotations apply to
+files; programs may exceed them, as tests do.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pydantic import Field as Limits
 from abbe.models.machine import AXES
 
 
-def one_of(*words: str) -> AfterValidator:
-    """Only these words."""
+def one_of(*choices: str) -> AfterValidator:
+    """Validator that accepts only these values."""
 
-    def check(word: str) -> str:
-        if word not in words:
-            raise ValueError(f"expected {', '.join(map(repr, words[:-1]))} or {words[-1]!r}, got {word!r}")
-        return word
+    def check(value: str) -> str:
+        if value not in choices:
+            raise ValueError(f"expected {', '.join(map(repr, choices[:-1]))} or {choices[-1]!r}, got {value!r}")
+        return value
 
     return AfterValidator(check)
 
@@ -51,16 +51,16 @@ IN_FILE = "in_file"
 
 
 def inner(default: Any) -> Any:
-    """A field that no file sets: it follows from the tests around it, or belongs to a built-in campaign."""
+    """A field that no file sets: it follows from neighbouring tests, or belongs to a built-in campaign."""
     return field(default=default, metadata={IN_FILE: False})
 
 
 @dataclass(frozen=True, slots=True)
 class TestRecipe:
-    """A test: what it is called, its set-up, and whether it identifies or is held out.
+    """A test: its label, its set-up, and its role (identify or holdout).
 
-    ``mount`` and ``unmount`` are false where two tests in a row share one set-up: the second does not mount, the first leaves the bar or
-    the mirror.
+    ``mount`` and ``unmount`` are false where consecutive tests share a set-up: the second does not mount, the first leaves the bar or the
+    mirror.
     """
 
     __test__ = False  # not a pytest class
@@ -75,12 +75,12 @@ class TestRecipe:
 
 
 def file_fields(kind: type[TestRecipe]) -> dict[str, Field[Any]]:
-    """Fields of a recipe that a file sets, by their keys."""
+    """Fields of a recipe that a file sets, by key."""
     return {"setup" if f.name == "setup_id" else f.name: f for f in fields(kind) if f.metadata.get(IN_FILE, True)}
 
 
 def file_table(recipe: TestRecipe) -> dict[str, Any]:
-    """A recipe as it stands in a file: empty values are left out where that means the same."""
+    """A recipe as a table of a file; omits empty values that equal the default."""
     found = {key: (getattr(recipe, f.name), f.default) for key, f in file_fields(type(recipe)).items()}
     kind = {"kind": found.pop("kind")[0]}
     shown = {key: value for key, (value, default) in found.items() if value or value != default}

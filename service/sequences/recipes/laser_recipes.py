@@ -27,8 +27,8 @@ Steps = Annotated[int, Limits(ge=1, le=500)]
 class BeamTest(TestRecipe):
     """A laser test along one line, out and back.
 
-    ``cycles``: so many times, in one run (ISO 230-2: five). ``overrun_mm``: the machine turns so far beyond both ends, so that every
-    position is approached in the direction of its leg; the turning points are read as well.
+    ``cycles``: repetitions in one run (ISO 230-2: five). ``overrun_mm``: distance of the turning points beyond both ends, so that the
+    machine approaches every position in the direction of its leg; the turning points are read, too.
     """
 
     _: KW_ONLY
@@ -56,7 +56,7 @@ class Diagonal(BeamTest):
         Raises
         ------
         ConfigError
-            A step diagonal with an overrun: its turning points have no side to be approached from.
+            A step diagonal with an overrun: its turning points have no approach direction.
         """
         if self.order and self.overrun_mm:
             raise ConfigError(f"test {self.label}: a step diagonal has no overrun", "leave overrun_mm out, or the order")
@@ -74,12 +74,10 @@ class Diagonal(BeamTest):
 
 @dataclass(frozen=True, slots=True)
 class FaceDiagonal(BeamTest):
-    """Diagonal of a plane of two axes by laser (ISO 230-6 has six of them: two in each plane), the third axis standing.
+    """Diagonal of a plane of two axes by laser (ISO 230-6 has two in each of three planes), with the third axis at rest.
 
-    ``at_share``: where that one stands in its stroke.
-
-    ``diagonal``: ``pp`` both axes of the plane grow, ``np`` the first falls. As a run it is a ``laser_diagonal`` that does not move the
-    third axis: its letter in ``diagonal`` is p, and ``face`` names the plane.
+    ``at_share``: relative position of the third axis in its stroke. ``diagonal``: ``pp`` both axes of the plane increase, ``np`` the first
+    decreases. The run is stored as a ``laser_diagonal``: the letter of the third axis in ``diagonal`` is p, and ``face`` names the plane.
     """
 
     plane: Flat
@@ -101,12 +99,10 @@ class FaceDiagonal(BeamTest):
 
 @dataclass(frozen=True, slots=True)
 class Linear(BeamTest):
-    """Single-axis positioning by laser (ISO 230-2 line), so many ``positions`` out and back.
+    """Single-axis positioning by laser (ISO 230-2), with this number of ``positions`` out and back.
 
-    ``at_share``: relative places in the strokes of the two other axes, in the order X, Y, Z.
-
-    ``offset_share``: each position is moved by a pseudo-random part of the interval, at most by this share of it, so that errors with a
-    period do not hide (ISO 230-2); ``seed`` says which.
+    ``at_share``: relative positions in the strokes of the two other axes, in the order X, Y, Z. ``offset_share``: largest pseudo-random
+    shift of a position, as a share of the interval, to reveal periodic errors (ISO 230-2); ``seed``: of the shifts.
     """
 
     axis: AxisIndex

@@ -1,7 +1,7 @@
-"""Recipes: a few numbers that say which test; `plan` turns each into steps.
+"""Recipes: the parameters of a test; `plan` turns them into steps.
 
-Every sequence approaches its first position in the direction of its first motion, each axis for itself, so that lost motion is in a known
-state at the start; an axis that begins at the very end of its stroke cannot. A test that mounts something clears it away at the end.
+Every axis approaches the first position in the direction of its first motion, so that its lost motion is in a known state at the start; an
+axis that begins at the very end of its stroke cannot. A test that mounts something clears it away at the end.
 """
 
 from __future__ import annotations

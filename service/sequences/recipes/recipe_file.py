@@ -1,7 +1,7 @@
 """Campaign recipes as TOML files: written by the planner or by hand, read by `abbe measure --recipe FILE.toml`.
 
-Tests in a row with the same ``setup`` share what was mounted: the first of them mounts, the last clears away, a helix of another radius has
-the bar changed at the standing cup.
+Consecutive tests with the same ``setup`` share it: the first mounts, the last clears away, and a helix of another radius changes the bar at
+the same cup.
 """
 
 from __future__ import annotations
@@ -54,19 +54,13 @@ def read_recipe(path: Path) -> tuple[str, tuple[Recipe, ...]]:
     Raises
     ------
     ConfigError
-        File, key, what was expected; or which test cannot share its set-up with the one before.
+        A key is missing, unknown or wrong, or two tests cannot share a set-up.
     """
     return parse_recipe(recipe_source(path), str(path))
 
 
 def recipe_source(path: Path) -> str:
-    """The text of a campaign recipe file.
-
-    Raises
-    ------
-    ConfigError
-        It is not there or cannot be read.
-    """
+    """Read the text of a campaign recipe file. Raises ConfigError if that fails."""
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -78,14 +72,14 @@ def recipe_source(path: Path) -> str:
 
 
 def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
-    """The same from the file's text; ``source`` names it in errors."""
+    """As `read_recipe`, from the text; ``source`` names it in errors."""
     try:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise ConfigError(f"{source}: not valid TOML: {' '.join(str(error).split())[:200]}", "correct this line") from None
     _check_keys(content, source)
     try:
-        # By way of JSON: there strict means that text is no number, while a list still is a tuple.
+        # Through JSON: strict mode then refuses text for a number, but takes a list for a tuple.
         found = RecipeFile.model_validate_json(json.dumps(content, default=str), strict=True)
     except ValidationError as error:
         raise _config_error(source, error.errors()) from None
@@ -93,7 +87,7 @@ def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
 
 
 def _check_keys(content: dict[str, Any], source: str) -> None:
-    """Refuse a key that no test of its kind has: the recipes have fields which are none of a file's. A test without a role identifies."""
+    """Refuse keys that tests of the kind do not have in a file, and set the default role."""
     tests = content.get("test")
     for k, table in enumerate(tests if isinstance(tests, list) else []):
         kind = KINDS.get(str(table.get("kind"))) if isinstance(table, dict) else None
@@ -119,12 +113,12 @@ def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
 
 
 def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
-    """A campaign recipe as TOML text; `parse_recipe` gives the same recipes back.
+    """Return a campaign recipe as TOML text; `parse_recipe` restores the same recipes.
 
     Raises
     ------
     ConfigError
-        A recipe says something that a file cannot hold (a label with a slash, say).
+        A value is not valid in a file (a label with a slash, for instance).
     """
     lines = [f"format = {_toml(FORMAT)}", f"name = {_toml(name)}"]
     if note:
@@ -137,5 +131,5 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
 
 
 def _toml(value: Any) -> str:
-    """A TOML value: JSON's way of writing text, numbers and lists of numbers is TOML's as well, but for the ASCII DEL."""
+    """Format a TOML value: for text, numbers and their lists JSON is TOML, except the ASCII DEL."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,4 +1,4 @@
-"""Which tests of a campaign share what is mounted: where a person mounts, changes the bar, and clears away."""
+"""Which tests of a campaign share a set-up: where a person mounts, changes the bar, and clears away."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from abbe.service.sequences.recipes.recipe import BarRecipe, Diagonal, FaceDiago
 
 
 def shared_setups(recipes: tuple[Recipe, ...], source: str) -> tuple[Recipe, ...]:
-    """The same recipes, mounting only where a set-up begins and clearing away only where it ends.
+    """Return the same recipes, mounting only where a set-up begins and clearing away only where it ends.
 
-    Tests in a row with the same ``setup_id`` share a set-up; ``source`` names the file in errors.
+    Consecutive tests with the same ``setup_id`` share a set-up; ``source`` names the file in errors.
 
     Raises
     ------
     ConfigError
-        Labels twice, a set-up taken down and used again, or two tests that cannot share what is mounted.
+        Two tests have one label, a set-up is used again after its end, or two tests cannot share their set-up.
     """
     labels = [r.label for r in recipes]
     twice = sorted({label for label in labels if labels.count(label) > 1})

@@ -89,7 +89,7 @@ def test_two_accounts_are_kept_apart_by_a_folder_for_their_group(folder: Path) -
         assert said.startswith(f"MachineInUse the machine at {URL} is in use by process {os.getpid()} ")
         _over(mine)
     stranger, said = _holder(NOBODY)
-    assert said.startswith(f"UnsafeToMove nobody can say whether the machine at {URL} is in use: {folder}/")
+    assert said.startswith(f"UnsafeToMove it is unknown whether the machine at {URL} is in use: {folder}/")
     assert "(Permission denied) " in said
     assert f"{folder} is for a group: become a member of it" in said
     _over(stranger)

@@ -6,7 +6,7 @@ import pytest
 from abbe.drivers.api import Condition, LaserReading
 from abbe.models.machine import Machine
 from abbe.service.campaigns import listen
-from abbe.service.campaigns.listen import Heard, row_times, wanted
+from abbe.service.campaigns.listen import Heard, planned_readings, row_times
 from abbe.service.runs.laser_columns import MM_PER_COUNT, laser_columns
 from abbe.service.runs.observations import run_data
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
@@ -36,7 +36,7 @@ class Recorder:
 def world(recipe, lost):
     """The plan of a test, and the laser and the controller beside a program that does not rest at the readings ``lost``."""
     plan = recipe.plan(MACHINE)
-    places, way, now, rest = wanted(plan), [(0.0, 0.0)], 1.0, 0.3 + LASER_DWELL_S
+    places, way, now, rest = planned_readings(plan), [(0.0, 0.0)], 1.0, 0.3 + LASER_DWELL_S
     for k, one in enumerate(places):
         now += abs(one.along_mm - way[-1][1]) / 100.0
         way.append((now, one.along_mm))
@@ -99,7 +99,7 @@ async def listened(recipe, lost, monkeypatch):
 async def test_a_missing_reading_is_an_invalid_row_in_its_place(kind, monkeypatch):
     lost = {2, 9}
     plan, columns, end, said = await listened(KINDS[kind], lost, monkeypatch)
-    places = wanted(plan)
+    places = planned_readings(plan)
     assert [k for k, valid in enumerate(columns["valid"]) if not valid] == sorted(lost)
     for k, one in enumerate(places):
         assert [columns[f"{a}_mm"][k] for a in "xyz"] == list(one.target_mm)
@@ -127,7 +127,7 @@ async def test_the_solvers_see_the_same_travel_as_if_nothing_had_been_lost(monke
 async def test_where_the_first_reading_is_missing_the_others_count_from_the_first_that_is_there(monkeypatch):
     records = []
     plan = KINDS["line"].plan(MACHINE)
-    for k, one in enumerate(wanted(plan)):
+    for k, one in enumerate(planned_readings(plan)):
         told = (
             {"displacement_tenth_nm": round((one.along_mm + 5e-3) / MM_PER_COUNT)} if k else {"displacement_tenth_nm": 0, "missing": True}
         )

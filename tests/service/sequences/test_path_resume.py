@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from abbe.drivers.api import BarSample, Condition, ControllerStatus
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import RunPiece, SoFar, arc_of
-from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, PathRemainder, SameStretch, Way, rest_of_path
+from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, PathProgress, PathRemainder, StretchComparison, rest_of_path
 from abbe.service.sequences.recipes.recipe import Circle
 from abbe.service.sequences.resume_plan import rest_of, way_back
 from abbe.service.sequences.steps import MountBar, RecordPath
@@ -36,13 +36,13 @@ def path(measured: tuple[int, int] | None = None) -> RecordPath:
     return RecordPath(POINTS, FEED, 200, 1, measured)
 
 
-def seen(until_s: float, *, stops_s: float = np.inf, share: float = 1.0, lag_mm: float = 0.0) -> Way:
+def seen(until_s: float, *, stops_s: float = np.inf, share: float = 1.0, lag_mm: float = 0.0) -> PathProgress:
     """Statuses every 20 ms of a machine that follows ``lag_mm`` behind, at a share of the feed, and stands from an instant on."""
-    way = Way(path())
+    way = PathProgress(path())
     for t in np.arange(0.02, until_s, 0.02):
         gone = max(share * FEED_MM_S * min(t, stops_s) - lag_mm, 0.0)
         at = [float(np.interp(gone, ARC, np.array(POINTS)[:, a])) for a in range(3)]
-        way.see(status_at((at[0], at[1], at[2]), start_us=7_000_000, now_us=7_000_000 + round(t * 1e6)))
+        way.add(status_at((at[0], at[1], at[2]), start_us=7_000_000, now_us=7_000_000 + round(t * 1e6)))
     way.boot_id = 5
     return way
 
@@ -111,13 +111,13 @@ def test_too_little_begins_again():
 
 def read(
     remainder: PathRemainder, off_mm: float, *, status: int = 0b1000, noise_mm: float = 3e-4, seed: int = 1, lost: bool = False
-) -> SameStretch:
-    compare, rng = SameStretch(remainder, 200), np.random.default_rng(seed)
-    compare.see(BarSample(2**31 if lost else 99, 500, 0, 0))
+) -> StretchComparison:
+    compare, rng = StretchComparison(remainder, 200), np.random.default_rng(seed)
+    compare.add(BarSample(2**31 if lost else 99, 500, 0, 0))
     for k in range(ceil(remainder.arc_mm[-1] / FEED_MM_S * 200.0) + 3):
         at = remainder.offset_mm + (k + 0.5) / 200.0 * FEED_MM_S
         reading_mm = np.sin(at / 20.0) * 0.01 + off_mm + noise_mm * rng.standard_normal()
-        compare.see(BarSample(100 + k, 1000 + 5000 * k, round(reading_mm * 1e6), status))
+        compare.add(BarSample(100 + k, 1000 + 5000 * k, round(reading_mm * 1e6), status))
     return compare
 
 
@@ -140,17 +140,17 @@ def test_a_steep_stretch_is_no_knock():
     at = np.arange(0.0, 60.0, 0.1)
     remainder = PathRemainder((RunPiece(1, 100.0),), 0.0, 500.0, 100.0, at, slope * at, 5)
     for shift in (-0.5, 0.0, 0.5):
-        compare = SameStretch(remainder, 50)
-        compare.see(BarSample(0, 0, 0, 0))
+        compare = StretchComparison(remainder, 50)
+        compare.add(BarSample(0, 0, 0, 0))
         for k in range(40):
-            compare.see(BarSample(1 + k, 20000 * (1 + k), round(slope * (k + 0.5 + shift) * 2.0 * 1e6), 0b1000))
+            compare.add(BarSample(1 + k, 20000 * (1 + k), round(slope * (k + 0.5 + shift) * 2.0 * 1e6), 0b1000))
         assert compare.off_mm == pytest.approx(slope * 2.0 * shift, abs=1e-6)
 
 
 def test_a_stretch_that_was_never_reached_is_no_proof_and_another_box_neither():
     found = rest_of_path(path(), so_far(300.0))
     assert found is not None
-    compare = SameStretch(found[2], 200)
+    compare = StretchComparison(found[2], 200)
     with pytest.raises(StretchDiffers, match="too few readings"):
         compare.judge()
     compare.from_box(5)
