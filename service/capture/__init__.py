@@ -1,1 +1,1 @@
-"""What a device sent is on the disk before anything else is done with it (docs/decisions/0013-segments-before-the-database.md)."""
+"""Writes device data to disk before any other use of it (docs/decisions/0013-segments-before-the-database.md)."""

@@ -1,4 +1,4 @@
-"""The few things that the segment log does to a file system, as a port, so that tests can let each of them fail or be cut off."""
+"""File operations of the segment log, as a port, so that tests can make each of them fail or stop."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _PIECE = 1 << 20
 
 
 class FileIO(Protocol):
-    """Files as the log needs them. Everything raises OSError."""
+    """File operations of the log. All raise OSError."""
 
     def create(self, path: Path) -> int:
-        """Make a new file, refuse an existing one; returns a handle, and holds a lock on the file until it is closed."""
+        """Create a file, refusing an existing one; return a handle, and lock the file until it is closed."""
         ...
 
     def append(self, handle: int, data: bytes) -> None:
@@ -22,7 +22,7 @@ class FileIO(Protocol):
         ...
 
     def sync(self, handle: int) -> None:
-        """Return only when everything written is on the disk."""
+        """Return when everything written is on the disk."""
         ...
 
     def truncate(self, handle: int, size: int) -> None:
@@ -30,19 +30,19 @@ class FileIO(Protocol):
         ...
 
     def close(self, handle: int) -> None:
-        """Give the handle back."""
+        """Close the handle."""
         ...
 
     def sync_folder(self, folder: Path) -> None:
-        """Return only when the folder's entries are on the disk."""
+        """Return when the folder's entries are on the disk."""
         ...
 
     def hold_space(self, path: Path, size: int) -> None:
-        """Make a file that really occupies this many bytes."""
+        """Create a file that occupies this many bytes of the disk."""
         ...
 
     def remove(self, path: Path) -> None:
-        """Delete a file; one that is not there is fine."""
+        """Delete a file if it exists."""
         ...
 
 
@@ -50,7 +50,7 @@ class RealFileIO:
     """The file system of this computer."""
 
     def create(self, path: Path) -> int:
-        """Make a new file, refuse an existing one; returns a descriptor, whose lock tells other processes that it is being written."""
+        """Create a file, refusing an existing one; return a descriptor, whose lock shows other processes a running recording."""
         descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -66,7 +66,7 @@ class RealFileIO:
             rest = rest[os.write(handle, rest) :]
 
     def sync(self, handle: int) -> None:
-        """Return only when everything written is on the disk."""
+        """Return when everything written is on the disk."""
         os.fdatasync(handle)
 
     def truncate(self, handle: int, size: int) -> None:
@@ -78,7 +78,7 @@ class RealFileIO:
         os.close(handle)
 
     def sync_folder(self, folder: Path) -> None:
-        """Return only when the folder's entries are on the disk."""
+        """Return when the folder's entries are on the disk."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(descriptor)
@@ -86,13 +86,13 @@ class RealFileIO:
             os.close(descriptor)
 
     def hold_space(self, path: Path, size: int) -> None:
-        """Make a file that really occupies this many bytes."""
+        """Create a file that occupies this many bytes of the disk."""
         if path.exists() and path.stat().st_size == size:
             return
         part = path.with_suffix(f".{os.getpid()}")
         try:
             with part.open("wb") as file:
-                for at in range(0, size, _PIECE):  # written, not only sized: a sparse file would hold nothing back
+                for at in range(0, size, _PIECE):  # written, not only sized: a sparse file reserves nothing
                     file.write(bytes(min(_PIECE, size - at)))
                 file.flush()
                 os.fsync(file.fileno())
@@ -101,5 +101,5 @@ class RealFileIO:
             part.unlink(missing_ok=True)
 
     def remove(self, path: Path) -> None:
-        """Delete a file; one that is not there is fine."""
+        """Delete a file if it exists."""
         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""From a segment into the database, in a thread of its own: a locked or missing database delays it and nothing else."""
+"""Moves records from a segment to the database in a thread of its own: a locked or missing database delays nothing else."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from abbe.service.storage.store import Store
 
 RETRY_S = 0.1
 END_S = 10.0
-"""So long is waited for a write that the database has begun and does not end."""
+"""Longest wait at the end for a pending write of the database."""
 BATCH = 200
 TOGETHER_S = 0.25
-"""So long a batch waits for company. It is safe in the segment; a transaction for each of them (100 a second) cost more
-than all the rest of the capture."""
+"""Longest wait of a record for a joint transaction. The segment keeps it safe; one transaction per record (100 per second) would cost more
+than the rest of the capture."""
 TOGETHER_BYTES = 1 << 16
-"""More than this never waits: on a disk that runs full the database must still get what the segment has, and the reserve is not large."""
+"""A batch of this size never waits: on a disk that runs full the database must still get all records, and the reserve is small."""
 
 
 def chunk_of(record: Record) -> ChunkRecord:
-    """The row of the database that a record of a segment becomes."""
+    """Convert a record of a segment to a row of the database."""
     r = record
     crc = zlib.crc32(r.payload)
     count = r.count if r.kind == CHUNK else 1
@@ -36,30 +36,23 @@ def chunk_of(record: Record) -> ChunkRecord:
 
 
 def may_pass(error: BaseException) -> bool:
-    """Tell whether the database may take the same chunks later: locked, full, restarting, gone for a while."""
+    """Whether the database may take the same chunks later: it is locked, full, restarting or temporarily gone."""
     cause = error.__cause__
     return isinstance(cause, DBAPIError | TimeoutError) and not isinstance(cause, IntegrityError | DataError | ProgrammingError)
 
 
 def is_full(error: BaseException) -> bool:
-    """Tell whether the database says that its disk is full, in SQLite's words or with PostgreSQL's code (53100, disk_full)."""
-    said = getattr(error.__cause__, "orig", None)
-    if not isinstance(error, StoreError) or said is None:
+    """Whether the database reports a full disk, by SQLite's message or PostgreSQL's code (53100, disk_full)."""
+    original = getattr(error.__cause__, "orig", None)
+    if not isinstance(error, StoreError) or original is None:
         return False
-    return getattr(said, "sqlstate", None) == "53100" or any(words in str(said).lower() for words in ("is full", "no space left"))
+    return getattr(original, "sqlstate", None) == "53100" or any(text in str(original).lower() for text in ("is full", "no space left"))
 
 
 class Ingest:
-    """Reads records back from the segment, checks them, and gives them to the database until it takes them.
+    """Reads records back from the segment at ``path``, checks them, and retries until the database has taken them.
 
-    Parameters
-    ----------
-    store : Store
-        Where they go.
-    path : Path
-        The segment.
-    disk_full : callable
-        Called when the database finds no disk space.
+    Calls ``disk_full`` when the database has no disk space.
     """
 
     def __init__(self, store: Store, path: Path, disk_full: Callable[[], None]) -> None:
@@ -75,7 +68,7 @@ class Ingest:
         self._thread.start()
 
     def add(self, places: list[tuple[int, int]]) -> None:
-        """Records that are durable now: offset and length in the segment."""
+        """Queue durable records by offset and length in the segment."""
         with self._news:
             idle = not self._places
             self._places.extend(places)
@@ -85,11 +78,11 @@ class Ingest:
 
     @property
     def waiting(self) -> int:
-        """Records that the database does not have yet."""
+        """Number of records that the database does not have yet."""
         return len(self._places)
 
     def finish(self, timeout_s: float) -> bool:
-        """Wait until the database has everything; False when it did not take all in time (the segment keeps it)."""
+        """Wait until the database has everything; False if it did not take all in time (the segment keeps it)."""
         with self._news:
             self._hurry = True
             self._news.notify_all()
@@ -97,7 +90,7 @@ class Ingest:
             self._stop = True
             self._news.notify_all()
         self._thread.join(END_S)
-        if self._thread.is_alive():  # the file stays open: the thread is in the middle of it
+        if self._thread.is_alive():  # the thread still uses the file: keep it open
             return False
         os.close(self._file)
         return done and self.error is None
@@ -124,8 +117,8 @@ class Ingest:
                     self._disk_full()
                 again = True
                 continue
-            except Exception as error:  # noqa: BLE001 - a thread that dies in silence would look like a slow database
-                self._fail(CaptureFault(f"the way to the database broke: {error!r}", "report this"))
+            except Exception as error:  # noqa: BLE001 - a silent end of the thread would look like a slow database
+                self._fail(CaptureFault(f"the transfer to the database failed: {error!r}", "report this"))
                 return
             with self._news:
                 for _ in batch:

@@ -1,6 +1,6 @@
-"""Where every sequence number of a run ended: stored as valid, stored with a flag, or in an explicit gap. Pure bookkeeping.
+"""Accounts for every sequence number of a run: stored as valid, stored with a flag, or in an explicit gap. Pure bookkeeping.
 
-`Drafter` turns batches into chunks and gaps by it; `streams_doc` and `joined` give the account of a whole run.
+`Drafter` turns batches into chunks and gaps; `streams_doc` and `joined` make the account of a whole run.
 """
 
 from __future__ import annotations
@@ -20,18 +20,10 @@ from abbe.service.storage.store import Store
 
 @dataclass(frozen=True, slots=True)
 class SampleGap:
-    """Samples that are missing, and all that is known about it.
+    """A gap of missing samples.
 
-    Parameters
-    ----------
-    stream : int
-        Which stream of the run, from 0.
-    first, last : int
-        Sequence numbers; ``last`` is None when it is unknown how many would have come.
-    cause : str
-        In words.
-    before_us, after_us : int or None
-        Device clock of the last sample before and the first one after.
+    ``stream``: number of the stream in the run, from 0; ``first``, ``last``: sequence numbers, ``last`` None if unknown; ``before_us``,
+    ``after_us``: device clock of the neighbouring samples.
     """
 
     stream: int
@@ -43,7 +35,7 @@ class SampleGap:
 
     @property
     def missing(self) -> int:
-        """How many; 0 where unknown."""
+        """Number of missing samples; 0 if unknown."""
         return 0 if self.last is None else self.last - self.first + 1
 
     def doc(self) -> dict[str, Any]:
@@ -58,7 +50,7 @@ class SampleGap:
 
 @dataclass(slots=True)
 class Ledger:
-    """Account of one run's sequence numbers. Samples and gaps come in any order; `unaccounted` says what no entry covers."""
+    """Account of one run's sequence numbers. Samples and gaps come in any order; `unaccounted` lists what no entry covers."""
 
     flagged: dict[str, int] = field(default_factory=dict)
     gaps: list[SampleGap] = field(default_factory=list)
@@ -66,16 +58,16 @@ class Ledger:
     _stored: dict[int, list[list[int]]] = field(default_factory=dict)
 
     def add_samples(self, stream: int, samples: Sequence[BarSample]) -> None:
-        """Book samples that are stored; in one call without a gap between them."""
+        """Enter stored samples with consecutive numbers."""
         self.add_span(stream, samples[0].seq, samples[-1].seq)
         for sample in samples:
-            if not bar_is_valid(sample.status):  # the sample is kept all the same
+            if not bar_is_valid(sample.status):  # flagged samples are stored, too
                 self.invalid += 1
                 for reason in bar_reasons(sample.status):
                     self.flagged[reason] = self.flagged.get(reason, 0) + 1
 
     def add_span(self, stream: int, first: int, last: int) -> None:
-        """Book samples that are stored without a flag, from their first and last number."""
+        """Enter stored samples without flags, by their first and last number."""
         spans = self._stored.setdefault(stream, [])
         if spans and spans[-1][1] + 1 == first:
             spans[-1][1] = last
@@ -83,20 +75,20 @@ class Ledger:
             spans.append([first, last])
 
     def add_gap(self, gap: SampleGap) -> None:
-        """Book samples that are missing."""
+        """Enter missing samples."""
         self.gaps.append(gap)
 
     @property
     def stored(self) -> int:
-        """Samples stored, with and without flag."""
+        """Number of stored samples, with and without flags."""
         return sum(last - first + 1 for spans in self._stored.values() for first, last in spans)
 
     def stored_spans(self, stream: int = 0) -> list[tuple[int, int]]:
-        """First and last number of every unbroken piece of a stream."""
+        """First and last number of every contiguous part of a stream."""
         return [(first, last) for first, last in sorted(self._stored.get(stream, []))]
 
     def unaccounted(self) -> list[tuple[int, int, int]]:
-        """Stream, first and last of what neither a sample nor a gap covers, up to the highest number known."""
+        """Stream, first and last number of every range that neither a sample nor a gap covers, up to the highest known number."""
         found = []
         for stream in sorted({*self._stored, *(gap.stream for gap in self.gaps)}):
             at = 0
@@ -107,12 +99,12 @@ class Ledger:
         return found
 
     def ends(self) -> dict[int, int]:
-        """For each stream the number behind the highest known one."""
+        """For each stream the number after the highest known one."""
         streams = sorted({*self._stored, *(gap.stream for gap in self.gaps)})
         return {stream: max((last + 1 for _, last in self._covered(stream)), default=0) for stream in streams}
 
-    def twice(self) -> int:
-        """How many numbers have more than one entry."""
+    def duplicates(self) -> int:
+        """Number of entries in excess of one per sequence number."""
         count = 0
         for stream in sorted({*self._stored, *(gap.stream for gap in self.gaps)}):
             at = 0
@@ -122,7 +114,7 @@ class Ledger:
         return count
 
     def doc(self) -> dict[str, Any]:
-        """Sums, as JSON object."""
+        """Totals as JSON object."""
         return {
             "stored_valid": self.stored - self.invalid,
             "stored_flagged": self.invalid,
@@ -155,15 +147,7 @@ class _Stream:
 
 
 class Drafter:
-    """Turns what a run produces into records and books it.
-
-    Parameters
-    ----------
-    run : int
-        Run in the database.
-    utc_offset_s : callable
-        UTC minus monotonic host time, now.
-    """
+    """Turns a run's data into records and enters them into the ledger. ``utc_offset_s`` returns UTC minus monotonic host time."""
 
     def __init__(self, run: int, utc_offset_s: Callable[[], float]) -> None:
         self.ledger = Ledger()
@@ -174,28 +158,28 @@ class Drafter:
 
     @property
     def last_seq(self) -> int:
-        """Highest sequence number of the present stream so far, -1 for none."""
+        """Highest sequence number of the current stream so far, -1 for none."""
         return self._stream.next_seq - 1
 
     def mark(self) -> object:
-        """Where the numbering stands, for `reset`."""
+        """State of the numbering, for `reset`."""
         return dict(self._numbers), dict(self._counts), replace(self._stream)
 
     def reset(self, mark: object) -> None:
-        """Number as if what was drafted since `mark` had never been: it did not get onto the disk."""
+        """Undo the numbering since `mark`, whose records did not reach the disk."""
         assert isinstance(mark, tuple)
         self._numbers, self._counts, self._stream = mark
 
     def opening(self, doc: dict[str, Any]) -> Record:
-        """The first record: who measures what."""
+        """Return the first record, which describes the run."""
         return self._json(OPEN, RUN, [doc])
 
     def closing(self, doc: dict[str, Any]) -> Record:
-        """The last record: how it ended."""
+        """Return the last record, with the outcome of the run."""
         return self._json(CLOSE, RUN, [doc])
 
     def drafts(self, items: list[Item]) -> list[Record]:
-        """Records for everything that came, in order. The ledger is not touched: nothing is on the disk yet."""
+        """Return records for all items in order. Leaves the ledger alone: nothing is on the disk yet."""
         found: list[Record] = []
         batches: list[BarBatch] = []
         others: dict[str, list[dict[str, Any]]] = {}
@@ -217,7 +201,7 @@ class Drafter:
         return found + [self._json(CHUNK, channel, records) for channel, records in others.items()]
 
     def book(self, items: list[Item], gaps: list[Record]) -> None:
-        """Enter into the ledger what is on the disk now."""
+        """Enter items and gaps that are now on the disk into the ledger."""
         for stream, batch in items:
             if isinstance(batch, BarBatch) and batch.samples:
                 self.ledger.add_samples(int(stream), batch.samples)
@@ -225,14 +209,14 @@ class Drafter:
             self.ledger.add_gap(gap_of(record))
 
     def lost(self, cause: str, last: int | None, after_us: int | None, stream: int | None = None) -> Record:
-        """A gap from the next expected number on, of the present stream or of a later one that nothing was drafted of."""
+        """Return the record of a gap from the next expected number on, in the current stream or a later one without drafts."""
         at = self._stream if stream in (None, self._stream.number) else _Stream(int(stream or 0))
-        if last is not None and last < at.next_seq:  # unknown: the numbers went back
+        if last is not None and last < at.next_seq:  # the numbers went back: the end is unknown
             last = None
         return self.gap_record(SampleGap(max(0, at.number), at.next_seq, last, cause, at.last_us, after_us))
 
     def gap_record(self, gap: SampleGap) -> Record:
-        """The record of a gap."""
+        """Return the record of a gap."""
         record = self._json(GAP, GAPS, [gap.doc()])
         return replace(record, stream=gap.stream, first_seq=gap.first, count=gap.missing)
 
@@ -299,7 +283,7 @@ class Drafter:
 
 
 def gap_of(record: Record) -> SampleGap:
-    """The gap that a record tells of."""
+    """Decode the gap in a record."""
     return SampleGap.of(decode_json(record.payload)[0])
 
 
@@ -308,18 +292,13 @@ def _count(batches: list[BarBatch]) -> int:
 
 
 DAMAGED = "the segment is damaged here"
-TORN = "the end of the segment is torn or damaged: it is not known how many samples were in it"
+TORN = "the end of the segment is torn or damaged: the number of its samples is unknown"
 
 
 def ledger_of(chunks: list[ChunkRecord], streams: dict[int, int] | None = None) -> Ledger:
-    """Account of a stored run: every sequence number of its ball-bar streams.
+    """Return the ledger of a stored run from the chunks of all its channels.
 
-    Parameters
-    ----------
-    chunks : list of ChunkRecord
-        Of all channels.
-    streams : dict, optional
-        Stream of a chunk by its number, where a segment tells; else a new one begins where the numbers go back.
+    ``streams``: stream of a chunk by its number, if a segment has it; else a new stream begins where the numbers go back.
 
     Raises
     ------
@@ -341,12 +320,12 @@ def ledger_of(chunks: list[ChunkRecord], streams: dict[int, int] | None = None) 
 
 
 def streams_doc(records: Iterable[Record]) -> list[list[int]]:
-    """Of which stream the ball-bar's chunks are: first chunk, last chunk, stream, for every unbroken piece. Goes into the run's account."""
+    """Streams of the ball-bar's chunks, for the run's account: first chunk, last chunk and stream of every contiguous part."""
     return joined([], [[one.chunk_no, one.chunk_no, one.stream] for one in records if one.kind == CHUNK and one.channel == BAR])
 
 
 def joined(spans: list[list[int]], more: list[list[int]]) -> list[list[int]]:
-    """Pieces as `streams_doc` has them, and more behind them; those that follow each other in one stream become one."""
+    """Append parts in the form of `streams_doc`; merge adjacent parts of one stream."""
     spans = [list(span) for span in spans]
     for first, last, stream in more:
         if spans and spans[-1][1] + 1 == first and spans[-1][2] == stream:
@@ -356,31 +335,31 @@ def joined(spans: list[list[int]], more: list[list[int]]) -> list[list[int]]:
     return spans
 
 
-def streams_told(end_doc: dict[str, Any] | None) -> dict[int, int] | None:
-    """Stream of every chunk by its number, as the run's end document has it; None: it does not say (still open, or of an older version)."""
+def streams_from_end_doc(end_doc: dict[str, Any] | None) -> dict[int, int] | None:
+    """Stream of every chunk by its number, from the run's end document; None if that has none (open run, or older version)."""
     spans = ((end_doc or {}).get("capture") or {}).get("streams")
     if spans is None:
         return None
     return {chunk: stream for first, last, stream in spans for chunk in range(first, last + 1)}
 
 
-def settle(store: Store, run_id: int, held: Scan) -> Ledger:
-    """Account of a run whose good records are all in the database; what damage has swallowed is declared there as gaps.
+def settle(store: Store, run_id: int, scanned: Scan) -> Ledger:
+    """Return the ledger of a run whose good records are all in the database; store damaged ranges there as gaps.
 
     Raises
     ------
     StoreError
-        The database does not take it now, or a chunk cannot be unpacked.
+        The database refuses the gaps, or a chunk cannot be unpacked.
     """
     keys = store.chunks.crcs(run_id)
-    known = {(record.channel, record.chunk_no) for record in held.records if record.kind in (CHUNK, GAP)}
-    broken = bool(held.damaged or held.broken_links)
-    if broken or not keys.keys() <= known:  # only where the segment does not tell all is every sample looked at
-        streams = {one.chunk_no: one.stream for one in held.records if one.kind == CHUNK and one.channel == BAR}
+    known = {(record.channel, record.chunk_no) for record in scanned.records if record.kind in (CHUNK, GAP)}
+    broken = bool(scanned.damaged or scanned.broken_links)
+    if broken or not keys.keys() <= known:  # inspect every sample only if the segment is incomplete
+        streams = {one.chunk_no: one.stream for one in scanned.records if one.kind == CHUNK and one.channel == BAR}
         ledger = ledger_of(store.chunks.of_run(run_id), streams)
     else:
-        ledger = _of_headers(held)
-    holes = _holes(ledger, held) if broken or held.tail_bytes else []
+        ledger = _of_headers(scanned)
+    holes = _holes(ledger, scanned) if broken or scanned.tail_bytes else []
     begun = 1 + max((number for channel, number in {*keys, *known} if channel == GAPS), default=-1)
     drafter = Drafter(run_id, lambda: 0.0)
     store.chunks.ingest([chunk_of(replace(drafter.gap_record(gap), chunk_no=begun + k)) for k, gap in enumerate(holes)])
@@ -389,24 +368,24 @@ def settle(store: Store, run_id: int, held: Scan) -> Ledger:
     return ledger
 
 
-def _holes(ledger: Ledger, held: Scan) -> list[SampleGap]:
+def _holes(ledger: Ledger, scanned: Scan) -> list[SampleGap]:
     found = [SampleGap(stream, first, last, DAMAGED, None, None) for stream, first, last in ledger.unaccounted()]
     ends = ledger.ends()
-    for record in held.records:
-        if record.kind == CLOSE:  # it says up to where everything had been made safe
+    for record in scanned.records:
+        if record.kind == CLOSE:  # it states the last durable number
             stream, seq = decode_json(record.payload)[0].get("durable", {}).get(BAR, (0, -1))
             if seq >= ends.get(stream, 0):
                 found.append(SampleGap(stream, ends.get(stream, 0), seq, DAMAGED, None, None))
                 ends[stream] = seq + 1
-    if held.tail_bytes and not held.closed:
+    if scanned.tail_bytes and not scanned.closed:
         stream = max(ends, default=0)
         found.append(SampleGap(stream, ends.get(stream, 0), None, TORN, None, None))
     return found
 
 
-def _of_headers(held: Scan) -> Ledger:
+def _of_headers(scanned: Scan) -> Ledger:
     ledger = Ledger()
-    for record in held.records:
+    for record in scanned.records:
         if record.kind == GAP:
             ledger.add_gap(gap_of(record))
         elif record.kind == CHUNK and record.channel == BAR:

@@ -1,7 +1,7 @@
-"""What a running path reads, for live views: a bounded copy beside the way to the disk, which never waits and may lose.
+"""Readings of a running path for live views: a bounded copy beside the recording, which never waits and may drop data.
 
-The driver's thread puts batches in (`LiveFeed.take`), the event loop takes stretches out. What is not taken out in time is dropped here and
-nowhere else: the recorder has been given every sample before.
+The driver's thread puts batches in (`LiveFeed.take`), the event loop takes stretches out. Batches that wait too long are dropped from the
+live view only: the recorder already has every sample.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ F1 = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 MOST_BATCHES = 2000
-"""So many batches wait at most: seconds of a page that is being started again."""
+"""Most waiting batches: enough for the seconds in which the page process restarts."""
 LONGEST = 4096
-"""So many deviations make a stretch at most: a message of the channel is bounded, and a longer one would end the page's process."""
+"""Most deviations per stretch: channel messages are bounded, and a longer one would end the page process."""
 ANGLES = 512
-"""Places of a path whose angle is sent; in between the browser interpolates."""
+"""Number of path positions whose angle is sent; the browser interpolates between them."""
 UM_PER_NM = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Deviations that follow each other, µm; not a number where the box says that it did not read.
+    """Consecutive deviations, µm; NaN for invalid readings.
 
-    ``first``: number of the first one, counted from the sample with which the path began; ``host_s``: when the last one arrived here.
+    ``first``: number of the first one, counted from the first sample of the path; ``host_s``: arrival time of the last one.
     """
 
     path: int
@@ -48,18 +48,18 @@ class Stretch:
 
 
 class LiveFeed:
-    """The path that is being recorded now, and what it has read lately. Make it before the event loop runs or inside of it."""
+    """The current path and its latest readings. Create it before the event loop runs, or in it."""
 
     def __init__(self) -> None:
         self.path: RecordedPath | None = None
         self.active = asyncio.Event()
-        """Set while a path is recorded."""
+        """Set during the recording of a path."""
         self._number = 0
         self._first_seq: int | None = None
         self._batches: deque[BarBatch] = deque(maxlen=MOST_BATCHES)
 
     def begin(self, run: str, test: str, setup: Mapping[str, Any], path: tuple[Sequence[Point], float, int]) -> None:
-        """Hear that a path is going to be recorded: its points in mm, feed in mm/min and rate in Hz."""
+        """Begin a path, given by its points in mm, feed in mm/min and rate in Hz."""
         points_mm, feed_mm_min, rate_hz = path
         self._number += 1
         self._first_seq = None
@@ -80,7 +80,7 @@ class LiveFeed:
         self.active.set()
 
     def end(self) -> None:
-        """Hear that it is over, however it ended."""
+        """End the path."""
         self.path = None
         self.active.clear()
 
@@ -92,7 +92,7 @@ class LiveFeed:
             self._batches.append(batch)
 
     def stretches(self) -> list[Stretch]:
-        """What has come since the last call, as few stretches as gaps and `LONGEST` allow; in the event loop."""
+        """Return the readings since the last call, in as few stretches as gaps and `LONGEST` allow; call it in the event loop."""
         path, first_seq = self.path, self._first_seq
         if path is None or first_seq is None:
             return []
@@ -118,10 +118,10 @@ def _cut(path: int, numbers: list[int], values: Values, host_s: float) -> list[S
 
 
 def angles_along(points_mm: Sequence[Point], setup: Mapping[str, Any]) -> tuple[F1, float]:
-    """Angle about a ball-bar test's axis at `ANGLES` even parts of its path, degrees, not wrapped; and the path's length in mm.
+    """Angle about a ball-bar test's axis at `ANGLES` equally spaced positions of its path, degrees, unwrapped; and the path's length in mm.
 
-    Angles count from the first axis of the plane to its second, as in a recipe. None where neither set-up nor path tells the axis: there
-    is no round picture of it.
+    Angles count from the first axis of the plane to its second, as in a recipe. The angles are empty if neither set-up nor path defines the
+    axis: such a path has no polar plot.
     """
     points = np.asarray(points_mm, dtype=np.float64) - np.asarray(setup["centre_mm"], dtype=np.float64)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

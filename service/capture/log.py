@@ -1,7 +1,7 @@
-"""The capture of one run: whatever is given to it is on the disk a few tens of milliseconds later, then on its way to the database.
+"""The capture of one run: every item reaches the disk within tens of milliseconds, and then goes to the database.
 
-It has a thread of its own. Nothing in the event loop, the database or a solver can hold it up; the disk can, and then `take` waits and the
-driver's ring fills up, which stops the machine before a sample is lost.
+It has a thread of its own, which the event loop, the database or a solver cannot delay. The disk can: then `put` waits and the driver's ring
+fills, which stops the machine before a sample is lost.
 """
 
 from __future__ import annotations
@@ -18,32 +18,19 @@ from abbe.service.capture.segment import CHUNK, GAP, Record, Reserve, Segment
 from abbe.service.errors import AbbeError, CaptureFault, DiskFull
 
 GROUP_S = 0.01
-"""So long after its arrival the first sample waits for company, so that a group costs one sync. No longer: what it waited before counts, be
-it for its framing or for a slow sync."""
+"""Longest wait of a sample after its arrival, so that a group shares one sync. Earlier waits (for framing or a slow sync) count."""
 MAX_PENDING = 8192
 HANG_S = 30.0
 
 Published = Callable[[str, int, int], None]
-"""Channel, stream and highest sequence number that is durable; called in the capture's thread."""
+"""Called in the capture's thread with channel, stream and highest durable sequence number."""
 
 
 class CaptureLog:
-    """Writes one run's segment.
+    """Writes one run's segment, which must be new and empty.
 
-    Parameters
-    ----------
-    segment : Segment
-        New and empty.
-    drafter : Drafter
-        Of this run.
-    reserve : Reserve
-        Disk space for the end.
-    opening : dict
-        What the first record says.
-    durable : callable
-        Called with the places of every record that is on the disk now.
-    published : callable
-        Called when ``durable_seq`` has risen.
+    ``opening``: content of the first record. ``durable`` is called with offset and length of every record that reached the disk,
+    ``published`` when ``durable_seq`` has risen.
     """
 
     def __init__(
@@ -58,10 +45,10 @@ class CaptureLog:
         self.segment, self.drafter = segment, drafter
         self.error: AbbeError | None = None
         self.durable: dict[str, tuple[int, int]] = {}
-        """For each channel stream and sequence number up to which everything survives a kill and a power cut."""
+        """For each channel the stream and the last sequence number that survives a kill and a power cut."""
         self.warnings: list[str] = []
         self.streams: list[list[int]] = []
-        """Of which stream the ball-bar's chunks are, as `streams_doc` has it."""
+        """Streams of the ball-bar's chunks, in the form of `streams_doc`."""
         self._reserve, self._durable, self._published = reserve, durable, published
         self._pending: list[Item] = []
         self._samples = 0
@@ -70,14 +57,14 @@ class CaptureLog:
         self._closing = self._hurry = False
         self._full = False
         self._dropped: dict[int, int] = {}
-        """Of each stream the last number that did not get onto the disk."""
+        """For each stream the last number that did not reach the disk."""
         self._news = threading.Condition()
         self._append([drafter.opening(opening)], [])
         self._thread = threading.Thread(target=self._run, name="abbe-capture", daemon=True)
         self._thread.start()
 
     def put(self, item: Item) -> None:
-        """Take a batch or a record, from any thread; waits while the disk is far behind. Never raises: see ``error``."""
+        """Queue a batch or a record, from any thread; waits while the disk is far behind. Never raises: see ``error``."""
         with self._news:
             room = self._news.wait_for(lambda: self._samples < MAX_PENDING or self._closing or self.error is not None, HANG_S)
             if self._closing:
@@ -92,10 +79,10 @@ class CaptureLog:
             self._given += 1
             self._samples += len(item[1].samples) if isinstance(item[1], BarBatch) else 1
             if first or self._samples >= MAX_PENDING:
-                self._news.notify_all()  # joining a group does not wake the writer
+                self._news.notify_all()  # further items of a group need not wake the writer
 
     def flush(self) -> None:
-        """Wait until everything given so far is on the disk, or never will be. Blocks."""
+        """Block until everything queued so far is on the disk, or the capture has failed."""
         with self._news:
             goal = self._given
             self._hurry = True
@@ -103,20 +90,15 @@ class CaptureLog:
             self._news.wait_for(lambda: self._stored >= goal or not self._thread.is_alive())
 
     def disk_full(self) -> None:
-        """The database found no space: end the run while there still is some for the segment."""
+        """Report a full database disk: end the run while the segment still has space."""
         with self._news:
             self._full = True
             self._news.notify_all()
 
     def close(self, doc: dict[str, Any], cause: str) -> None:
-        """Write what is left and the closing record, and end the thread. Blocks.
+        """Write the rest and the closing record ``doc``, and end the thread. Blocks.
 
-        Parameters
-        ----------
-        doc : dict
-            How the run ended.
-        cause : str
-            Why samples after the last one may be missing; empty when the stream ended in order.
+        ``cause``: why samples after the last one may be missing; empty after an orderly end of the stream.
         """
         with self._news:
             self._closing = True
@@ -124,18 +106,18 @@ class CaptureLog:
         self._thread.join(HANG_S)
         if self.hangs:
             self.error = self.error or self._hangs()
-            return  # its thread may still be in the file: leave it alone; the next start sees how far it got
+            return  # the thread may still use the file: leave it alone; the next start recovers it
         for step in (partial(self._write_end, doc, cause), self.segment.close):
             try:
                 step()
             except AbbeError as error:
                 self.error = self.error or error
-            except Exception as error:  # noqa: BLE001 - whatever it is, the run was not ended in order and must not look so
+            except Exception as error:  # noqa: BLE001 - the run did not end in order and must not look so
                 self.error = self.error or CaptureFault(f"the capture could not be ended: {error!r}", "report this")
 
     @property
     def hangs(self) -> bool:
-        """After `close`: the disk still has not answered, and what it does with the file is not known."""
+        """After `close`: whether the disk has not answered, so that the state of the file is unknown."""
         return self._thread.is_alive()
 
     def _hangs(self) -> CaptureFault:
@@ -150,7 +132,7 @@ class CaptureLog:
         self._append_or_release([*last, self.drafter.closing(doc | sums)], [])
 
     def _final_gaps(self, cause: str) -> list[Record]:
-        if self._dropped:  # numbers that came after the disk had given up
+        if self._dropped:  # numbers that came after the disk had failed
             return [self.drafter.lost(str(self.error), last, None, stream) for stream, last in self._dropped.items()]
         return [self.drafter.lost(cause, None, None)] if cause else []
 
@@ -182,8 +164,8 @@ class CaptureLog:
                 return
             except AbbeError as error:
                 self.error = error
-            except Exception as error:  # noqa: BLE001 - a thread that dies in silence would hold the tap for ever
-                self.error = CaptureFault(f"the capture could not go on: {error!r}", "report this")
+            except Exception as error:  # noqa: BLE001 - a silent end of the thread would block the tap for ever
+                self.error = CaptureFault(f"the capture failed: {error!r}", "report this")
         self._drop(items)
 
     def _end_for_want_of_space(self) -> None:
@@ -201,7 +183,7 @@ class CaptureLog:
             raise
 
     def _append_or_release(self, records: list[Record], items: list[Item]) -> DiskFull | None:
-        """Append, if need be on the reserve's space; then says that the disk is full, with everything acknowledged."""
+        """Append, using the reserve if necessary; return the DiskFull error if it was used."""
         try:
             self._append(records, items)
         except DiskFull as error:

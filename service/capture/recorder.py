@@ -1,4 +1,4 @@
-"""The recorder of real runs: samples go from the driver's thread to the segment, from there to the database."""
+"""The recorder of real runs: samples go from the driver's thread to the segment, and from there to the database."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def _key(path: Path) -> tuple[str, int]:
 
 
 def is_active(path: Path) -> bool:
-    """Tell whether this very process is recording into a segment, or has not closed its run yet."""
+    """Whether this process records into a segment, or has not closed its run yet."""
     return _key(path) in _active
 
 
 Look = Callable[[BarBatch], None]
-"""Is shown every batch after it was taken, in the driver's thread; must neither wait nor raise."""
+"""Receives every recorded batch in the driver's thread; must neither wait nor raise."""
 
 
 def ignore_batch(_: BarBatch) -> None:
@@ -59,14 +59,7 @@ class _Tap:
 class CaptureRecorder:
     """Records one run. Open it with `recording`.
 
-    Attributes
-    ----------
-    log : CaptureLog
-        The segment and its thread.
-    ingest : Ingest
-        The way to the database.
-    behind : bool
-        The segment holds what the database does not; after the end: it must stay, and the run open, for the next start.
+    ``behind``: the segment has records that the database lacks; after the end it must stay, and the run open, for the next start.
     """
 
     def __init__(self, log: CaptureLog, ingest: Ingest, keep: bool, io: FileIO, *, temporary: bool = False) -> None:
@@ -79,55 +72,43 @@ class CaptureRecorder:
         """The live view; set before a stream begins."""
 
     def tap(self) -> _Tap:
-        """What a new stream gives every sample to."""
+        """Return the tap that takes every sample of a new stream."""
         self._streams += 1
         return _Tap(self.log, self._streams - 1, self.look)
 
     async def add_bar(self, batch: BarBatch) -> None:
-        """Hear of a batch that the tap has taken.
-
-        Raises
-        ------
-        DiskFull, CaptureFault, CaptureConflict
-            Samples are not safe any more: the machine has to stop.
-        """
+        """Check the capture after a batch that the tap has taken; raises as `check`."""
         self.check()
 
     async def add_record(self, record: dict[str, Any]) -> None:
-        """Take one record of the laser.
-
-        Raises
-        ------
-        DiskFull, CaptureFault, CaptureConflict
-            Samples are not safe any more: the machine has to stop.
-        """
+        """Queue one record of the laser; raises as `check`."""
         self.check()
         self.log.put((LASER, record))
 
     async def flush(self) -> None:
-        """Wait until everything given so far is on the disk.
-
-        Raises
-        ------
-        DiskFull, CaptureFault, CaptureConflict
-            It will not get there.
-        """
+        """Wait until everything queued so far is on the disk; raises as `check`."""
         await asyncio.to_thread(self.log.flush)
         self.check()
 
     def check(self) -> None:
-        """Raise what has gone wrong in the threads."""
+        """Raise an error of the threads.
+
+        Raises
+        ------
+        DiskFull, CaptureFault, CaptureConflict
+            Samples are not safe any more: the machine has to stop.
+        """
         error = self.log.error or self.ingest.error
         if error is not None:
             raise error
 
     @property
     def durable_seq(self) -> int:
-        """Every ball-bar sample up to this number of the present stream survives a kill and a power cut; -1: none yet."""
+        """Last ball-bar sample of the current stream that survives a kill and a power cut; -1: none yet."""
         return self.log.durable.get(BAR, (0, -1))[1]
 
     def close(self, status: str, reason: str) -> None:
-        """End the segment and wait for the database. Blocks. Whatever goes wrong here, ``behind`` is only taken back by the database."""
+        """End the segment and wait for the database. Blocks. Only a complete transfer clears ``behind``."""
         self.behind, taken = True, False
         try:
             self.log.close({"status": status, "reason": reason}, "" if status == "complete" else reason)
@@ -136,7 +117,7 @@ class CaptureRecorder:
             self.behind = not taken or self.log.hangs
 
     def doc(self) -> dict[str, Any]:
-        """What the end document says about the samples."""
+        """Return the account of the samples for the end document."""
         log = self.log
         capture = log.drafter.ledger.doc() | {
             "records": log.segment.records,
@@ -149,35 +130,30 @@ class CaptureRecorder:
     def discard(self) -> None:
         """Delete the segment: the database has everything and the run is closed there."""
         if not self._keep:
-            with suppress(OSError):  # the next start finds that all of it is in the database
+            with suppress(OSError):  # the next start finds all of it in the database
                 self._io.remove(self.log.segment.path)
         if self._temporary:
-            with suppress(OSError):  # other runs may be in it
+            with suppress(OSError):  # the folder may hold other runs
                 self.log.segment.path.parent.rmdir()
 
     def release(self) -> None:
-        """The run is closed, or stays open for the recovery: from now on this process may take the segment over as any other."""
+        """Let this process recover the segment like any other; the run is closed, or stays open for the recovery."""
         _active.discard(_key(self.log.segment.path))
 
 
 async def close_run(store: Store, run_id: int, recorder: CaptureRecorder | None, status: str, reason: str, end: dict[str, Any]) -> None:
-    """Close a run in the database and delete its segment; a run whose samples are not all there stays open and visibly incomplete.
+    """Close a run in the database and delete its segment; a run with samples missing there stays open and visibly incomplete.
 
-    Parameters
-    ----------
-    recorder : CaptureRecorder or None
-        After its end; None when there was no recording.
-    status, reason, end : str, str, dict
-        As `Store.finish_run` takes them.
+    ``recorder`` must have ended; None: there was no recording.
 
     Raises
     ------
     StoreError
-        The database does not take it. The segment stays, and the next start closes the run.
+        The database refuses the end. The segment stays, and the next start closes the run.
     """
     try:
         if recorder is not None and recorder.behind:
-            return  # the next start takes over what its segment holds, and closes it
+            return  # the next start recovers the segment and closes the run
         await store.write(store.runs.finish, run_id, status, reason, end)
         if recorder is not None:
             recorder.discard()
@@ -197,29 +173,21 @@ async def recording(
     io: FileIO | None = None,
     published: Published = lambda channel, stream, seq: None,
 ) -> AsyncIterator[CaptureRecorder]:
-    """A recorder for one run.
+    """Open a recorder for one run and close it after the block.
 
     Parameters
     ----------
-    store : Store
-        The database.
-    run_id : int
-        Run in it.
-    settings : CaptureSettings
-        Folder and reserve.
     clock : Clock
-        For the UTC offset that is noted beside every chunk; no sample time depends on it.
+        For the UTC offset beside every chunk; no sample time depends on it.
     about : dict, optional
-        Who measures what, for the segment's first record.
-    io : FileIO, optional
-        For tests.
+        Description of the run, for the segment's first record.
     published : callable, optional
         Called in the capture's thread whenever more samples are durable.
 
     Raises
     ------
     DiskFull, CaptureFault
-        Nothing can be written, before anything moves; or not all samples could be made safe.
+        Before anything moves: nothing can be written. At the end: some samples are not safe.
     StoreError
         At the end: the database did not take everything in time. The segment keeps it, and the next start catches up.
     """
@@ -242,7 +210,7 @@ async def recording(
 
 
 async def _opened_or_closed(work: Callable[[], CaptureRecorder]) -> CaptureRecorder:
-    """Open a recorder; if the caller is cancelled meanwhile, what comes back is closed again."""
+    """Open a recorder; close it again if the caller is cancelled during that."""
     found: list[CaptureRecorder] = []
 
     async def opening() -> None:
@@ -252,7 +220,7 @@ async def _opened_or_closed(work: Callable[[], CaptureRecorder]) -> CaptureRecor
         await run_to_end(opening())
     except BaseException:
         for one in found:
-            await run_to_end(asyncio.to_thread(one.close, "failed", ""))  # nothing was measured: there is no gap either
+            await run_to_end(asyncio.to_thread(one.close, "failed", ""))  # without a measurement there is no gap
             one.release()
         raise
     return found[0]
@@ -268,9 +236,9 @@ def _opened(
     _make(folder, io)
     reserve.hold()
     path = segment_path(folder, run_id)
-    _active.add(_key(path))  # before there is a file that a recovery could find
+    _active.add(_key(path))  # before a recovery could find the file
     try:
-        if path.exists():  # of a database that was deleted since: the same numbers come again
+        if path.exists():  # of a deleted database, whose numbers are used again
             set_aside(path, ORPHAN)
         drafter = Drafter(run_id, lambda: clock.utc().timestamp() - clock.monotonic_s())
         log, ingest = _begun(store, Segment(io, path), drafter, reserve, opening, published)
@@ -283,7 +251,7 @@ def _opened(
 
 
 def _make(folder: Path, io: FileIO) -> None:
-    """Make a folder whose every new level survives a power cut."""
+    """Create a folder so that every new level survives a power cut."""
     made = [one for one in (folder, *folder.parents) if not one.exists()] or [folder]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -296,7 +264,7 @@ def _make(folder: Path, io: FileIO) -> None:
 def _begun(
     store: Store, segment: Segment, drafter: Drafter, reserve: Reserve, opening: dict[str, Any], published: Published
 ) -> tuple[CaptureLog, Ingest]:
-    """The two threads of a recording; without both of them there is none, and the file is given back."""
+    """Start both threads of a recording, or neither; then the segment is closed."""
     logs: list[CaptureLog] = []
     with ExitStack() as undo:
         undo.callback(segment.close)

@@ -1,6 +1,6 @@
-"""After a crash: what the segments have and the database lacks is taken over, and the run is marked as interrupted.
+"""Recovery after a crash: moves missing records from segments to the database, and marks their runs as interrupted.
 
-One segment that cannot be taken over stops neither the others nor the machine: it is set aside under another name, and that is said.
+A segment that cannot be recovered stops neither the others nor the machine: it is renamed, and a message reports that.
 """
 
 from __future__ import annotations
@@ -40,34 +40,22 @@ from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreE
 from abbe.service.runs.codec import decode_json
 from abbe.service.storage.store import Store
 
-# What becomes of a segment whose run is closed: deleted, kept, or renamed because something in it is damaged.
 
-
-def put_away(path: Path, held: Scan, *, keep: bool) -> None:
-    """Delete or keep a segment that was taken over; nothing that could not be read is deleted. Never raises: the next start tries again.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    held : Scan
-        What is in it.
-    keep : bool
-        Keep it although the database has everything.
-    """
+def put_away(path: Path, scanned: Scan, *, keep: bool) -> None:
+    """Delete a recovered segment (or ``keep`` it), but never unreadable parts. Never raises: the next start tries again."""
     with suppress(OSError):
-        if held.damaged or (held.tail_bytes and not _copied(path, held.good_bytes)):
+        if scanned.damaged or (scanned.tail_bytes and not _copied(path, scanned.good_bytes)):
             set_aside(path, DAMAGED_SUFFIX)
         elif not keep:
             path.unlink(missing_ok=True)
-        elif held.tail_bytes:
+        elif scanned.tail_bytes:
             with path.open("r+b") as file:
-                file.truncate(held.good_bytes)
+                file.truncate(scanned.good_bytes)
                 os.fsync(file.fileno())
 
 
 def _copied(path: Path, begin: int) -> bool:
-    """Copy the end of a file to a file of its own, onto the disk; False when there is no room or the disk reports an error."""
+    """Copy the end of a file durably to a file of its own; False if there is no room or the disk reports an error."""
     copy = free_name(path, TAIL)
     try:
         with path.open("rb") as file, copy.open("xb") as other:
@@ -83,22 +71,20 @@ def _copied(path: Path, begin: int) -> bool:
     return True
 
 
-# Locks that the operating system gives back when a process ends, however it ends: on a segment, and on the recovery.
-
-
+# The operating system releases the locks on segments and on the recovery at any end of a process.
 LOCK_NAME = "recovery.lock"
 WAIT_S = 30.0
 _POLL_S = 0.05
 
 
 @contextmanager
-def held_alone(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
-    """Hold a lock file; False when another process held it all the time.
+def exclusive_lock(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
+    """Lock a file for the block; yields False if another process kept the lock for ``wait_s``.
 
     Raises
     ------
     CaptureFault
-        The file cannot be made.
+        The file cannot be created.
     """
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
@@ -106,24 +92,24 @@ def held_alone(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
         raise CaptureFault(f"{path}: lock: {error.strerror}", "look at the folder of the segments and its rights") from error
     try:
         until_s = time.monotonic() + wait_s
-        while not (got := _got(handle)) and time.monotonic() < until_s:
+        while not (locked := _try_lock(handle)) and time.monotonic() < until_s:
             threading.Event().wait(_POLL_S)
-        yield got
+        yield locked
     finally:
         os.close(handle)
 
 
 @contextmanager
 def is_free(path: Path) -> Iterator[bool]:
-    """Tell whether no process writes a segment, and keep it so meanwhile. Raises OSError."""
+    """Lock a segment for the block; yields False if a process writes it. Raises OSError."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        yield _got(handle)
+        yield _try_lock(handle)
     finally:
         os.close(handle)
 
 
-def _got(handle: int) -> bool:
+def _try_lock(handle: int) -> bool:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -134,25 +120,15 @@ def _got(handle: int) -> bool:
 __all__ = ["DAMAGED", "RecoveredRun", "ledger_of", "read_segment", "recover_segments"]
 
 MOST_RUNS = 2**31
-"""No database has a row of this number; a damaged segment may name it."""
+"""No database has a row with such a number, but a damaged segment may name it."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecoveredRun:
-    """What was done about one segment.
+    """Result of the recovery of one segment.
 
-    Parameters
-    ----------
-    run : int
-        Run in the database; 0 where there is none.
-    name : str
-        ``campaign/label``; empty when the database has no such run.
-    new_chunks : int
-        Chunks that the database lacked.
-    cut_bytes : int
-        Torn tail that was cut off; a copy of it is kept.
-    text : str
-        One sentence for people.
+    ``run``: number in the database, 0 without a run; ``name``: ``campaign/label``, empty without a run; ``new_chunks``: added to the
+    database; ``cut_bytes``: length of the torn tail, of which a copy is kept; ``text``: one sentence for people.
     """
 
     run: int
@@ -163,12 +139,12 @@ class RecoveredRun:
 
 
 def recover_segments(store: Store, settings: CaptureSettings) -> list[RecoveredRun]:
-    """Take over what a killed process, a power cut or a locked database left in segments. Blocks; call it before anything is measured.
+    """Recover the segments left by a killed process, a power cut or a locked database. Blocks; call it before any measurement.
 
     Raises
     ------
     StoreError
-        The database does not take it now. What was done so far stays done; it can be called again.
+        The database refuses records now. Finished segments stay recovered; call it again later.
     CaptureFault
         The folder of the segments cannot be used.
     """
@@ -180,36 +156,36 @@ def recover_segments(store: Store, settings: CaptureSettings) -> list[RecoveredR
 
 
 class _Runs:
-    """Runs by their numbers, each read when it is asked for: with their documents all of a month's runs are 100 MB."""
+    """Runs by number, each loaded on demand: a month's runs with their documents take 100 MB."""
 
     def __init__(self, store: Store) -> None:
         self._store, self._found = store, dict[int, RunRecord | None]()
 
     def get(self, number: int) -> RunRecord | None:
-        """The run, None if there is none."""
+        """Return the run, or None."""
         if number not in self._found:
             self._found[number] = self._store.runs.numbered(number) if 0 < number < MOST_RUNS else None
         return self._found[number]
 
 
 def _in_folder(store: Store, folder: Path, settings: CaptureSettings, *, only_ours: bool) -> list[RecoveredRun]:
-    """Take over what lies in one folder; in one that may be another database's, only what names a run of this one."""
+    """Recover the segments of one folder; ``only_ours``: only those of runs of this database."""
     if not folder.is_dir() or not any(folder.glob(f"*{SUFFIX}")):
         return []
     known = _Runs(store)
     if only_ours and not any(_is_ours(path, known) for path in folder.glob(f"*{SUFFIX}")):
         return []
-    with held_alone(folder / LOCK_NAME) as alone:
-        if not alone:
-            return [RecoveredRun(0, "", 0, 0, f"another process is taking over what is in {folder}; it was left to it")]
+    with exclusive_lock(folder / LOCK_NAME) as locked:
+        if not locked:
+            return [RecoveredRun(0, "", 0, 0, f"another process is recovering {folder}; nothing was done here")]
         paths = [path for path in sorted(folder.glob(f"*{SUFFIX}")) if not only_ours or _is_ours(path, known)]
-        known = _Runs(store)  # anew: another process may have closed some meanwhile
+        known = _Runs(store)  # reload: another process may have closed some
         found = (_recover_one(store, path, known, settings) for path in paths)
         return [one for one in found if one is not None]
 
 
 def _is_ours(path: Path, known: _Runs) -> bool:
-    """Whether a segment says that it is of a run of this database: same number, name and instant of its beginning."""
+    """Whether a segment belongs to a run of this database, by number, name and start time."""
     try:
         records = read_segment(path).records
         about = decode_json(records[0].payload)[0] if records and records[0].kind == OPEN else {}
@@ -220,13 +196,7 @@ def _is_ours(path: Path, known: _Runs) -> bool:
 
 
 def read_segment(path: Path) -> Scan:
-    """Scan a file.
-
-    Raises
-    ------
-    CaptureFault
-        It cannot be read, or a newer version of this program wrote it.
-    """
+    """Scan a segment file. Raises CaptureFault if it is unreadable or of a newer version of this program."""
     try:
         return _read(path)
     except OSError as error:
@@ -234,7 +204,7 @@ def read_segment(path: Path) -> Scan:
 
 
 def _read(path: Path) -> Scan:
-    return scan(path.read_bytes())  # not mapped: a file that is cut meanwhile, or a bad sector, would kill the process
+    return scan(path.read_bytes())  # not mapped: a truncation of the file, or a bad sector, would kill the process
 
 
 def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettings) -> RecoveredRun | None:
@@ -247,10 +217,10 @@ def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettin
     try:
         with is_free(path) as free:
             if not free:
-                return _told(run, f"{path.name} is still open in a process that records; it was left to it")
+                return _report(run, f"a recording process still writes {path.name}; nothing was done")
             return _take_over(store, path, run, settings)
-    except CaptureFault as error:  # of a newer version: that one can take it over
-        return _told(run, f"{path.name} was left as it is: {error}")
+    except CaptureFault as error:  # of a newer version, which can recover it
+        return _report(run, f"{path.name} was left as it is: {error}")
     except (CaptureConflict, ValueError, KeyError, TypeError, OSError) as error:
         return _give_up(store, path, run, error)
     except StoreError as error:
@@ -260,39 +230,39 @@ def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettin
 
 
 def _take_over(store: Store, path: Path, run: RunRecord | None, settings: CaptureSettings) -> RecoveredRun | None:
-    held = _read(path)
-    if run is None or not _belongs(held, run):
+    scanned = _read(path)
+    if run is None or not _belongs(scanned, run):
         return _aside(path, ORPHAN, None, "it belongs to no run of this database")
     if run.status != RUNNING:
-        return _of_closed(store, path, run, held, settings)
-    added = _ingest(store, run.id, held)
-    ledger = settle(store, run.id, held)
-    text = _ending(held, added)
-    capture = ledger.doc() | {"records": len(held.records), "head_sha256": held.head.hex(), "cut_bytes": held.tail_bytes}
-    capture["streams"] = streams_doc(held.records)
+        return _of_closed(store, path, run, scanned, settings)
+    added = _ingest(store, run.id, scanned)
+    ledger = settle(store, run.id, scanned)
+    text = _ending(scanned, added)
+    capture = ledger.doc() | {"records": len(scanned.records), "head_sha256": scanned.head.hex(), "cut_bytes": scanned.tail_bytes}
+    capture["streams"] = streams_doc(scanned.records)
     if not _closed(store, run, text, ledger, capture):
         return None
-    put_away(path, held, keep=settings.keep)
-    return RecoveredRun(run.id, _name(run), added, held.tail_bytes, f"run {_name(run)}: {text}")
+    put_away(path, scanned, keep=settings.keep)
+    return RecoveredRun(run.id, _name(run), added, scanned.tail_bytes, f"run {_name(run)}: {text}")
 
 
-def _of_closed(store: Store, path: Path, run: RunRecord, held: Scan, settings: CaptureSettings) -> RecoveredRun | None:
-    """A run that was closed before the process could delete the file, or that another process closed without it."""
+def _of_closed(store: Store, path: Path, run: RunRecord, scanned: Scan, settings: CaptureSettings) -> RecoveredRun | None:
+    """Handle the segment of a run that was closed before the file was deleted, or by another process without the file."""
     if settings.keep:
         return None
     keys = store.chunks.crcs(run.id)
-    chunks = [record for record in held.records if record.kind in (CHUNK, GAP)]
+    chunks = [record for record in scanned.records if record.kind in (CHUNK, GAP)]
     lacking = sum(keys.get((one.channel, one.chunk_no)) != zlib.crc32(one.payload) for one in chunks)
     if lacking:
         return _aside(path, ORPHAN, run, f"the run is closed, but {lacking} of its {len(chunks)} chunks are not in the database")
-    if held.damaged:
-        return _aside(path, ORPHAN, run, f"the run is closed, and the segment is damaged in {len(held.damaged)} places")
-    put_away(path, held, keep=False)
+    if scanned.damaged:
+        return _aside(path, ORPHAN, run, f"the run is closed, and the segment is damaged in {len(scanned.damaged)} places")
+    put_away(path, scanned, keep=False)
     return None
 
 
 def _closed(store: Store, run: RunRecord, text: str, ledger: Ledger | None, capture: dict[str, Any]) -> bool:
-    """Close a run; False when another process did it at the same time."""
+    """Close a run; False if another process did so at the same time."""
     gaps = [gap.doc() for gap in ledger.gaps] if ledger is not None else []
     try:
         store.runs.finish(run.id, INTERRUPTED, text, {"gaps": gaps, "capture": capture} if ledger is not None else None)
@@ -304,7 +274,7 @@ def _closed(store: Store, run: RunRecord, text: str, ledger: Ledger | None, capt
 
 
 def _give_up(store: Store, path: Path, run: RunRecord | None, error: Exception) -> RecoveredRun | None:
-    """Nothing is overwritten and nothing deleted; the run is closed with the reason, so that the machine can be used."""
+    """Set a segment aside, deleting nothing, and close its run with the reason, so that the machine stays usable."""
     why = f"{error.code}: {error}" if isinstance(error, AbbeError) else repr(error)
     done = _aside(path, CONFLICT, run, why)
     if run is not None and run.status == RUNNING:
@@ -317,14 +287,14 @@ def _give_up(store: Store, path: Path, run: RunRecord | None, error: Exception) 
 
 def _aside(path: Path, suffix: str, run: RunRecord | None, why: str) -> RecoveredRun:
     try:
-        where = f"it was set aside as {set_aside(path, suffix).name}"
+        outcome = f"it was set aside as {set_aside(path, suffix).name}"
     except OSError as error:
-        where = f"it could not be renamed ({error.strerror})"
+        outcome = f"it could not be renamed ({error.strerror})"
     about = f"run {_name(run)}: " if run is not None else ""
-    return _told(run, f"{about}{path.name} was not taken over: {why}; {where}")
+    return _report(run, f"{about}{path.name} was not taken over: {why}; {outcome}")
 
 
-def _told(run: RunRecord | None, text: str) -> RecoveredRun:
+def _report(run: RunRecord | None, text: str) -> RecoveredRun:
     return RecoveredRun(0 if run is None else run.id, "" if run is None else _name(run), 0, 0, text)
 
 
@@ -333,22 +303,22 @@ def _name(run: RunRecord) -> str:
 
 
 def _abandoned(run: RunRecord) -> bool:
-    # a run of this very process that is no longer recorded into was left by a database that did not take its end
+    # an inactive open run of this process: the database did not take its end
     return run.owner.is_gone() or run.owner == this_process()
 
 
-def _belongs(held: Scan, run: RunRecord) -> bool:
-    """A database that was made anew, or another one, has the same numbers for other runs, but none begun at the same microsecond."""
-    if not held.records or held.records[0].kind != OPEN:
+def _belongs(scanned: Scan, run: RunRecord) -> bool:
+    """Whether label and start time match: another database uses the same run numbers, but not the same start microsecond."""
+    if not scanned.records or scanned.records[0].kind != OPEN:
         return True
-    about = decode_json(held.records[0].payload)[0]
+    about = decode_json(scanned.records[0].payload)[0]
     return bool(about.get("label", run.label) == run.label and about.get("started_utc", run.started_utc) == run.started_utc)
 
 
-def _ingest(store: Store, run_id: int, held: Scan) -> int:
+def _ingest(store: Store, run_id: int, scanned: Scan) -> int:
     keys = store.chunks.crcs(run_id)
     missing: list[ChunkRecord] = []
-    for record in held.records:
+    for record in scanned.records:
         if record.kind not in (CHUNK, GAP):
             continue
         known = keys.get((record.channel, record.chunk_no))
@@ -362,17 +332,17 @@ def _ingest(store: Store, run_id: int, held: Scan) -> int:
     return sum(store.chunks.ingest(missing[at : at + BATCH]) for at in range(0, len(missing), BATCH))
 
 
-def _ending(held: Scan, added: int) -> str:
-    closing = [record for record in held.records if record.kind == CLOSE]
+def _ending(scanned: Scan, added: int) -> str:
+    closing = [record for record in scanned.records if record.kind == CLOSE]
     why = "the process ended before the run was closed"
     if closing:
-        said = decode_json(closing[0].payload)[0]
-        why = f"recorded to its end ({said['status']}), but the process ended before the database knew"
+        end = decode_json(closing[0].payload)[0]
+        why = f"recorded to its end ({end['status']}), but the process ended before the database knew"
     parts = [f"interrupted: {why}"]
     if added:
         parts.append(f"{added} chunks were taken over from the segment")
-    if held.damaged:
-        parts.append(f"the segment is damaged in {len(held.damaged)} places and kept beside the others as *{DAMAGED_SUFFIX}")
-    if held.broken_links:
-        parts.append("records of the segment were exchanged or taken out")
+    if scanned.damaged:
+        parts.append(f"the segment is damaged in {len(scanned.damaged)} places and kept beside the others as *{DAMAGED_SUFFIX}")
+    if scanned.broken_links:
+        parts.append("records of the segment were exchanged or removed")
     return "; ".join(parts)

@@ -1,7 +1,6 @@
 """The append-only file of one run: records chained by their hashes, on the disk when `append` returns.
 
-Its records and their bytes, the reserve of disk space that lets a run be closed on a full disk, and the scan that finds how far a file can
-be believed.
+Also the encoding of records, the reserve of disk space for closing a run on a full disk, and the scan that finds the valid part of a file.
 """
 
 from __future__ import annotations
@@ -22,21 +21,14 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Segment:
-    """Writes one segment.
+    """Writes one segment to a new file.
 
-    After an error of the disk the file is left alone for good: what a failed sync has dropped, a second one would claim to have written.
-
-    Parameters
-    ----------
-    io : FileIO
-        Where files are.
-    path : Path
-        The file; it must not exist.
+    After a disk error the file is never written again: a second sync would report success for data that the failed one dropped.
 
     Raises
     ------
     DiskFull, CaptureFault
-        It cannot be made.
+        The file exists or cannot be created.
     """
 
     def __init__(self, io: FileIO, path: Path) -> None:
@@ -52,18 +44,18 @@ class Segment:
             io.sync_folder(path.parent)
         except OSError as error:
             with suppress(CaptureFault, DiskFull):
-                self.close()  # else its lock would outlive it
+                self.close()  # releases the lock
             raise fault(path, "make", error) from error
 
     def append(self, records: Sequence[Record]) -> list[tuple[int, int]]:
-        """Write records and wait until they are on the disk; returns offset and length of each.
+        """Write records and wait until they are on the disk; return offset and length of each.
 
         Raises
         ------
         DiskFull
-            No room. The file is as it was before; the same records may be appended again once there is room.
+            No room. The file is unchanged, and the same records may be appended once there is room.
         CaptureFault
-            Anything else, also no room at the sync. Nothing can be appended any more.
+            Any other error, including no room at the sync. The segment accepts nothing more.
         """
         if self.dead:
             raise CaptureFault(f"{self.path}: an earlier error of the disk ended this file")
@@ -80,12 +72,12 @@ class Segment:
         return places
 
     def close(self) -> None:
-        """Give the file back. Closing twice does nothing.
+        """Close the file. Closing twice does nothing.
 
         Raises
         ------
         DiskFull, CaptureFault
-            The disk reports an error only now.
+            The disk reports a delayed error.
         """
         handle, self._handle = self._handle, -1
         if handle >= 0:
@@ -117,11 +109,11 @@ class Segment:
             self.dead = True
 
 
-_DISK = "look at the disk and at the system's log; what was acknowledged before is kept"
+_DISK = "look at the disk and at the system's log; everything acknowledged before is kept"
 
 
 def fault(path: Path, what: str, error: OSError) -> CaptureFault | DiskFull:
-    """An error of the disk in the words of the job."""
+    """Convert a disk error to DiskFull or CaptureFault."""
     if error.errno in NO_SPACE:
         return DiskFull(f"{path}: {what}: no space left on the disk", "free disk space, then measure this test again")
     return CaptureFault(f"{path}: {what}: {error.strerror or error}", _DISK)
@@ -148,30 +140,26 @@ class Record:
     ----------
     kind : int
         ``OPEN``, ``CHUNK``, ``GAP`` or ``CLOSE``.
-    run : int
-        Run in the database.
-    channel, codec : str
-        As in the database.
     chunk_no : int
         Number in its channel, from 0.
     stream : int
-        Which stream of the run: sequence numbers begin anew in each.
+        Number of the stream in the run; sequence numbers begin anew in each stream.
     boot_id : int
-        Of the device, 0 where it has none.
+        Of the device, 0 if it has none.
     first_seq, count : int
-        First sequence number and how many samples.
+        First sequence number and number of samples.
     flags : int
-        All status bits that any of the samples has.
+        Union of the samples' status bits.
     first_us, last_us : int
         Device clock of the first and the last sample.
     first_host_s, last_host_s : float
         Monotonic host time of the first and the last arrival.
     utc_offset_s : float
-        What to add to the monotonic host time to get UTC, as this computer believed then; no sample time depends on it.
+        UTC minus monotonic host time by this computer's clock; no sample time depends on it.
     payload : bytes
         Packed samples, or JSON.
     previous : bytes
-        SHA-256 of the record before in the same file.
+        SHA-256 of the previous record in the file.
     """
 
     kind: int
@@ -194,7 +182,7 @@ class Record:
 
 
 def encode(record: Record) -> bytes:
-    """Bytes of a record."""
+    """Encode a record."""
     r = record
     head = _HEAD.pack(
         MAGIC, VERSION, r.kind, r.stream, r.run, r.chunk_no, r.boot_id, r.channel.encode(), r.codec.encode(), r.first_seq, r.count, r.flags,
@@ -205,17 +193,17 @@ def encode(record: Record) -> bytes:
 
 
 def digest(encoded: bytes | memoryview) -> bytes:
-    """What the next record holds of this one."""
+    """SHA-256 of an encoded record, for the next record."""
     return hashlib.sha256(encoded).digest()
 
 
 def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
-    """The record that begins at a place, and where it ends; None when there is no whole and undamaged one.
+    """Return the record at an offset, and the offset of its end; None without a whole and undamaged record.
 
     Raises
     ------
     CaptureFault
-        There is one, undamaged, of another version: nothing may be taken for a torn tail.
+        The record is undamaged but of another version, so it must not count as a torn tail.
     """
     if at + HEAD_BYTES > len(data) or bytes(data[at : at + 4]) != MAGIC:
         return None
@@ -229,7 +217,7 @@ def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
     if version != VERSION:
         raise CaptureFault(
             f"a record of format {version}: this segment was made by a newer version of this program",
-            "start the newer version once, it takes the run over; nothing was changed",
+            "start the newer version once, it recovers the run; nothing was changed",
         )
     payload = bytes(data[at + HEAD_BYTES : body_end])
     names = (channel.rstrip(b"\0").decode(), codec.rstrip(b"\0").decode())
@@ -240,30 +228,30 @@ def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Bytes between good records that are no record: bits that flipped, or a sector that was lost."""
+    """Bytes between good records that are no record: flipped bits, or a lost sector."""
 
     offset: int
     length: int
     before: int
-    """How many good records stand before it."""
+    """Number of good records before the damage."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What a segment holds.
+    """Content of a segment.
 
     Parameters
     ----------
     records : list of Record
-        Every undamaged one, in order.
+        All undamaged records, in order.
     damaged : list of Damage
-        Damage with good records behind it.
+        Damage followed by good records.
     good_bytes : int
-        Where the last good record ends; what follows was never acknowledged and may be cut off.
+        End of the last good record; later bytes were never acknowledged and may be cut off.
     tail_bytes : int
-        How much that is.
+        Number of these later bytes.
     broken_links : list of int
-        Records that do not follow on the one before them: something was taken out, put in or changed on purpose.
+        Records whose hash does not match the previous record: somebody removed, inserted or changed one.
     head : bytes
         SHA-256 of the last good record.
     """
@@ -277,20 +265,20 @@ class Scan:
 
     @property
     def closed(self) -> bool:
-        """True when the run was ended, not cut off."""
+        """Whether the run ended in order."""
         return bool(self.records) and self.records[-1].kind == CLOSE
 
     @property
     def whole(self) -> bool:
-        """True when every byte is part of one unbroken chain."""
+        """Whether every byte is part of one unbroken chain."""
         return not (self.damaged or self.tail_bytes or self.broken_links)
 
 
 def scan(data: bytes | memoryview) -> Scan:
     """Find every good record of a segment.
 
-    A bad record ends the search only if no good one follows: this distinguishes a torn tail from damage in the
-    middle; neither costs a good record.
+    A bad record ends the search only if no good one follows: this distinguishes a torn tail from damage in the middle, and keeps every good
+    record in both cases.
     """
     records: list[Record] = []
     damaged: list[Damage] = []
@@ -314,7 +302,7 @@ def scan(data: bytes | memoryview) -> Scan:
 
 
 def _next_good(data: bytes | memoryview, at: int) -> int:
-    """Where the next undamaged record begins, or -1."""
+    """Offset of the next undamaged record, or -1."""
     rest = bytes(data[at:])
     found = rest.find(MAGIC)
     while found >= 0:
@@ -325,17 +313,7 @@ def _next_good(data: bytes | memoryview, at: int) -> int:
 
 
 class Reserve:
-    """A file of a given size in the folder of the segments.
-
-    Parameters
-    ----------
-    io : FileIO
-        Where files are.
-    folder : Path
-        Of the segments.
-    size : int
-        Bytes.
-    """
+    """Disk space reserved by a file of ``size`` bytes in the folder of the segments."""
 
     def __init__(self, io: FileIO, folder: Path, size: int) -> None:
         self._io, self._folder, self._size = io, folder, size
@@ -343,12 +321,12 @@ class Reserve:
         self._held = False
 
     def hold(self) -> None:
-        """Make sure that it is there; of size 0 there is none.
+        """Create the file unless its size is 0.
 
         Raises
         ------
         DiskFull, CaptureFault
-            There is no room for it: nothing should be begun.
+            There is no room: no recording should begin.
         """
         if not self._size:
             return
@@ -356,11 +334,11 @@ class Reserve:
             self._io.hold_space(self._path, self._size)
             self._io.sync_folder(self._folder)
         except OSError as error:
-            raise fault(self._path, "hold back disk space", error) from error
+            raise fault(self._path, "reserve disk space", error) from error
         self._held = True
 
     def release(self) -> bool:
-        """Give the space back; False when it was given back before or cannot be."""
+        """Free the space; False if it is already free or cannot be freed."""
         if not self._held:
             return False
         self._held = False

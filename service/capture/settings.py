@@ -1,4 +1,4 @@
-"""Where segments lie until the database has everything: beside a SQLite file, else in a folder of the machine file."""
+"""Folder of the segments until the database has everything: beside a SQLite file, else from the machine file."""
 
 from __future__ import annotations
 
@@ -17,27 +17,21 @@ from abbe.service.storage.store import Store
 MIB = 1 << 20
 SUFFIX = ".seg"
 ORPHAN = ".orphan"
-"""Set aside: a segment of no run of this database, or of a closed run that does not have all of it."""
+"""Set aside: a segment without a run in this database, or of a closed run that lacks some of its records."""
 CONFLICT = ".conflict"
 """Set aside: a segment that contradicts the database or cannot be read."""
 DAMAGED_SUFFIX = ".damaged"
-"""Set aside: a segment with damage between good records; what could be read is in the database."""
+"""Set aside: a segment with damage between good records; its readable records are in the database."""
 TAIL = ".tail"
-"""A copy of what was cut off the end of a segment."""
+"""A copy of the tail that was cut off a segment."""
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureSettings:
-    """How samples are made safe.
+    """Settings of the capture.
 
-    Parameters
-    ----------
-    folder : str
-        Local folder for segments; empty: beside the SQLite file.
-    reserve_bytes : int
-        Disk space held back to close a run when the disk is full.
-    keep : bool
-        Keep segments although the database has everything.
+    ``folder``: local folder for segments, empty: beside the SQLite file. ``reserve_bytes``: disk space reserved for closing a run on a full
+    disk. ``keep``: keep segments although the database has everything.
     """
 
     folder: str = ""
@@ -46,22 +40,20 @@ class CaptureSettings:
 
 
 def is_memory(database_url: str) -> bool:
-    """Tell whether the database ends with the process; segments that outlive it would belong to no database."""
+    """Whether the database ends with the process; remaining segments would belong to no database."""
     parsed = parse_url(database_url)
     return parsed.drivername == "sqlite" and parsed.database in {None, "", ":memory:"}
 
 
 def segment_folder(database_url: str, settings: CaptureSettings, database_id: str = "") -> Path:
-    """Folder of the segments of a database, however its address is written; not created.
+    """Return the folder of the segments of a database, independent of the form of its address; does not create it.
 
     Parameters
     ----------
     database_url : str
-        As the store was opened; a password in it does not matter. Of SQLite the file counts that it leads to, be it by a link.
-    settings : CaptureSettings
-        Of the machine file.
+        As the store was opened; for SQLite the file after following links counts.
     database_id : str
-        Of a database on a server: what it calls itself (`Store.database_id`), for it has many addresses.
+        Own name of a database on a server (`Store.database_id`), which may have several addresses.
 
     Raises
     ------
@@ -83,15 +75,15 @@ def segment_folder(database_url: str, settings: CaptureSettings, database_id: st
 
 
 def _named(folder: str, name: str, what: str) -> Path:
-    """A folder may serve several databases, whose runs have the same numbers."""
+    """Subfolder per database: several databases may share a folder, and use the same run numbers."""
     readable = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
     return Path(folder) / f"{readable}-{hashlib.sha256(what.encode()).hexdigest()[:8]}"
 
 
 def other_folders(database_url: str, settings: CaptureSettings, present: Path) -> list[Path]:
-    """Where earlier versions, which named the folder by the address, or another machine file may have left segments of this database.
+    """Folders where earlier versions or another machine file may have left segments of this database.
 
-    What lies there may as well be of other databases: only what names a run of this one may be touched.
+    They may also hold segments of other databases: touch only those of runs of this one.
     """
     parsed = parse_url(database_url)
     found = []
@@ -111,25 +103,19 @@ def segment_path(folder: Path, run_id: int) -> Path:
 
 
 def free_name(path: Path, suffix: str) -> Path:
-    """Name beside a file with another suffix that nothing has yet, e.g. ``run-00000012.orphan-2``."""
+    """Return an unused name beside a file with another suffix, e.g. ``run-00000012.orphan-2``."""
     names = (path.with_suffix(suffix if k == 1 else f"{suffix}-{k}") for k in count(1))
     return next(name for name in names if not name.exists())
 
 
 def set_aside(path: Path, suffix: str) -> Path:
-    """Rename a file so that it no longer counts as a segment, and nothing is overwritten. Raises OSError."""
+    """Rename a file so that it no longer counts as a segment; overwrites nothing. Raises OSError."""
     name = free_name(path, suffix)
     path.rename(name)
     return name
 
 
 def folder_of(store: Store, settings: CaptureSettings) -> Path:
-    """Folder of the segments of a store; the same whatever address it was opened by. Not created.
-
-    Raises
-    ------
-    ConfigError
-        A PostgreSQL database, and no folder is configured.
-    """
+    """Return the folder of the segments of a store; arguments and errors as for `segment_folder`."""
     on_server = parse_url(store.url).drivername != "sqlite"
     return segment_folder(store.url, settings, store.database_id() if on_server and settings.folder else "")

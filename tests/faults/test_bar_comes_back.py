@@ -77,7 +77,7 @@ def whole(store: Store, run_id: int) -> list[int]:
     """Sequence numbers of a run's stream, which begins at 0 and has none twice and none unaccounted."""
     chunks = store.chunks.of_run(run_id)
     ledger = ledger_of(chunks)
-    assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
+    assert (ledger.unaccounted(), ledger.duplicates()) == ([], 0)
     return [sample.seq for chunk in chunks if chunk.channel == "bar" for sample in decode_bar(chunk.payload)]
 
 

@@ -100,7 +100,7 @@ async def test_and_into_the_runs_account_with_an_open_gap_behind_it(tmp_path: Pa
         stored = [sample.seq for chunk in chunks if chunk.channel == "bar" for sample in decode_bar(chunk.payload)]
         assert stored == sent
         ledger = ledger_of(chunks)
-        assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
+        assert (ledger.unaccounted(), ledger.duplicates()) == ([], 0)
         (gap,) = ledger.gaps
         assert (gap.first, gap.last) == (sent[-1] + 1, None)
         assert "the device has gone" in gap.cause

@@ -50,7 +50,7 @@ def test_a_killed_measurement_is_taken_over_by_the_next_command(abbe, start_sims
         chunks = store.chunks.of_run(run.id)
     assert len([one for one in chunks if one.channel == "bar"]) >= known
     ledger = ledger_of(chunks)
-    assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
+    assert (ledger.unaccounted(), ledger.duplicates()) == ([], 0)
     assert ledger.stored > 20
     assert not segment.exists()
 

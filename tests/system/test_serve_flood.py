@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.capture.ledger import ledger_of, streams_told
+from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 from abbe.service.storage.store import Store
 from tests.system.serve_bench import Machine, abbe, free_port
 from tests.system.test_serve_processes import running, tokens, url_of
@@ -128,9 +128,9 @@ def test_a_flood_costs_no_sample_and_leaves_the_page_usable(tmp_path: Path) -> N
     made.process.close()
     with Store.open(url_of(tmp_path)) as store:
         runs = [run for run in store.runs.all() if run.status == "complete"]
-        ledgers = [ledger_of(store.chunks.of_run(run.id), streams_told(run.end_doc)) for run in runs]
+        ledgers = [ledger_of(store.chunks.of_run(run.id), streams_from_end_doc(run.end_doc)) for run in runs]
         assert len(store.verifications.of_machine("mill-7")) == checks
-    assert [(ledger.unaccounted(), ledger.twice()) for ledger in ledgers] == [([], 0)] * len(runs)
+    assert [(ledger.unaccounted(), ledger.duplicates()) for ledger in ledgers] == [([], 0)] * len(runs)
     p95_s = sorted(took_s)[int(0.95 * len(took_s))]
     print(  # noqa: T201 - figures for whoever runs it by hand
         f"{flood.opened} idle, {flood.dripped} bytes dripped, {flood.poured} bodies; {checks} checks, {len(runs)} runs, "

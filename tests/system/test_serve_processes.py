@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.capture.ledger import ledger_of, streams_told
+from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store
 from abbe.service.users.people import People
@@ -144,8 +144,8 @@ def test_the_page_is_killed_during_a_check_and_no_sample_is_missing(tmp_path: Pa
         runs = store.runs.all()
         assert len(runs) == len(check.doc["runs"]) > 2
         assert {run.status for run in runs} == {"complete"}
-        ledgers = [ledger_of(store.chunks.of_run(run.id), streams_told(run.end_doc)) for run in runs]
-        assert [(ledger.unaccounted(), ledger.twice()) for ledger in ledgers] == [([], 0)] * len(runs)
+        ledgers = [ledger_of(store.chunks.of_run(run.id), streams_from_end_doc(run.end_doc)) for run in runs]
+        assert [(ledger.unaccounted(), ledger.duplicates()) for ledger in ledgers] == [([], 0)] * len(runs)
         assert sum(ledger.stored for ledger in ledgers) > 1000
         assert AuditBook(store, url_of(tmp_path)).verify() == []
     print(f"page back after {back_s:.2f} s")  # noqa: T201 - a figure for whoever runs it by hand

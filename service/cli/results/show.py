@@ -79,9 +79,9 @@ def show(
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
     """Where every ball-bar sample ended: stored, flagged, or in which gap."""
     from abbe.drivers.flags import BAR_REASONS
-    from abbe.service.capture.ledger import ledger_of, streams_told
+    from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 
-    streams = streams_told(run.end_doc)
+    streams = streams_from_end_doc(run.end_doc)
     ledger = ledger_of(chunks, streams)
     if not ledger.stored and not ledger.gaps:
         return {}

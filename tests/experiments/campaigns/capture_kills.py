@@ -160,7 +160,7 @@ def _judge(url: str, number: int, durable: int) -> dict[str, object]:
             (not held.whole, "the chain is broken"),
             (bool(before.damaged) or bool(before.broken_links), "damage in the middle"),
             (bool(ledger.unaccounted()), f"unaccounted {ledger.unaccounted()}"),
-            (bool(ledger.twice()), "a number twice"),
+            (bool(ledger.duplicates()), "a number twice"),
             (any((one.device_us, one.reading_nm) != (1000 * (one.seq + 1), reading(one.seq)) for one in samples), "a changed sample"),
             (any(b.seq <= a.seq for a, b in itertools.pairwise(samples)), "out of order"),
             (last < durable, f"durable {durable}, but the last stored is {last}"),

@@ -200,6 +200,6 @@ def _compare(box: list[list[int | str]], store: Store, run_id: int) -> dict[str,
         "unaccounted": len(everything - stored - in_gaps),
         "in_no_ledger": len((stored | in_gaps) - everything),
         "stored_though_not_sent": len(stored & lost),
-        "twice": ours.twice() + len(stored & in_gaps),
+        "twice": ours.duplicates() + len(stored & in_gaps),
         "sent_but_in_gap": len(in_gaps - lost),
     }

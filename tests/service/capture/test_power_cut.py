@@ -132,7 +132,7 @@ def _recovered(store: Store, run_id: int, settings: CaptureSettings, state: byte
     assert_true(found)
     ledger = ledger_of(store.chunks.of_run(run_id))
     assert ledger.unaccounted() == []
-    assert ledger.twice() == 0
+    assert ledger.duplicates() == 0
     last = found[-1].seq if found else -1
     assert last >= durable
     return last

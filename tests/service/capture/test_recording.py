@@ -84,7 +84,7 @@ async def test_every_sample_is_in_the_segment_and_in_the_database_and_the_ledger
     assert [record.kind for record in held.records][0 :: len(held.records) - 1] == [OPEN, CLOSE]
     assert held.head.hex() == doc["capture"]["head_sha256"]
     ledger = ledger_of(store.chunks.of_run(run_id))
-    assert (ledger.stored, ledger.unaccounted(), ledger.twice(), len(ledger.gaps)) == (140, [], 0, 1)
+    assert (ledger.stored, ledger.unaccounted(), ledger.duplicates(), len(ledger.gaps)) == (140, [], 0, 1)
     assert decode_json(store.chunks.of_run(run_id, "laser")[0].payload) == [{"host_s": 1.0, "ctrl_us": 7, "displacement_tenth_nm": 5}]
 
 

@@ -120,7 +120,7 @@ def test_gaps_of_the_recovery_get_numbers_that_neither_segment_nor_database_has(
     recover_segments(store, PLAIN)
     ledger = ledger_of(store.chunks.of_run(run_id))
     assert sorted((gap.first, gap.last) for gap in ledger.gaps) == [(25, 29), (55, 79), (80, 84)]
-    assert (ledger.unaccounted(), ledger.twice()) == ([], 0)
+    assert (ledger.unaccounted(), ledger.duplicates()) == ([], 0)
     end = store.runs.find(str(run_id)).end_doc
     assert end is not None
     assert (end["capture"]["unaccounted"], end["capture"]["in_gaps"]) == (0, 35)
@@ -168,8 +168,8 @@ def test_bad_segments_stop_neither_the_others_nor_the_machine(store: Store, fold
 
 def test_only_one_recovers_at_a_time(store: Store, folder: Path, monkeypatch) -> None:  # noqa: F811
     run_id = crashed(store, folder)
-    held_alone = recovery.held_alone
-    monkeypatch.setattr(recovery, "held_alone", lambda path: held_alone(path, 0.1))
+    exclusive_lock = recovery.exclusive_lock
+    monkeypatch.setattr(recovery, "exclusive_lock", lambda path: exclusive_lock(path, 0.1))
     other = os.open(folder / "recovery.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(other, fcntl.LOCK_EX)
     (told,) = recover_segments(store, PLAIN)
