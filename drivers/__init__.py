@@ -1,1 +1,1 @@
-"""Drivers know bytes: async conversations with instruments and controllers, nothing about physics or jobs."""
+"""Drivers: async communication with instruments and controllers; they know bytes, not physics or jobs."""

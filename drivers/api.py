@@ -1,7 +1,7 @@
-"""What devices can do, as small Protocols, and the plain values they return.
+"""Capabilities of devices as small Protocols, and the plain values they return.
 
-Lengths here keep the unit of the wire's meaning (mm for commands, nm or 0.1 nm counts for raw readings) so that nothing is lost before
-storage; the service turns raw counts into arrays in one place. Times ``host_s`` are monotonic host seconds at the last byte.
+Lengths keep the unit of the wire (mm for commands, nm or 0.1 nm counts for raw readings), so that nothing is lost before storage; the
+service turns raw counts into arrays in one place. Times ``host_s`` are monotonic host seconds at the last byte.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who answered."""
+    """Identity of a device."""
 
     kind: str
     model: str
@@ -37,7 +37,7 @@ class BarSample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BarBatch:
-    """Samples that arrived together. ``missing``: samples the sequence numbers say are lost just before this batch's samples.
+    """Samples that arrived together. ``missing``: number of samples lost just before this batch, by the sequence numbers.
 
     ``boot_id``: of the box that sent them. ``overran``: bytes were lost before these samples because this computer did not keep up.
     """
@@ -50,14 +50,14 @@ class BarBatch:
 
 
 class BarTap(Protocol):
-    """Takes every sample of a stream before anybody else sees it, in a thread of the driver: the way to the disk."""
+    """Takes every sample of a stream before all consumers, in a thread of the driver, for recording."""
 
     def take(self, batch: BarBatch) -> None:
-        """Take a batch, in order and exactly once. It may block while the disk is slow: the ring in front of it waits. It never raises."""
+        """Take a batch, in order and exactly once. May block while the disk is slow: the ring buffers meanwhile. Never raises."""
         ...
 
     def warn(self, text: str) -> None:
-        """Hear that the ring fills up. Must not block."""
+        """Receive a warning that the ring fills. Must not block."""
         ...
 
 
@@ -78,7 +78,7 @@ class LaserReading:
 
 
 class Condition(Flag):
-    """What holds at a controller. A driver maps its own status on these; their numbers mean nothing on any wire."""
+    """Conditions of a controller. Drivers map their status bits to these; the numbers appear on no wire."""
 
     ESTOP = auto()
     DOOR_OPEN = auto()
@@ -100,10 +100,10 @@ NOTHING_HOLDS = Condition(0)
 
 @dataclass(frozen=True, slots=True)
 class ControllerStatus:
-    """One coherent look at a controller. ``_us``: its own clock, in microseconds.
+    """One coherent status of a controller. ``_us``: its own clock, in microseconds.
 
-    ``path_start_us`` and ``path_end_us``: of the last path; the end is the smaller one while a path is followed. ``in_position_us``: when
-    the axes came to stand where they are.
+    ``path_start_us`` and ``path_end_us``: of the last path; the end is the smaller one while a path runs. ``in_position_us``: when the axes
+    last came to a stop.
     """
 
     host_s: float
@@ -123,12 +123,12 @@ class ControllerStatus:
 
     @property
     def path_running(self) -> bool:
-        """Whether a path is being followed."""
+        """Whether a path runs."""
         return Condition.PATH_RUNNING in self.conditions
 
     @property
     def compensation_on(self) -> bool:
-        """Whether the table in force acts."""
+        """Whether compensation is on."""
         return Condition.COMPENSATION_ON in self.conditions
 
     @property
@@ -143,20 +143,20 @@ class ControllerStatus:
 
 
 class BankState(StrEnum):
-    """What a bank for compensation tables holds. A driver maps its own numbers on these."""
+    """State of a bank for compensation tables. Drivers map their own numbers to these."""
 
     EMPTY = "empty"
     WRITING = "being written"
     SEALED = "sealed"
     LAID_ASIDE = "laid aside"
-    """Sealed, and acts after the control's next start."""
+    """Sealed, and takes effect after the control's next start."""
     UNKNOWN = "unknown"
-    """The controller says something that its driver does not know."""
+    """The controller reports a number that its driver does not know."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompStatus:
-    """One coherent look at the compensation banks, with the generation counter and boot id read around it (seqlock).
+    """One coherent status of the compensation banks, with the generation counter and boot id read around it (seqlock).
 
     ``bank_crc`` is 0 for a bank that is not sealed.
     """
@@ -172,7 +172,7 @@ class CompStatus:
 
 @dataclass(frozen=True, slots=True)
 class TableFormat:
-    """How a controller stores tables: unit of a value, size of a bank."""
+    """Storage format of a controller's tables: unit of a value, size of a bank."""
 
     lsb_nm: int
     bank_registers: int
@@ -204,7 +204,7 @@ class DisplacementMeter(Protocol):
 
 
 class Identity(Protocol):
-    """Who a controller is and how it is: everything that can be asked without changing anything."""
+    """Identity and status of a controller: all requests that change nothing."""
 
     async def identify(self) -> DeviceInfo: ...
     async def status(self) -> ControllerStatus: ...
@@ -214,7 +214,7 @@ class Identity(Protocol):
 
 
 class Motion(Protocol):
-    """Straight moves, and stopping whatever moves."""
+    """Straight moves, and stops of any motion."""
 
     async def status(self) -> ControllerStatus: ...
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus: ...
@@ -230,7 +230,7 @@ class Paths(Motion, Protocol):
 
 
 class Tables(Protocol):
-    """Two banks for compensation tables, and the lease that permits to change them.
+    """Two banks for compensation tables, and the lease that allows changing them.
 
     A bank holds an image (`abbe.drivers.tables`); ``first`` and sizes count its 16-bit words.
     """
@@ -244,11 +244,11 @@ class Tables(Protocol):
 
 
 class TableController(Identity, Tables, Protocol):
-    """What a push needs: it looks and it changes banks, but moves nothing."""
+    """The part of a controller that a push needs: status and banks, but no motion."""
 
 
 class Controller(Identity, Paths, Tables, Protocol):
-    """Everything that an open session can do with a controller. Functions ask for the part that they need."""
+    """All capabilities of a controller. Functions should require only the part that they need."""
 
 
 class Fixture(Protocol):

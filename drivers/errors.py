@@ -1,4 +1,4 @@
-"""Errors of the wire. Each names the device, what was tried, what happened and what to do about it."""
+"""Errors of devices and links. Each names the device, the operation, what happened and a remedy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _RUN: ContextVar[str] = ContextVar("run", default=NO_RUN)
 
 @contextmanager
 def on_behalf_of(run: str) -> Iterator[None]:
-    """Name the run that everything in this block (and in tasks started in it) happens for: its errors and records say so."""
+    """Attach a run's name to all errors and records in this block, including tasks started in it."""
     token = _RUN.set(run)
     try:
         yield
@@ -21,23 +21,10 @@ def on_behalf_of(run: str) -> Iterator[None]:
 
 
 class DriverError(Exception):
-    """A device could not do what was asked.
+    """A device operation failed.
 
-    Parameters
-    ----------
-    device : str
-        Name or URL of the device as the user wrote it.
-    operation : str
-        What was being tried, e.g. ``"read status"``.
-    detail : str
-        What happened.
-    remedy : str, optional
-        What a person can do about it.
-
-    Attributes
-    ----------
-    run : str
-        The run that it happened to (``on_behalf_of``).
+    ``device``: name or URL as the user wrote it; ``operation``: e.g. ``"read status"``; ``detail``: what happened; ``remedy``: for
+    a person; ``run``: the affected run (``on_behalf_of``).
     """
 
     code = "DRV-000"
@@ -53,13 +40,13 @@ class DriverError(Exception):
 
 
 class BadUrl(DriverError):
-    """The device URL cannot be understood."""
+    """The device URL is not valid."""
 
     code = "DRV-001"
 
 
 class LinkDown(DriverError):
-    """The port cannot be opened, or the peer has gone."""
+    """The port cannot be opened, or the connection was lost."""
 
     code = "DRV-002"
     retryable = True
@@ -73,13 +60,13 @@ class ReplyTimeout(DriverError, TimeoutError):
 
 
 class BadFrame(DriverError):
-    """Bytes arrived that are not a frame of the protocol, or a reply that does not answer the request."""
+    """Bytes arrived that are no frame of the protocol, or a reply that does not match the request."""
 
     code = "DRV-004"
 
 
 class WrongDevice(DriverError):
-    """Canary registers, map version or identity are not what the protocol demands."""
+    """Canary registers, map version or identity do not match the protocol."""
 
     code = "DRV-005"
 
@@ -91,30 +78,30 @@ class DeviceFault(DriverError):
 
 
 class Refused(DriverError):
-    """The device understood and refused: interlock, stroke limit, lease, compare-and-swap."""
+    """The device refused a valid request: interlock, stroke limit, lease, compare-and-swap."""
 
     code = "DRV-007"
 
 
 class Rebooted(DriverError):
-    """The device restarted (new boot id): nothing measured before may be joined to what comes after."""
+    """The device restarted (new boot id): data before and after must not be joined."""
 
     code = "DRV-008"
 
 
 class Backpressure(DriverError):
-    """This computer does not keep up with the device: the motion is stopped before a sample is lost."""
+    """This computer does not keep up with the device: the motion stops before a sample is lost."""
 
     code = "DRV-009"
 
 
 class SettingsChanged(DriverError):
-    """The device's own settings (unit, range, zero) are not those that were accepted: readings before and after must not be joined."""
+    """The device's settings (unit, range, zero) changed: readings before and after must not be joined."""
 
     code = "DRV-010"
 
 
 class LossyLine(DriverError):
-    """More than 0.1 % of the samples of a run were lost on the line: what is left is too little to be trusted."""
+    """The line lost more than 0.1 % of the samples of a run: the rest is not reliable."""
 
     code = "DRV-011"

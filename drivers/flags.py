@@ -1,6 +1,6 @@
-"""What the status word of a reading says, for readings that were stored as the instrument sent them (docs/protocols).
+"""Meaning of the status word of stored readings (docs/protocols).
 
-A run keeps the word itself; what its bits mean stands here and nowhere else outside the drivers.
+A run stores the word itself; outside the drivers only this module interprets its bits.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _BAR_OUT = int(BarFlag.OUT_OF_RANGE | BarFlag.NO_BAR)
 _BAR_INVALID = _BAR_OUT | _OVERRUN
 _BAR_REASONS = ((int(BarFlag.OUT_OF_RANGE), "out of range"), (_OVERRUN, "samples lost before it"), (int(BarFlag.NO_BAR), "no bar"))
 BAR_REASONS = tuple(reason for _, reason in _BAR_REASONS)
-"""Why a reading of the ball-bar is none: everything that the box can say."""
+"""All reasons for an invalid ball-bar reading that the box can report."""
 _BEAM_GONE = int(LaserFlag.BEAM_LOST | LaserFlag.NO_REFLECTOR)
 _BEAM_BAD = _BEAM_GONE | int(LaserFlag.SIGNAL_LOW)
 _COMPENSATED = int(LaserFlag.COMPENSATED)
@@ -46,17 +46,17 @@ def on_path(status: int) -> bool:
 
 
 def bar_is_out(status: int) -> bool:
-    """Whether the bar was out of range or not there."""
+    """Whether the bar was out of range or absent."""
     return bool(status & _BAR_OUT)
 
 
 def bar_is_valid(status: int) -> bool:
-    """Whether the box says that the reading is one: in range, a bar there, no samples lost just before."""
+    """Whether the reading is valid: in range, a bar present, no samples lost just before."""
     return not status & _BAR_INVALID
 
 
 def bar_reasons(status: int) -> list[str]:
-    """Why the box says that the reading is none, in words; empty where it is one."""
+    """Reasons why the reading is invalid; empty if it is valid."""
     return [reason for bit, reason in _BAR_REASONS if status & bit]
 
 
@@ -66,7 +66,7 @@ def overran(status: int) -> bool:
 
 
 def beam_is_good(status: int) -> bool:
-    """Whether the laser's count can be trusted: beam never lost since the zero, strong enough, a reflector there."""
+    """Whether the laser's count is valid: beam never lost since the zero, strong enough, a reflector present."""
     return not status & _BEAM_BAD
 
 
@@ -76,12 +76,12 @@ def beam_is_gone(status: int) -> bool:
 
 
 def signal_is_there(status: int) -> bool:
-    """Whether the laser sees a reflector with a strong signal now, whatever was before."""
+    """Whether the laser now sees a reflector with a strong signal, regardless of earlier losses."""
     return not status & _NO_SIGNAL
 
 
 def is_zeroed(status: int) -> bool:
-    """Whether the laser's count begins at a zero that was asked for."""
+    """Whether the laser was zeroed."""
     return bool(status & _ZEROED)
 
 

@@ -1,6 +1,6 @@
-"""From a device URL to a driver that is connected and has proven that it talks to the right kind of device.
+"""Opens devices by URL: returns a connected driver that has verified the kind of its device.
 
-A package adds another protocol by an entry point named as its URL scheme::
+A package adds another protocol by an entry point named like its URL scheme::
 
     [project.entry-points."abbe.cnc"]
     "acme+tcp" = "acme_driver:open_controller"      # async def open_controller(url: str) -> abbe.drivers.api.Controller
@@ -23,7 +23,7 @@ from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, installed, parse_url
 
 HEARTBEAT_S = 1.0
-"""Seconds between two reads of the canary of an idle controller or laser, so that a lost one is known within 3 s."""
+"""Seconds between canary reads of an idle controller or laser, so that a loss is detected within 3 s."""
 
 
 async def open_ballbar(url: str) -> BallBar:
@@ -68,12 +68,7 @@ async def open_laser(url: str) -> DisplacementMeter:
 async def open_controller(url: str, *, commissioned: str = "") -> Controller:
     """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL, or one of an installed driver.
 
-    Parameters
-    ----------
-    url : str
-        The URL as the user wrote it.
-    commissioned : str
-        What ``identify().firmware`` said when this machine was commissioned; another answer is refused. Empty: any map of this version.
+    ``commissioned``: ``identify().firmware`` at commissioning; any other is refused. Empty: any map of this version.
 
     Raises
     ------
@@ -99,12 +94,7 @@ async def open_controller(url: str, *, commissioned: str = "") -> Controller:
 async def open_fixture(url: str, ask: Ask) -> Fixture:
     """Open the fixture behind a ``fixture+tcp://`` or ``fixture+console:`` URL.
 
-    Parameters
-    ----------
-    url : str
-        The URL as the user wrote it.
-    ask : callable
-        ``await ask(text)`` asks the operator and returns when confirmed; used by the console only.
+    ``await ask(text)`` asks the operator and returns when confirmed; only the console uses it.
 
     Raises
     ------
@@ -124,10 +114,10 @@ async def open_fixture(url: str, ask: Ask) -> Fixture:
 
 
 async def _opened(entry: EntryPoint, url: str) -> object:
-    """Let an installed package's driver open its device."""
+    """Open a device with the driver of an installed package."""
     try:
         opener = entry.load()
-    except Exception as fault:  # whatever a stranger's module does on import
+    except Exception as fault:  # an import of foreign code may raise anything
         detail = f"the driver {entry.value} cannot be loaded: {type(fault).__name__}: {fault}"
         raise BadUrl(ascii(url), "open device", detail, "repair or remove the package that offers it") from fault
     return await opener(url)
@@ -145,7 +135,7 @@ def _wrong_scheme(url: str, what: str, schemes: str) -> BadUrl:
 
 
 async def _identify_or_close(device: BallBar | DisplacementMeter | Controller) -> DeviceInfo:
-    """Ask who is there; whatever goes wrong, or a cancellation, leaves no open link behind."""
+    """Identify a device; close its link on any error or cancellation."""
     try:
         return await device.identify()
     except BaseException:

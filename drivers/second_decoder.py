@@ -1,7 +1,7 @@
-"""A second, independent reading of a compensation image, for the read-back before activation.
+"""A second, independent decoder of compensation images, for the read-back before activation.
 
-Written from docs/protocols/cnc.md without looking at ``tables.py`` and on purpose in another way (register by register, plain
-arithmetic, no struct, no zlib): a sign, unit or order mistake in one of the two does not cancel out in the other.
+Written from docs/protocols/cnc.md independently of ``tables.py`` and deliberately in another way (register by register, plain arithmetic,
+no struct, no zlib): a sign, unit or order mistake in one of the two does not cancel in the other.
 """
 
 from __future__ import annotations
@@ -13,16 +13,11 @@ AxisTables = dict[tuple[str, str], list[tuple[float, float]]]
 
 
 class UnreadableImage(ValueError):  # noqa: N818 - reads as what it is
-    """The registers are not an image as the protocol defines it."""
+    """The registers are not an image of the protocol."""
 
 
 def read_axis_tables(data: bytes) -> AxisTables:
     """Read the nine one-axis tables of an image.
-
-    Parameters
-    ----------
-    data : bytes
-        The image as read from the bank.
 
     Returns
     -------
@@ -78,7 +73,7 @@ def read_grid(data: bytes) -> dict[tuple[float, float, float], tuple[float, floa
 
 
 def plain_crc32(data: bytes) -> int:
-    """Compute the CRC-32 of the image bit by bit, the slow way."""
+    """Compute the CRC-32 of the image bit by bit."""
     crc = 0xFFFFFFFF
     for byte in data:
         crc ^= byte

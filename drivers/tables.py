@@ -1,4 +1,4 @@
-"""Compensation images <-> bytes (docs/protocols/cnc.md, "Banks"). Pure; what does not fit exactly is refused, never rounded or clipped."""
+"""Compensation images <-> bytes (docs/protocols/cnc.md, "Banks"). Pure; refuses inexact values, never rounds or clips them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from abbe.drivers.api import Point
 
 FORMAT_VERSION = 1
-"""What is signed for a controller names it."""
+"""Part of the signed content of a table."""
 MAGIC = 0xABBE
 FORMAT = 1
 NO_CORRECTION, NINE_TABLES, GRID_3D = 0, 1, 2
@@ -22,12 +22,12 @@ _EXACT = 1e-3  # counts: a grid position may differ from a multiple of 10 nm by 
 
 
 class TableCodecError(ValueError):
-    """The table cannot be stored exactly as it is, or the bytes are not an image."""
+    """The table cannot be stored exactly, or the bytes are not an image."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableImage:
-    """A compensation table as the controller stores it.
+    """A compensation table in the controller's format.
 
     Parameters
     ----------
@@ -55,13 +55,7 @@ class TableImage:
 
 
 def body_words(kind: int, counts: tuple[int, int, int]) -> int:
-    """Return how many values an image of this kind and grid has.
-
-    Raises
-    ------
-    TableCodecError
-        Unknown kind.
-    """
+    """Return the number of values in an image of this kind and grid. Raises TableCodecError for an unknown kind."""
     nx, ny, nz = counts
     if kind == NO_CORRECTION:
         return 0
@@ -73,12 +67,12 @@ def body_words(kind: int, counts: tuple[int, int, int]) -> int:
 
 
 def encode(image: TableImage) -> bytes:
-    """Turn a table into the bytes of a bank.
+    """Encode a table as the bytes of a bank.
 
     Raises
     ------
     TableCodecError
-        A correction beyond 16 bits, a wrong number of values, a position off the 10 nm grid, too many registers...
+        A correction exceeds 16 bits, the number of values is wrong, a position is off the 10 nm grid, too many registers, ...
     """
     _check(image)
     n_words = _HEADER.size // 2 + len(image.values)
@@ -94,17 +88,12 @@ def encode(image: TableImage) -> bytes:
 
 
 def decode(data: bytes) -> TableImage:
-    """Turn the bytes of a bank into a table.
-
-    Parameters
-    ----------
-    data : bytes
-        Exactly the LENGTH registers of the image.
+    """Decode exactly the LENGTH registers of an image.
 
     Raises
     ------
     TableCodecError
-        Not an image, or not the whole of it and nothing else.
+        The bytes are not exactly one image.
     """
     if len(data) < _HEADER.size:
         raise TableCodecError(f"{len(data)} bytes are shorter than an image's header of {_HEADER.size}")

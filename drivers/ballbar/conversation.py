@@ -1,6 +1,6 @@
-"""Questions to the box and their answers, matched by tag: a late answer never passes for the answer to another question.
+"""Requests to the box and their replies, matched by tag, so that a late reply never passes for that of another request.
 
-`Box` is what is known of the box that answers.
+`Box` keeps the known state of the box.
 """
 
 from __future__ import annotations
@@ -13,22 +13,12 @@ from abbe.drivers.ballbar.frames import BarCounters
 from abbe.drivers.ballbar.stream import OtherPace, OtherSettings, Reads, SegmentEnd
 from abbe.drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, Rebooted, Refused, ReplyTimeout, SettingsChanged, WrongDevice
 
-_TELLS_SETTINGS = 0x0101  # firmware
-_RESTORE = "somebody changed the box: set it back (restore_settings), then measure this test again"
+_SETTINGS_FIRMWARE = 0x0101
+_RESTORE = "the box's settings were changed: set them back (restore_settings), then measure this test again"
 
 
 class Box:
-    """What is known of the box, and must stay so.
-
-    Parameters
-    ----------
-    name : str
-        For errors.
-    talk : Conversation
-        With the box.
-    serial_no : int or None
-        The only box that is accepted; None: the first one that answers.
-    """
+    """Identity and settings of the box, which must not change. Accepts only ``serial_no``; None: the first box that answers."""
 
     def __init__(self, name: str, talk: Conversation, serial_no: int | None) -> None:
         self.boot_id: int | None = None
@@ -39,11 +29,11 @@ class Box:
 
     @property
     def reads(self) -> Reads | None:
-        """Number of the settings and stroke, of a box that tells them."""
+        """Number of the settings, and stroke; None if the box does not report them."""
         return None if self.settings is None else Reads(self.settings.number, self.settings.range_nm)
 
     async def accept(self) -> frames.Info:
-        """Ask who is there and how it reads; its boot id is the one that counts from now on.
+        """Read identity and settings, and accept the boot id as the current one.
 
         Raises
         ------
@@ -52,22 +42,22 @@ class Box:
         LinkDown, ReplyTimeout, BadFrame
             The wire.
         """
-        info = await self._talk.who()
+        info = await self._talk.identify()
         if self._serial_no not in (None, info.serial_no):
             detail = f"the box with serial number {info.serial_no} answers instead of {self._serial_no}"
             raise WrongDevice(self._name, "identify", detail, "plug in the right box, or configure this one as a device of its own")
-        if info.firmware >= _TELLS_SETTINGS:
+        if info.firmware >= _SETTINGS_FIRMWARE:
             self.settings = await self._talk.settings()
             self._first = self._first or self.settings
         self.boot_id, self._serial_no, self._max_rate_hz = info.boot_id, info.serial_no, info.max_rate_hz
         return info
 
     async def peek(self) -> int:
-        """Ask for its boot id, and take nothing over from the answer; errors of the wire as for `accept`."""
-        return (await self._talk.who()).boot_id
+        """Read the boot id without accepting it; errors of the wire as for `accept`."""
+        return (await self._talk.identify()).boot_id
 
     async def check_boot(self) -> None:
-        """Ask again; besides the errors of `accept`, ``Rebooted`` when it was switched on anew."""
+        """Read identity and settings again; raises as `accept`, and ``Rebooted`` if the box restarted."""
         known = self.boot_id
         info = await self.accept()
         if known not in (None, info.boot_id):
@@ -75,7 +65,7 @@ class Box:
             raise self.rebooted(f"boot id {info.boot_id:#x} instead of {known:#x}")
 
     def check_settings(self) -> None:
-        """Raise ``SettingsChanged`` when it reads otherwise than at first, or in inches."""
+        """Raise ``SettingsChanged`` if unit, range or zero differ from the first ones, or the unit is inches."""
         now, first = self.settings, self._first
         if now is None or first is None:
             return
@@ -86,7 +76,7 @@ class Box:
             raise SettingsChanged(self._name, "start stream", "the box shows inches", "switch it to millimetres, then open it anew")
 
     def check_can(self, rate_hz: int, range_mm: float) -> None:
-        """Raise ``Refused`` when it cannot send so fast, or clamps readings that are wanted; what it does not tell is not judged."""
+        """Raise ``Refused`` if rate or stroke exceed the box's; limits that the box does not report are not checked."""
         if 0 < self._max_rate_hz < rate_hz:
             detail = f"{rate_hz} Hz are wanted, the box sends at most {self._max_rate_hz}"
             raise Refused(self._name, "check", detail, "choose a lower rate")
@@ -95,24 +85,22 @@ class Box:
             raise Refused(self._name, "check", detail, "set a larger range at the box")
 
     async def restore(self) -> None:
-        """Set unit, range and zero as they were at first; errors as for `accept`, and ``Refused``."""
+        """Restore the first unit, range and zero; raises as `accept`, and ``Refused``."""
         first = self._first
         if first is not None:
             await self._talk.command(frames.CONFIGURE, lambda tag: frames.configure_command(tag, first.unit, first.range_nm, first.zero_nm))
         await self.accept()
 
     def error_of(self, end: SegmentEnd) -> DriverError:
-        """The message when a stream cannot go on."""
+        """Return the error of a stream that cannot continue."""
         if isinstance(end, OtherSettings):
             return SettingsChanged(self._name, "stream", str(end), _RESTORE)
         if isinstance(end, OtherPace):
-            return DeviceFault(
-                self._name, "stream", str(end), "was the box set or restarted by somebody else? then measure this test again"
-            )
+            return DeviceFault(self._name, "stream", str(end), "did another program set or restart the box? then measure this test again")
         return self.rebooted(str(end))
 
     def rebooted(self, detail: str) -> Rebooted:
-        """The error of a box that was switched on anew."""
+        """Return the error of a box that restarted."""
         return Rebooted(self._name, "stream", detail, "the box restarted: call identify, then measure this test again")
 
 
@@ -121,20 +109,18 @@ _OPERATION = {frames.START: "start stream", frames.STOP: "stop stream", frames.C
 
 
 class Conversation:
-    """Asks one thing after the other, or several at once.
+    """Sends requests to the box, one by one or concurrently, and waits for their replies.
 
     Parameters
     ----------
-    name : str
-        The device, for errors.
     send : callable
-        Opens the line when it is not, and sends the bytes.
+        Opens the line if necessary, and sends the bytes.
     counters : BarCounters
-        Of the line: whether anything at all was understood tells a mute box from a wrong baud rate.
+        Of the line: whether any frame was valid distinguishes a silent box from a wrong baud rate.
     answer_s : callable
-        Seconds that an answer may take.
+        Longest time of a reply, s.
     backlog : callable
-        How full the ring between reading and framing is: an answer may stand behind samples that wait for a slow disk.
+        Fill of the ring between reading and framing: a reply may wait behind samples for a slow disk.
     """
 
     def __init__(
@@ -149,13 +135,13 @@ class Conversation:
         self._open: dict[int, asyncio.Future[frames.Answer]] = {}
         self._tag = 0
 
-    async def who(self) -> frames.Info:
-        """Ask who is there.
+    async def identify(self) -> frames.Info:
+        """Read the identity of the box.
 
         Raises
         ------
         LinkDown, ReplyTimeout, BadFrame
-            No connection, no answer, or an answer that cannot be understood.
+            No connection, no reply, or an invalid one.
         """
         answer = await self._ask(frames.identify_command, "identify")
         if not isinstance(answer, frames.Info):
@@ -163,21 +149,21 @@ class Conversation:
         return answer
 
     async def settings(self) -> frames.BoxSettings:
-        """Ask how the box reads (firmware 1.1 and later); errors as for ``who``."""
+        """Read the settings of the box (firmware 1.1 and later); errors as for ``identify``."""
         answer = await self._ask(frames.read_settings_command, "read settings")
         if not isinstance(answer, frames.BoxSettings):
             raise BadFrame(self._name, "read settings", "an ACK came instead of the SETTINGS", "is the firmware really 1.1 or later?")
         return answer
 
     async def command(self, kind: int, make: Callable[[int], bytes]) -> None:
-        """Send a command of this type, made with its tag, and wait for its ACK.
+        """Send a command of this type, which ``make`` builds from its tag, and wait for its ACK.
 
         Raises
         ------
         Refused
-            The box says no.
+            The box refused the command.
         LinkDown, ReplyTimeout, BadFrame
-            As for ``who``.
+            As for ``identify``.
         """
         operation = _OPERATION[kind]
         answer = await self._ask(make, operation)
@@ -188,19 +174,19 @@ class Conversation:
             raise Refused(self._name, operation, frames.ACK_TEXT.get(answer.result, f"result {answer.result}"), remedy)
 
     def answered(self, frame: frames.Answer) -> None:
-        """Deliver an answer; drop it when no question waits for it."""
+        """Deliver a reply; drop it if no request waits for it."""
         future = self._open.get(frame.tag)
         if future is not None and not future.done():
             future.set_result(frame)
 
     def fail(self, error: LinkDown) -> None:
-        """No more answers will come: every waiting question fails with this reason."""
+        """Fail all waiting requests with this error."""
         for future in self._open.values():
             if not future.done():
                 future.set_exception(error)
 
     def forget(self) -> None:
-        """Wait for no answer any more."""
+        """Stop waiting for replies."""
         self._open.clear()
 
     async def _ask(self, make: Callable[[int], bytes], operation: str) -> frames.Answer:

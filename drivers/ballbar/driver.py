@@ -1,4 +1,4 @@
-"""Conversation with a ball-bar's interface box."""
+"""Driver of a ball-bar's interface box."""
 
 from __future__ import annotations
 
@@ -39,13 +39,8 @@ _MAX_RATE_HZ = 1000
 class SerialBallBar:
     """A telescoping ball-bar on a serial line or a serial device server (docs/protocols/ballbar.md).
 
-    Parameters
-    ----------
-    link : ByteLink
-        Where the box is; opened on first use, and again after the device was lost. The first box that answers is the one from then on:
-        another serial number is refused, as is one that is not the serial number in the URL.
-    ring_s : float
-        How many seconds of bytes at full rate may wait to be framed and stored.
+    The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else that of the
+    first box that answers, and refuses all others. ``ring_s``: capacity of the ring for framing and storing, seconds at full rate.
     """
 
     def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:
@@ -61,7 +56,7 @@ class SerialBallBar:
         self._streaming = False
 
     async def open(self) -> None:
-        """Open the line; does nothing when it is open.
+        """Open the line if it is not open.
 
         Raises
         ------
@@ -85,14 +80,14 @@ class SerialBallBar:
             raise LinkDown(self.name, "open", f"the line cannot be read: {error}", remedy) from error
 
     async def identify(self) -> DeviceInfo:
-        """Ask the box who it is and how it reads, and accept its boot id as the one that counts from now on.
+        """Read identity and settings of the box, and accept its boot id as the current one.
 
         Raises
         ------
         WrongDevice
-            Another box than the one that was here before, or than the URL says.
+            Another box than before, or than the URL names.
         LinkDown, ReplyTimeout, BadFrame
-            No connection, no answer, or an answer that cannot be understood.
+            No connection, no reply, or an invalid one.
         """
         try:
             info = await self._box.accept()
@@ -104,26 +99,23 @@ class SerialBallBar:
         return DeviceInfo("ballbar", info.model, str(info.serial_no), info.boot_id, firmware)
 
     async def peek_boot_id(self) -> int | None:
-        """Boot id of the box that answers now, without accepting it as the one that counts; None without an answer."""
+        """Read the boot id of the box without accepting it; None without a reply."""
         try:
             return await self._box.peek()
         except DriverError:
             return None
 
     async def recover(self, *, within_s: float) -> DeviceInfo:
-        """Wait until the same box answers again, for example after its cable was pulled; the line is opened anew as often as needed.
+        """Retry until the same box answers again, for example after its cable was pulled; reopens the line as often as needed.
 
-        Parameters
-        ----------
-        within_s : float
-            How long to try. The waits between attempts grow from 0.1 to 2 s.
+        The waits between attempts grow from 0.1 to 2 s.
 
         Raises
         ------
         WrongDevice
-            Another box answers: it is refused at once.
+            Another box answers: refused at once.
         LinkDown, ReplyTimeout, BadFrame
-            Of the last attempt, when the time is over.
+            Error of the last attempt within ``within_s``.
         """
         clock = asyncio.get_running_loop().time
         until_s, backoff = clock() + within_s, Backoff(_FIRST_WAIT_S, _LONGEST_WAIT_S)
@@ -136,23 +128,18 @@ class SerialBallBar:
             except DriverError:
                 if clock() + backoff.left_s() > until_s:
                     raise
-            await self._hang_up()  # a line that answers nothing may be stuck: a fresh one costs nothing
+            await self._hang_up()  # a silent line may be stuck: reopen it
             await backoff.due()
 
     async def make_ready(self, *, within_s: float) -> DeviceInfo:
-        """Before a new stream: the same box, found again if need be, and reading as at first if it was switched on anew meanwhile.
+        """Prepare a new stream: recover the same box if necessary, and restore its first settings after a restart.
 
-        What was measured before and what comes now are streams of their own: nothing here joins them.
-
-        Parameters
-        ----------
-        within_s : float
-            How long to look for it; as for ``recover``.
+        Streams before and after are never joined.
 
         Raises
         ------
         Rebooted
-            It was switched on anew and does not tell how it reads (firmware 1.0): a person has to look.
+            The box restarted and does not report its settings (firmware 1.0): a person has to look.
         WrongDevice, Refused, LinkDown, ReplyTimeout, BadFrame
             As for ``recover`` and ``restore_settings``.
         """
@@ -170,19 +157,19 @@ class SerialBallBar:
         return info
 
     async def check(self, rate_hz: int, *, range_mm: float) -> None:
-        """Ask whether a stream of this rate, read over this stroke, could begin now; nothing is started.
+        """Check whether a stream could begin now, without starting it.
 
         Parameters
         ----------
         rate_hz : int
-            Samples per second; 0: whatever the box does.
+            Samples per second; 0: any.
         range_mm : float
-            Stroke to either side that is needed; of firmware 1.0, which does not tell its own, nothing is asked.
+            Needed stroke to either side; not checked for firmware 1.0, which does not report its own.
 
         Raises
         ------
         Refused
-            The box cannot send so fast, or reads over less.
+            Rate or stroke exceed the box's.
         SettingsChanged, Rebooted, LinkDown, ReplyTimeout, BadFrame, WrongDevice
             As for ``stream``.
         """
@@ -191,12 +178,12 @@ class SerialBallBar:
         self._box.check_can(rate_hz, range_mm)
 
     async def restore_settings(self) -> None:
-        """Give the box the unit, range and zero back that it had when this driver first met it.
+        """Restore the unit, range and zero that the box had at its first identification.
 
         Raises
         ------
         Refused
-            The box does not take them.
+            The box refuses them.
         LinkDown, ReplyTimeout, BadFrame, WrongDevice
             As for ``identify``.
         """
@@ -204,22 +191,22 @@ class SerialBallBar:
 
     @asynccontextmanager
     async def stream(self, rate_hz: int, tap: BarTap | None = None) -> AsyncIterator[AsyncIterator[BarBatch]]:
-        """Stream samples while the context is open; the box gets a stop when it ends, however it ends.
+        """Stream samples while the context is open; always stop the box at the end.
 
         Parameters
         ----------
         rate_hz : int
             Samples per second of device time; must divide 1000.
         tap : BarTap, optional
-            Takes every sample until the box has stopped, before the consumer and however slow he is.
+            Takes every sample until the box has stopped, before the consumer and independent of its speed.
 
         Yields
         ------
         AsyncIterator of BarBatch
-            ``missing`` counts samples that the wire lost or that a consumer more than 30 s behind let go. The iterator
-            raises ``Rebooted`` when the box restarted, ``ReplyTimeout`` after max(1 s, 50 periods) of silence, ``LinkDown``; with a tap
-            ``Backpressure`` as soon as the ring, or the consumer's buffer, is 80 % full. ``SettingsChanged`` when unit, range or zero of
-            the box were changed, ``LossyLine`` when more is lost than a run may lose.
+            ``missing`` counts samples lost on the wire, or dropped because the consumer was more than 30 s behind. The iterator raises
+            ``Rebooted`` after a restart of the box, ``ReplyTimeout`` after max(1 s, 50 periods) of silence, ``LinkDown``; with a tap
+            ``Backpressure`` as soon as the ring, or the consumer's buffer, is 80 % full. ``SettingsChanged`` after a change of unit, range
+            or zero, ``LossyLine`` after too many losses.
 
         Raises
         ------
@@ -228,11 +215,11 @@ class SerialBallBar:
         Rebooted
             The box has restarted since ``identify``.
         SettingsChanged
-            The box reads otherwise than when this driver first met it: ``restore_settings``.
+            The settings differ from those at the first identification: call ``restore_settings``.
         LossyLine
             At the end: the whole stream lost more than 0.1 % of its samples.
         Backpressure
-            At the end: samples that had arrived did not get through to the tap in 10 s.
+            At the end: received samples did not reach the tap within 10 s.
         """
         if rate_hz <= 0 or 1000 % rate_hz:
             raise Refused(self.name, "start stream", f"{rate_hz} Hz does not divide 1000", "choose 1000, 500, 250, 200, 125, 100 ...")
@@ -258,18 +245,18 @@ class SerialBallBar:
             try:
                 await run_to_end(self._stop_quietly())
                 if self._stream is not None:
-                    through = await run_to_end(self._given_on())
+                    through = await run_to_end(self._delivered())
                     await run_to_end(asyncio.to_thread(self._stream.finish))
             finally:
                 self._attach(None)
                 self._streaming = False
-        if not through:  # with another error on its way the run is not complete anyway
+        if not through:  # another error already marks the run as incomplete
             waited = Backpressure(self.name, "end stream", f"samples still waited {_DRAIN_S:g} s after the box had stopped", SLOW)
             self.incidents.note(waited)
             raise waited
 
-    async def _given_on(self) -> bool:
-        """Whatever ended the stream, what had arrived by then is given to the tap; after an answer to STOP all of it is already."""
+    async def _delivered(self) -> bool:
+        """Wait until the tap has all received samples; after a reply to STOP it already has."""
         return self._framing is None or self._stream is None or self._stream.tap is None or await self._framing.drained(_DRAIN_S)
 
     async def close(self) -> None:
@@ -279,7 +266,7 @@ class SerialBallBar:
 
     async def _hang_up(self) -> None:
         framing, self._framing = self._framing, None
-        await self._link.close()  # what was read until now is framed and given to the stream; what the kernel holds is read before
+        await self._link.close()  # reads the kernel's rest first; everything read is still framed and delivered
         if framing is not None:
             await framing.ended()
 
@@ -290,7 +277,7 @@ class SerialBallBar:
 
     @property
     def state(self) -> str:
-        """``ready``, ``streaming``, ``down`` (the next call opens it), ``aborted: CODE`` until a stream begins or it is identified."""
+        """``ready``, ``streaming``, ``down`` (the next call opens the line), ``aborted: CODE`` until the next stream or identification."""
         if self.incidents.open is not None:
             return f"aborted: {self.incidents.open.code}"
         if not self._link.is_open:
@@ -299,12 +286,12 @@ class SerialBallBar:
 
     @property
     def settings(self) -> frames.BoxSettings | None:
-        """The last known unit, range and zero of the box; None before `identify`, and with firmware 1.0, which reports none."""
+        """Last known settings of the box; None before `identify`, and with firmware 1.0, which reports none."""
         return self._box.settings
 
     @property
     def backlog(self) -> float:
-        """How full the ring between reading and storing is, 0 to 1."""
+        """Fill of the ring between reading and storing, 0 to 1."""
         return 0.0 if self._framing is None else self._framing.ring.fill
 
     async def _batches(self, stream: Stream, silence_s: float) -> AsyncIterator[BarBatch]:
@@ -314,31 +301,31 @@ class SerialBallBar:
             except TimeoutError:
                 break
             yield batch
-        # Silence: a box that restarted sits there idle. Ask, so that the user hears the true reason.
+        # Silence: a restarted box is idle. Check for that, so that the error names the true reason.
         await self._box.check_boot()
         raise ReplyTimeout(self.name, "read samples", f"no sample for {silence_s:g} s", "box switched off, or stopped by another program?")
 
     async def _ready(self) -> None:
         await self._box.check_boot()
         self._box.check_settings()
-        # A box left streaming by a crashed program still sends: stop it, so that old samples cannot enter the new stream.
+        # After a crash of a program the box may still stream: stop it, so that old samples cannot enter the new stream.
         await self._talk.command(frames.STOP, frames.stop_command)
 
     def _judge(self, stream: Stream, bad_bytes: int) -> None:
         verdict = stream.verdict(bad_bytes)
         if isinstance(verdict, LossyLine):
             raise verdict
-        if verdict is not None:  # noted and over: every gap is recorded
+        if verdict is not None:  # only noted: every gap is recorded
             self.incidents.note(verdict)
             self.incidents.good()
 
     async def _stop_quietly(self) -> None:
         if not self._link.is_open:
-            return  # what is plugged in next may be another box: it is asked first, and stopped before it is started
+            return  # the next box may be another one: the next stream identifies it and stops it first
         try:
             await self._talk.command(frames.STOP, frames.stop_command)
         except DriverError:
-            # The box is gone or mute: the reason already reaches the user from the stream itself, and the next stream stops it first.
+            # The box is gone or silent: the stream itself reports the reason, and the next stream stops the box first.
             self._talk.forget()
 
     async def _send(self, data: bytes) -> None:
@@ -349,14 +336,14 @@ class SerialBallBar:
         if isinstance(frame, frames.Info) and self._stream is not None and self._box.boot_id not in (None, frame.boot_id):
             self._stream.fail(self._box.rebooted(f"boot id {frame.boot_id:#x} instead of {self._box.boot_id:#x}"))
             if self._framing is not None:
-                self._framing.stream = None  # nothing more of it may reach the tap
+                self._framing.stream = None  # no further sample may reach the tap
         self._talk.answered(frame)
 
     def _restarted(self, stream: Stream, why: SegmentEnd) -> None:
         stream.fail(self._box.error_of(why))
 
     def _broken(self, error: Exception) -> None:
-        self._fail(LinkDown(self.name, "read", f"the program could not go on: {error!r}", "report this"))
+        self._fail(LinkDown(self.name, "read", f"the framing thread failed: {error!r}", "report this"))
 
     def _fail(self, error: LinkDown) -> None:
         self.incidents.note(error)

@@ -23,7 +23,7 @@ NANOMETRE, TENTH_MICROINCH = 0, 1
 
 ACK_TEXT = {0: "ok", 1: "bad argument", 2: "unknown command"}
 
-# One known length per type the box sends: a sync pattern inside noise is mostly unmasked here, before waiting for its payload.
+# One known length per type that the box sends: this rejects most sync patterns in noise before waiting for a payload.
 _LENGTH = {SAMPLE: 18, INFO: 28, ACK: 4, SETTINGS: 12}
 _OVERHEAD = 6  # sync, type, length, check sum
 _SAMPLE = struct.Struct("<IQiH")
@@ -38,7 +38,7 @@ _SETTINGS = struct.Struct("<HBBIi")
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """The box says who it is. ``firmware`` is BCD (0x0102 = 1.2), ``rate_hz`` 0 when it is not streaming."""
+    """Identity of the box. ``firmware`` is BCD (0x0102 = 1.2), ``rate_hz`` 0 when it is not streaming."""
 
     tag: int
     boot_id: int
@@ -51,7 +51,7 @@ class Info:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The box answers the command with this tag; ``result`` 0 is ok (see ``ACK_TEXT``)."""
+    """Reply to the command with this tag; ``result`` 0 is ok (see ``ACK_TEXT``)."""
 
     tag: int
     command: int
@@ -60,9 +60,9 @@ class Ack:
 
 @dataclass(frozen=True, slots=True)
 class BoxSettings:
-    """How the box reads: ``number`` counts the changes since it was switched on and stands in bits 8 to 15 of every sample's status.
+    """Settings of the box: ``number`` counts the changes since power-on and appears in bits 8 to 15 of every sample's status.
 
-    ``unit`` is ``NANOMETRE`` or ``TENTH_MICROINCH``; ``range_nm`` the stroke to either side; ``zero_nm`` what is taken off every reading.
+    ``unit`` is ``NANOMETRE`` or ``TENTH_MICROINCH``; ``range_nm`` the stroke to either side; ``zero_nm`` is subtracted from every reading.
     """
 
     tag: int
@@ -74,7 +74,7 @@ class BoxSettings:
 
 @dataclass(frozen=True, slots=True)
 class Bad:
-    """``n_bytes`` bytes that are no frame; ``reason`` is ``"check sum"`` when something in them looked like one, else ``"garbage"``."""
+    """``n_bytes`` bytes that are no frame; ``reason`` is ``"check sum"`` if they contained a false frame, else ``"garbage"``."""
 
     reason: str
     n_bytes: int
@@ -90,13 +90,7 @@ def crc16(data: bytes) -> int:
 
 
 def encode(kind: int, payload: bytes) -> bytes:
-    """Wrap a payload of at most 32 bytes into a frame.
-
-    Raises
-    ------
-    ValueError
-        Payload too long.
-    """
+    """Wrap a payload into a frame. Raises ValueError if it has more than 32 bytes."""
     if len(payload) > MAX_PAYLOAD:
         raise ValueError(f"a payload has at most {MAX_PAYLOAD} bytes, not {len(payload)}")
     body = bytes((kind, len(payload))) + payload
@@ -104,40 +98,40 @@ def encode(kind: int, payload: bytes) -> bytes:
 
 
 def identify_command(tag: int) -> bytes:
-    """Ask the box who it is."""
+    """Request the identity of the box."""
     return encode(IDENTIFY, struct.pack("<H", tag))
 
 
 def start_command(tag: int, rate_hz: int) -> bytes:
-    """Ask the box for ``rate_hz`` samples per second."""
+    """Request a stream of ``rate_hz`` samples per second."""
     return encode(START, _COMMAND.pack(tag, rate_hz))
 
 
 def stop_command(tag: int) -> bytes:
-    """Ask the box to stop streaming."""
+    """Request the end of the stream."""
     return encode(STOP, struct.pack("<H", tag))
 
 
 def read_settings_command(tag: int) -> bytes:
-    """Ask the box how it reads (firmware 1.1 and later)."""
+    """Request the settings of the box (firmware 1.1 and later)."""
     return encode(READ_SETTINGS, struct.pack("<H", tag))
 
 
 def configure_command(tag: int, unit: int, range_nm: int, zero_nm: int) -> bytes:
-    """Set how the box reads (firmware 1.1 and later)."""
+    """Change the settings of the box (firmware 1.1 and later)."""
     return encode(CONFIGURE, _SETTINGS.pack(tag, 0, unit, range_nm, zero_nm))
 
 
 def reading_text(settings: BoxSettings) -> str:
-    """Say how a box reads, for errors."""
+    """Describe settings for errors."""
     unit = "nm" if settings.unit == NANOMETRE else "0.1 microinch"
     return f"unit {unit}, range {settings.range_nm / 1e6:g} mm, zero {settings.zero_nm} nm"
 
 
 class FrameDecoder:
-    """Turns a byte stream into frames, whatever the pieces it arrives in.
+    """Turns a byte stream, in pieces of any size, into frames.
 
-    After noise no good frame is lost: bytes of a false frame are searched again for a true one.
+    Noise costs no good frame: the bytes of a false frame are searched again for a true one.
     """
 
     def __init__(self) -> None:
@@ -145,16 +139,16 @@ class FrameDecoder:
 
     @property
     def pending(self) -> int:
-        """Bytes kept because they may be the start of a frame (always less than one frame)."""
+        """Number of bytes kept as a possible start of a frame (always less than one frame)."""
         return len(self._rest)
 
     def feed(self, chunk: bytes) -> list[Frame]:
-        """Take any number of bytes, return what they complete.
+        """Take any number of bytes and return the completed frames.
 
         Returns
         -------
         list of BarSample, Info, Ack, Settings or Bad
-            In order of arrival. Every byte fed ends in exactly one of them or in ``pending``.
+            In order of arrival. Every byte ends in exactly one of them or in ``pending``.
         """
         data = self._rest + chunk if self._rest else chunk
         out: list[Frame] = []
@@ -190,7 +184,7 @@ class FrameDecoder:
 
 
 def _samples(data: bytes, at: int, out: list[Frame]) -> int:
-    """Take the whole SAMPLE frames that follow one another from ``at`` on; gives where they end. A good line is nothing but these."""
+    """Decode the consecutive whole SAMPLE frames from ``at`` on, and return their end: the fast path of a good line."""
     view = memoryview(data)
     whole = at + (len(data) - at) // _SAMPLE_BYTES * _SAMPLE_BYTES
     for head, seq, device_us, reading_nm, status, crc in _WHOLE_SAMPLE.iter_unpack(view[at:whole]):
@@ -223,10 +217,10 @@ _STOP_S = 2.0
 
 @dataclass(slots=True)
 class BarCounters:
-    """What came over the wire so far, for diagnostics: whole frames, and what went wrong; none of that reaches the data.
+    """Diagnostic counters of the wire: whole frames, and errors, none of which reach the data.
 
-    ``bad_frames``: looked like frames until the check sum. ``strays``: samples that cannot be (see `abbe.drivers.ballbar.stream`).
-    ``lost``: samples missing between others. ``overflow``: samples that a slow consumer without a tap let go.
+    ``bad_frames``: with a wrong check sum. ``strays``: impossible samples (see `abbe.drivers.ballbar.stream`). ``lost``: samples missing
+    between others. ``overflow``: samples dropped by a slow consumer without a tap.
     """
 
     frames: int = 0
@@ -239,20 +233,10 @@ class BarCounters:
 
 
 class Framing:
-    """Frames what the ring holds until the ring ends.
+    """A thread that turns the ring's bytes into frames until the ring ends, and updates the counters.
 
-    Parameters
-    ----------
-    ring : Ring
-        Filled by the reading thread.
-    counters : BarCounters
-        Kept up to date.
-    answered : callable
-        Called in the event loop with each frame that answers a command.
-    restarted : callable
-        Called in the event loop with the stream and the reason when the box began anew, or reads otherwise, in the middle of it.
-    broken : callable
-        Called in the event loop with a defect that ended this thread.
+    It makes these calls in the event loop: ``answered`` with each reply to a command, ``restarted`` with the stream and the reason when the
+    box restarts or changes its settings during a stream, ``broken`` with a defect that ended the thread.
     """
 
     def __init__(
@@ -266,7 +250,7 @@ class Framing:
     ) -> None:
         self.ring = ring
         self.stream: Stream | None = None
-        """Where samples go; set from the event loop between STOP and START."""
+        """Destination of the samples; set from the event loop between STOP and START."""
         self._counters, self._answered, self._restarted, self._broken = counters, answered, restarted, broken
         self._loop = asyncio.get_running_loop()
         self._overran = False
@@ -276,15 +260,15 @@ class Framing:
 
     @property
     def runs(self) -> bool:
-        """False once the line has ended."""
+        """Whether the line has not ended."""
         return self._thread.is_alive()
 
     async def drained(self, within_s: float) -> bool:
-        """Wait until everything that was read so far is framed and given on; False when it was not in this time, or the thread has died."""
+        """Wait until everything read so far is framed and delivered; False if that took too long, or the thread has died."""
         return await asyncio.to_thread(self.ring.drained, within_s) if self.runs else not self.ring.fill
 
     async def ended(self) -> None:
-        """Wait until everything that was read is framed, two seconds at the most (a disk that hangs may hold the tap)."""
+        """Wait until everything read is framed, at most two seconds (a hanging disk may block the tap)."""
         await asyncio.to_thread(self._thread.join, _STOP_S)
 
     def _run(self) -> None:
@@ -295,8 +279,8 @@ class Framing:
                     self._overran |= bool(piece.lost_before)
                 if pieces:
                     self._sort(pieces[-1].host_s, decoder.feed(b"".join([piece.data for piece in pieces])))
-        except Exception as error:  # noqa: BLE001 - a thread that ends in silence would look like a mute box
-            self._tell(self._broken, error)
+        except Exception as error:  # noqa: BLE001 - a silent end of the thread would look like a silent box
+            self._call_in_loop(self._broken, error)
 
     def _sort(self, host_s: float, received: list[frames.Frame]) -> None:
         samples: list[BarSample] = []
@@ -309,9 +293,9 @@ class Framing:
                 self._counters.bad_frames += frame.reason == "check sum"
                 self._counters.frames -= 1
             else:
-                self._give(host_s, samples)  # samples before an answer are stored before the answer is delivered
+                self._give(host_s, samples)  # samples before a reply are stored before the reply is delivered
                 samples = []
-                self._tell(self._answered, frame)
+                self._call_in_loop(self._answered, frame)
         self._give(host_s, samples)
 
     def _give(self, host_s: float, samples: list[BarSample]) -> None:
@@ -324,7 +308,7 @@ class Framing:
             stream.put(host_s, samples, overran=self._overran)
             self._overran = False
         except SegmentEnd as event:
-            self._tell(self._restarted, stream, event)
+            self._call_in_loop(self._restarted, stream, event)
             if self.stream is stream:
                 self.stream = None
         counters.duplicates += tracker.duplicates - before[0]
@@ -333,10 +317,10 @@ class Framing:
         counters.overflow += stream.overflow - before[3]
 
     def _mark(self, mark: float) -> None:
-        stream = self.stream  # the event loop may take it away meanwhile
+        stream = self.stream  # the event loop may clear it at any time
         if stream is not None:
             stream.mark(mark)
 
-    def _tell(self, call: Callable[..., None], *arguments: object) -> None:
+    def _call_in_loop(self, call: Callable[..., None], *arguments: object) -> None:
         with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(call, *arguments)

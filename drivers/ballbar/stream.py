@@ -1,7 +1,7 @@
-"""Samples in order, and the stream that brings them to those who want them.
+"""Order of samples, and the stream that delivers them.
 
-Sequence numbers and device time distinguish gaps, duplicates, late samples and restarts (`SequenceTracker`). A `Stream` stands between
-the thread that frames samples and their users: the tap to the disk, and a consumer in the event loop.
+Sequence numbers and device time distinguish gaps, duplicates, late samples and restarts (`SequenceTracker`). A `Stream` passes samples from
+the framing thread to the tap, which records them, and to a consumer in the event loop.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _WRAP = 1 << 32
 _HALF = _WRAP // 2
 _LATE_WINDOW = 128
 _Runs = list[tuple[int, list[BarSample]]]
-_SLEW_NM_S = 100_000_000  # 100 mm/s: faster than any axis changes a bar's length, and a bar pushed in by hand stays where it is
+_SLEW_NM_S = 100_000_000  # 100 mm/s: faster than any axis changes a bar's length, and a bar pushed in by hand stays there
 _JITTER = 0.05  # of a period, between the number and the clock of a sample
 _MAX_LOSS = 0.001
-_LOSS_FLOOR = 10_000  # samples: a burst at the very beginning is judged as if the run were this long, the rest at its end
+_LOSS_FLOOR = 10_000  # samples: an early burst is judged as if the run were this long; the whole run is judged at its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +37,14 @@ class SampleRun:
 
 @dataclass(frozen=True, slots=True)
 class Reads:
-    """What is known of the box's settings: their number (bits 8 to 15 of every status) and the stroke."""
+    """Known settings of the box: their number (bits 8 to 15 of every status) and the stroke."""
 
     number: int
     range_nm: int
 
 
 class SegmentEnd(Exception):  # noqa: N818 - an event, not a mistake
-    """Nothing after this may be joined to what came before; ``runs`` is what was good until then."""
+    """Samples before and after this must not be joined; ``runs`` are the good ones before it."""
 
     runs: list[SampleRun]
 
@@ -54,7 +54,7 @@ class SequenceRestart(SegmentEnd):
 
 
 class OtherPace(SegmentEnd):
-    """Number and device clock of the samples no longer count the same periods: another rate, or a clock or stream that jumped."""
+    """Sequence number and device clock disagree: the rate changed, or the clock or the stream jumped."""
 
 
 class OtherSettings(SegmentEnd):
@@ -62,27 +62,20 @@ class OtherSettings(SegmentEnd):
 
 
 class SequenceTracker:
-    """Follows one stream from its START.
-
-    Parameters
-    ----------
-    rate_hz : int
-        Samples per second that were asked for.
-    reads : Reads, optional
-        The box's settings, if it tells them: without them the gates of stroke and slew are open.
+    """Checks the samples of one stream from its START. Without the box's settings (``reads``) stroke and slew are not checked.
 
     Attributes
     ----------
     accepted, lost, overrun, duplicates, strays : int
-        Samples given out; missing between them; missing because this computer did not fetch them from the box
-        in time (it says so), no fault of the line; dropped as already known; dropped because number, clock or reading cannot be.
+        Samples delivered; missing on the line; missing because the box's buffer overran (by its status); dropped as duplicates; dropped
+        because number, clock or reading is impossible.
     """
 
     def __init__(self, rate_hz: int, reads: Reads | None = None) -> None:
         self._period_us = 1_000_000 / rate_hz
         self._next = 0
         self._last_us = -1
-        # (least us, most us) to the next sample, stroke nm, slew nm, and which bits of the status have to be what
+        # (least us, most us) to the next sample, stroke nm, slew nm, mask of the status, and its required value
         open_gates = (1 << 31, 1 << 32, 0, 0)
         gates = open_gates if reads is None else (reads.range_nm, _SLEW_NM_S // rate_hz, 0xFF00, (reads.number & 0xFF) << 8)
         self._plain_limits = ((1.0 - _JITTER) * self._period_us, (1.0 + _JITTER) * self._period_us, *gates)
@@ -93,25 +86,25 @@ class SequenceTracker:
 
     @property
     def too_lossy(self) -> bool:
-        """True as soon as the run cannot end at 0.1 % loss or less, unless it lasts much longer than ``_LOSS_FLOOR`` samples."""
+        """Whether the run has lost too much to end at 0.1 % or less, unless it lasts much longer than ``_LOSS_FLOOR`` samples."""
         return self.lost > _MAX_LOSS * max(self.lost + self.accepted, _LOSS_FLOOR)
 
     @property
     def was_lossy(self) -> bool:
-        """True when the run as it stands has lost more than 0.1 %."""
+        """Whether the run has lost more than 0.1 % so far."""
         return self.lost > _MAX_LOSS * (self.lost + self.accepted)
 
     def accept(self, samples: list[BarSample]) -> list[SampleRun]:
-        """Sort samples into runs without gaps; drop and count duplicates, latecomers and what cannot be.
+        """Sort samples into runs without gaps; drop and count duplicates, late samples and impossible ones.
 
         Raises
         ------
         SequenceRestart
-            The stream began anew: nothing after this may be joined to what came before.
+            The stream began anew: samples before and after must not be joined.
         OtherPace
-            Two samples in a row do not fit it.
+            Two consecutive samples do not fit number and clock.
         OtherSettings
-            The box reads otherwise than when the stream began.
+            The box's settings changed since the stream began.
         """
         runs: _Runs = []
         at = 0
@@ -129,7 +122,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def rest(self) -> list[SampleRun]:
-        """The sample that is still weighed when the stream has ended: given as it came, since nothing more will tell."""
+        """Deliver the sample still on trial at the end of the stream: no further sample can confirm or refute it."""
         held, self._held = self._held, None
         runs: _Runs = []
         if held is not None:
@@ -137,7 +130,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def _plain(self, samples: Sequence[BarSample], at: int) -> int:
-        """Find where the samples that simply go on end, so that a good line costs next to nothing."""
+        """Return the end of the samples that need no check: the fast path of a good line."""
         if self._held is not None or self._last_us < 0:
             return at
         expected, last_us, last_nm = self._next, self._last_us, self._last_nm
@@ -181,7 +174,7 @@ class SequenceTracker:
         self._stray_before = False
 
     def _misfit(self, sample: BarSample, ahead: int) -> tuple[type[SegmentEnd], str]:
-        """Say why this cannot be the sample ``ahead`` places on, or nothing."""
+        """Return why this sample cannot be the one ``ahead`` numbers on; an empty reason if it can."""
         reason = self._clock_misfit(sample.device_us - self._last_us, ahead + 1)
         _, _, limit_nm, _, mask, number = self._plain_limits
         if not reason and sample.status & mask != number:
@@ -199,14 +192,14 @@ class SequenceTracker:
         return f"{steps} samples took the device {step_us} us instead of {steps * self._period_us:g} us"
 
     def _refuse(self, sample: BarSample, kind: type[SegmentEnd], reason: str) -> None:
-        # One such sample is a damaged frame; two in a row are another stream, another rate or a clock that jumped.
+        # One such sample is a damaged frame; two in a row mean another stream, another rate or a clock jump.
         self.strays += 1
         if sample.device_us <= self._last_us or self._stray_before:
             raise kind(reason)
         self._stray_before = True
 
     def _late(self, sample: BarSample, behind: int) -> None:
-        # A true latecomer is recent and carries the time that belongs to its number; anything else is another stream.
+        # A late sample is recent and its time matches its number; anything else is another stream.
         expected_us = self._last_us - (behind - 1) * self._period_us
         tolerance_us = (2 + 0.01 * behind) * self._period_us
         if behind > _LATE_WINDOW or abs(sample.device_us - expected_us) > tolerance_us:
@@ -219,7 +212,7 @@ class SequenceTracker:
         )
 
     def _weighed(self, sample: BarSample) -> tuple[BarSample, ...]:
-        """Keep a reading that jumps until the next one says whether it was a step or a single false value."""
+        """Keep a reading that jumps until the next one shows whether it was a step or a single false value."""
         held = self._held
         if held is None:
             self._held = sample
@@ -245,25 +238,10 @@ STOP_FILL = 0.8
 
 
 class Stream:
-    """Sorts samples, gives every one to the tap, and buffers them for a consumer who may be slow.
+    """Sorts samples, passes each to the tap in the framing thread, and buffers ``buffer_s`` seconds of them for a slow consumer.
 
-    The buffer is bounded. Without a tap, what does not fit is reported as missing; with a tap it is safe already, and a consumer so far
-    behind (he watches the machine) is a reason to stop.
-
-    Parameters
-    ----------
-    device : str
-        Name for errors.
-    rate_hz : int
-        Samples per second asked for.
-    buffer_s : float
-        Room for the consumer, seconds of samples.
-    tap : BarTap or None
-        Takes every sample first, in the framing thread.
-    boot_id : int
-        Of the box.
-    reads : Reads, optional
-        The box's settings, if it tells them.
+    Without a tap, samples that do not fit are reported as missing. With a tap they are recorded already, and the stream fails: the consumer
+    watches the machine and must not be that far behind.
     """
 
     def __init__(self, device: str, rate_hz: int, buffer_s: float, tap: BarTap | None, boot_id: int, *, reads: Reads | None = None) -> None:
@@ -289,7 +267,7 @@ class Stream:
         Raises
         ------
         SegmentEnd
-            The stream began anew, or the box reads otherwise now; what came before that was taken, nothing after it.
+            The stream began anew, or the box's settings changed; the samples before that are taken, none after it.
         """
         with self._putting:
             if self._finished:
@@ -304,14 +282,14 @@ class Stream:
                 self.fail(self.lossy())
 
     def finish(self) -> None:
-        """The box has stopped: the tap gets what was still weighed, and nothing after it. May wait for a slow tap."""
+        """Deliver the last sample to the tap after the box has stopped. May wait for a slow tap."""
         with self._putting:  # the framing thread may still be in the middle of a batch
             if not self._finished:
                 self._finished = True
                 self._take(self._host_s, self.tracker.rest(), overran=False)
 
     def verdict(self, bad_bytes: int) -> DriverError | None:
-        """What the line did to a stream that ended as it should: `LossyLine` refuses it, `BadFrame` is only to be noted."""
+        """Judge the line of a stream that ended in order: `LossyLine` invalidates the stream, `BadFrame` is only a note."""
         tracker = self.tracker
         if tracker.was_lossy:
             return self.lossy()
@@ -326,7 +304,7 @@ class Stream:
         )
 
     def lossy(self) -> LossyLine:
-        """The error of a run that has lost too much."""
+        """Return the error of a run that has lost too much."""
         lost, total = self.tracker.lost, self.tracker.lost + self.tracker.accepted
         detail = f"{lost} of {total} samples were lost on the line ({lost / total:.2%}; 0.1 % is the most that a run may lose)"
         return LossyLine(
@@ -346,7 +324,7 @@ class Stream:
     def _buffer(self, batch: BarBatch) -> None:
         count = len(batch.samples)
         with self._lock:
-            if self._left or self._error is not None:  # nothing after the reason to stop may be joined to what came before it
+            if self._left or self._error is not None:  # samples after an error must not be joined to earlier ones
                 return
             if count > self._room:
                 self._lost += batch.missing + count
@@ -361,7 +339,7 @@ class Stream:
         self._wake()
 
     def mark(self, fill: float) -> None:
-        """The ring between reading and framing has filled up to this mark (reading thread)."""
+        """Handle that the ring between reading and framing has filled to this mark; called in the reading thread."""
         text = f"the ring between reading and storing is {fill:.0%} full"
         if self.tap is not None:
             self.tap.warn(text)
@@ -369,7 +347,7 @@ class Stream:
                 self.fail(Backpressure(self._device, "store the samples", text, SLOW))
 
     def fail(self, error: DriverError) -> None:
-        """End the stream, after what is already buffered; back-pressure ends it at once, since the machine has to be stopped."""
+        """End the stream after the buffered samples; back-pressure ends it at once, because the machine must stop."""
         with self._lock:
             if self._error is None:
                 self._error = error
@@ -378,13 +356,13 @@ class Stream:
         self._wake()
 
     def leave(self) -> None:
-        """The consumer has gone; the tap goes on until the box has stopped."""
+        """Stop buffering after the consumer has left; the tap continues until the box has stopped."""
         with self._lock:
             self._left = True
             self._batches.clear()
 
     async def get(self, timeout_s: float) -> BarBatch:
-        """Wait for the next batch; TimeoutError when none comes."""
+        """Wait for the next batch; raises TimeoutError if none comes."""
         async with asyncio.timeout(timeout_s):
             while not self._batches and self._error is None:
                 self._news.clear()

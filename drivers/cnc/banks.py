@@ -1,4 +1,4 @@
-"""Compensation banks: lease, write, read, seal, activate; each command is sent once and then decided by what the controller says."""
+"""Compensation banks: lease, write, read, seal, activate; each command is sent once, and the controller's status decides its outcome."""
 
 from __future__ import annotations
 
@@ -22,13 +22,7 @@ _LEASED = 7
 
 
 class Banks:
-    """The two compensation banks of one controller.
-
-    Parameters
-    ----------
-    session : ControllerSession
-        The conversation they travel in.
-    """
+    """The two compensation banks of one controller."""
 
     def __init__(self, session: ControllerSession) -> None:
         self._session = session
@@ -90,11 +84,11 @@ class Banks:
             raise DeviceFault(self._name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
 
     async def _command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
-        """Send a command and find out what became of it.
+        """Send a command and determine its outcome.
 
-        Two programs can take the same number: the controller executes the first and passes over the second, and its acknowledge looks the
-        same to both. So what the acknowledge says is held against who has the lease. A command that was passed over was certainly not
-        executed and never will be; it is sent again under another number, except ACTIVATE: the caller decides about that.
+        Two programs can use the same number: the controller executes the first command and skips the second, and both see the same
+        acknowledge. Therefore the acknowledge is compared with the owner of the lease. A skipped command never executes; it is sent again
+        under another number, except ACTIVATE, where the caller decides.
         """
         async with self._commands:
             for _ in range(1 if command == reg.ACTIVATE else _TRIES):
@@ -105,7 +99,7 @@ class Banks:
                 detail = "another program's command took its number: it was not executed"
                 raise DeviceFault(self._name, operation, detail, "let one program at a time push; read the status again, then decide")
         if command == reg.RELEASE and result == _LEASED and counts["LEASE_OWNER"] == 0:
-            return  # some controls refuse to release a free lease: it is free, as asked
+            return  # some controls refuse to release a free lease
         if result:
             raise Refused(self._name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
 
@@ -113,7 +107,7 @@ class Banks:
         await self._session.check_boot()
         counts = await self._comp_counts()
         if not anyway and command in (reg.LEASE, reg.RELEASE) and counts["LEASE_OWNER"] not in (0, fields["owner"]):
-            return _LEASED, counts  # asking all the same would take the number of a command of the lease's owner
+            return _LEASED, counts  # a request would use up the number of a command of the lease's owner
         number = next_number(counts["COMP_ACK_SEQ"])
         try:
             words = reg.encode_comp(number, command, **fields)
@@ -128,7 +122,7 @@ class Banks:
             connection = self._session.link.connections
             counts = await self._comp_counts()
             if connection != self._session.link.connections:
-                await self._session.check_boot()  # after a restart the numbers begin anew and would prove nothing
+                await self._session.check_boot()  # after a restart the numbers begin anew and prove nothing
             return counts["COMP_ACK_SEQ"], counts["COMP_RESULT"]
 
         return await run_numbered(self._name, operation, number, write, acknowledge), counts
@@ -145,11 +139,11 @@ class Banks:
         length = header[_LENGTH_WORD]
         if header[0] != _MAGIC or not _HEADER_WORDS <= length <= reg.BANK_REGISTERS:
             detail = f"bank {bank} holds no image (magic {header[0]:#06x}, length {length})"
-            raise BadFrame(self._name, "read bank", detail, "empty or half written: give the number of bytes to read it all the same")
+            raise BadFrame(self._name, "read bank", detail, "empty or half written: give the number of bytes to read it anyway")
         return length
 
     def _within(self, operation: str, first: int, n_bytes: int) -> None:
-        """Refuse what is not registers of a bank, or begins within a 32-bit value."""
+        """Refuse ranges beyond the registers of a bank, or that split a 32-bit value."""
         if n_bytes % 2 or n_bytes <= 0 or first % 2 or not 0 <= first <= reg.BANK_REGISTERS - n_bytes // 2:
             detail = f"{n_bytes} bytes from register {first} on are not within the {reg.BANK_REGISTERS} registers of a bank"
             raise Refused(self._name, operation, detail)
@@ -161,7 +155,7 @@ class Banks:
 
 
 def _passed_over(command: int, result: int, counts: dict[str, int], fields: dict[str, int]) -> bool:
-    """Whether an acknowledge is that of another program's command: what it says does not go with who has the lease."""
+    """Whether an acknowledge belongs to another program's command: it contradicts the owner of the lease."""
     owner, holder = fields["owner"], counts["LEASE_OWNER"]
     if result == _LEASED:
         return holder == owner or (command == reg.LEASE and holder == 0)

@@ -1,4 +1,4 @@
-"""Conversation with a CNC controller: motion, status and compensation banks."""
+"""Driver of a CNC controller: motion, status and compensation banks."""
 
 from __future__ import annotations
 
@@ -16,13 +16,8 @@ class ModbusController:
     """A CNC controller with the register map of docs/protocols/cnc.md.
 
     Every method may raise ``LinkDown``, ``ReplyTimeout`` or ``BadFrame`` (the wire) and ``Rebooted`` (the controller restarted since
-    ``identify``; call ``identify`` again to accept that). Methods may be called from several tasks at a time: only single requests exclude
-    each other, so ``hold``, ``abort``, ``resume`` and ``status`` work while a move is pending.
-
-    Parameters
-    ----------
-    link : ModbusLink
-        Open link to the controller.
+    ``identify``; call ``identify`` again to accept that). Several tasks may call methods concurrently: only single requests exclude each
+    other, so ``hold``, ``abort``, ``resume`` and ``status`` work while a move is pending.
     """
 
     def __init__(self, link: ModbusLink) -> None:
@@ -31,20 +26,20 @@ class ModbusController:
         self._banks = Banks(self._session)
         self.name = link.name
         self.incidents = link.incidents
-        """Account of what went wrong on the link: one entry when it was noticed, one when it was over."""
+        """Incidents of the link: one entry for the detection, one for the outcome."""
 
     async def identify(self) -> DeviceInfo:
-        """Ask the controller who it is, and accept its boot id as the one that counts from now on.
+        """Read the identity of the controller, and accept its boot id as the current one.
 
         Raises
         ------
         WrongDevice
-            Canary registers or map version are not the protocol's.
+            Canary registers or map version do not match the protocol.
         """
         return await self._session.identify()
 
     async def table_format(self) -> TableFormat:
-        """Read in which unit and how large this controller stores tables."""
+        """Read the unit and the size of the controller's table banks."""
         return await self._session.table_format()
 
     async def status(self) -> ControllerStatus:
@@ -52,23 +47,10 @@ class ModbusController:
         return await self._session.status()
 
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
-        """Move straight to a target and wait until the axes stand there.
+        """Move straight to a target (commanded X, Y, Z in mm), wait until the axes stand there, and return that status.
 
-        When this is cancelled, times out or fails while the axes move, a feed hold is sent before the error goes on to the caller.
-
-        Parameters
-        ----------
-        target_mm : tuple of three float
-            Commanded X, Y, Z in mm.
-        feed_mm_min : float
-            Feed in mm/min.
-        timeout_s : float
-            Longest time for the whole move, in host seconds.
-
-        Returns
-        -------
-        ControllerStatus
-            Status at the end, in position.
+        On cancellation, timeout (``timeout_s`` host seconds for the whole move) or failure while the axes move, a feed hold is sent before
+        the error leaves.
 
         Raises
         ------
@@ -82,19 +64,19 @@ class ModbusController:
         return await self._motion.move(target_mm, feed_mm_min=feed_mm_min, timeout_s=timeout_s)
 
     async def load_path(self, points_mm: Sequence[Point]) -> None:
-        """Empty the controller's path and load these points (mm); nothing moves.
+        """Clear the controller's path and load these points (mm); nothing moves.
 
         Raises
         ------
         Refused
             Too many points, or one beyond the strokes.
         DeviceFault
-            Another number of points arrived than was sent.
+            The controller received another number of points.
         """
         await self._motion.load_path(points_mm)
 
     async def start_path(self, *, feed_mm_min: float) -> None:
-        """Start the loaded path at constant feed (mm/min) and return as soon as it runs; ``status`` tells how far it is.
+        """Start the loaded path at constant feed (mm/min) and return as soon as it runs; ``status`` shows its progress.
 
         Raises
         ------
@@ -104,11 +86,11 @@ class ModbusController:
         await self._motion.start_path(feed_mm_min=feed_mm_min)
 
     async def hold(self) -> None:
-        """Stop the axes on their path; ``resume`` goes on, ``abort`` gives up. Works at any time."""
+        """Stop the axes on their path; ``resume`` continues, ``abort`` gives up. Works at any time."""
         await self._motion.request_hold(reg.HOLD)
 
     async def resume(self) -> None:
-        """Take feed hold back: an interrupted motion goes on."""
+        """Release feed hold: an interrupted motion continues."""
         await self._motion.request_hold(reg.RUN)
 
     async def abort(self) -> None:
@@ -122,17 +104,11 @@ class ModbusController:
         await self._motion.abort()
 
     async def reset_alarm(self) -> None:
-        """Reset the controller's alarm after its cause was removed.
-
-        Raises
-        ------
-        Refused
-            The cause is still there.
-        """
+        """Reset the controller's alarm. Raises ``Refused`` while its cause persists."""
         await self._motion.reset_alarm()
 
     async def comp_status(self) -> CompStatus:
-        """Read the compensation status, with boot id and generation proven unchanged around it.
+        """Read the compensation status, with boot id and generation verified as unchanged around it.
 
         Raises
         ------
@@ -142,31 +118,25 @@ class ModbusController:
         return await self._banks.status()
 
     async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
-        """Take (or prolong) the right to change banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
+        """Take (or extend) the lease for changing banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
 
-        While the status says that another owner has it, nothing is sent, unless ``anyway``: a trial of whether the controller refuses.
+        If the status shows another owner, nothing is sent, unless ``anyway``, which tests whether the controller refuses.
 
         Raises
         ------
         Refused
-            Another owner has it.
+            Another owner has the lease.
         """
         await self._banks.lease(owner, lease_ms, anyway=anyway)
 
     async def release(self, owner: int, *, anyway: bool = False) -> None:
-        """Give the lease back; ``anyway`` as for `lease`.
-
-        Raises
-        ------
-        Refused
-            Another owner has it.
-        """
+        """Release the lease; ``anyway`` and errors as for `lease`."""
         await self._banks.release(owner, anyway=anyway)
 
     async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
-        """Write into the inactive bank from register ``first`` (even) on, in windows that never split a value.
+        """Write into the inactive bank from register ``first`` (even) on, in requests of up to 100 registers that never split a value.
 
-        Up to 100 registers travel in one request. Read them back before trusting them.
+        Read the bank back before relying on it.
 
         Raises
         ------
@@ -176,19 +146,19 @@ class ModbusController:
         await self._banks.write(bank, data, first=first)
 
     async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
-        """Read a bank from register ``first`` (even) on: ``n_bytes``, or to the end of the image that its header states.
+        """Read a bank from register ``first`` (even) on: ``n_bytes``, or to the end of the image by its header.
 
         Raises
         ------
         BadFrame
-            The bank holds no image and no length was given.
+            The bank holds no image and ``n_bytes`` is None.
         Refused
-            Not within the bank.
+            The range exceeds the bank.
         """
         return await self._banks.read(bank, n_bytes, first=first)
 
     async def seal(self, bank: int, owner: int) -> None:
-        """Let the controller check the bank's image and compute its CRC.
+        """Have the controller check the bank's image and compute its CRC.
 
         Raises
         ------
@@ -203,9 +173,9 @@ class ModbusController:
         Raises
         ------
         Refused
-            The controller's compare-and-swap, interlock or lease says no: nothing changed.
+            Compare-and-swap, interlock or lease failed at the controller: nothing changed.
         ReplyTimeout, LinkDown, BadFrame
-            The answer was lost and the controller says that nothing was executed, or cannot be asked: read ``comp_status`` before going on.
+            The reply was lost, and the controller reports no execution or is unreachable: read ``comp_status`` before continuing.
         """
         await self._banks.activate(bank, expect_crc=expect_crc, expect_gen=expect_gen, owner=owner)
 

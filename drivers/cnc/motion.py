@@ -1,4 +1,4 @@
-"""Moving the axes: single moves, paths, feed hold. A move that does not end as asked leaves the machine in feed hold."""
+"""Motion of the axes: single moves, paths, feed hold. A move that fails leaves the machine in feed hold."""
 
 from __future__ import annotations
 
@@ -22,18 +22,12 @@ _STOP_S = 5.0
 
 
 class MotionCommands:
-    """Motion commands, path FIFO and feed hold of one controller.
-
-    Parameters
-    ----------
-    session : ControllerSession
-        The conversation they travel in.
-    """
+    """Motion commands, path FIFO and feed hold of one controller."""
 
     def __init__(self, session: ControllerSession) -> None:
         self._session = session
         self._name = session.name
-        self._commands = asyncio.Lock()  # held while a command is being numbered and acknowledged, never while the axes move
+        self._commands = asyncio.Lock()  # held during numbering and acknowledge of a command, never while the axes move
 
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
         """See ``ModbusController.move``."""
@@ -76,7 +70,7 @@ class MotionCommands:
         await self._command(reg.RESET_ALARM, "reset alarm")
 
     async def request_hold(self, level: int) -> None:
-        """Write the level of HOLD_REQUEST. It is a level, not an event: writing it again changes nothing, so the link may repeat it."""
+        """Write HOLD_REQUEST. It is a level, not an event, so the link may repeat the write."""
         await self._session.link.write(reg.HOLD_ADDRESS, (level,), ModbusOperation.LEVEL)
 
     async def abort(self) -> None:
@@ -103,9 +97,9 @@ class MotionCommands:
         try:
             yield
         except (Refused, _MotionStopped):
-            raise  # nothing moves on our account
+            raise  # no motion of ours runs
         except BaseException as error:
-            # Cancelled, timed out, link lost, alarm: whatever the reason, the axes must not run on unattended.
+            # Cancellation, timeout, lost link, alarm: in every case the axes must not run on unattended.
             await self._hold_quietly(error)
             raise
 
@@ -113,14 +107,14 @@ class MotionCommands:
         async def hold() -> None:
             try:
                 async with asyncio.timeout(_HOLD_S):
-                    await self._hold_again_and_again()
+                    await self._retry_hold()
             except (DriverError, TimeoutError) as error:
                 reason.add_note(f"and the feed hold could not be sent: {error}")
 
         await run_to_end(hold())
 
-    async def _hold_again_and_again(self) -> None:
-        """A controller that is gone may be back in a moment, and its axes with it: the hold is tried as often as the link lets us."""
+    async def _retry_hold(self) -> None:
+        """Retry the feed hold as often as the link permits: a lost controller may return with moving axes."""
         while True:
             try:
                 return await self.request_hold(reg.HOLD)
@@ -132,7 +126,7 @@ class MotionCommands:
     async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
         async with self._commands:
             block = await self._session.block()
-            reasons = reg.interlocks(block.status.conditions)  # an open door may show as feed hold too: people have to hear of the door
+            reasons = reg.interlocks(block.status.conditions)  # an open door may also show as feed hold: report the door
             if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
                 raise Refused(self._name, operation, "feed hold is on", "call resume or abort first, when it is safe")
             number = next_number(block.motion_ack_seq)
@@ -151,7 +145,7 @@ class MotionCommands:
             result = await run_numbered(self._name, operation, number, write, acknowledge)
         if result:
             detail = reg.MOTION_RESULT.get(result, f"result {result}") + (f": {', '.join(reasons)}" if reasons else "")
-            # HOLD_REQUEST left at 2 forbids motion without a bit of the status saying so
+            # HOLD_REQUEST at 2 forbids motion without showing in the status
             unseen = "was an abort not finished? call abort again; else " if result == _INTERLOCK and not reasons else ""
             raise Refused(self._name, operation, detail, f"{unseen}look at the machine, then try again")
         return number
@@ -159,7 +153,7 @@ class MotionCommands:
     async def _done(self, number: int) -> ControllerStatus:
         while True:
             block = await self._session.block()
-            # Trouble first: after an alarm the controller may well count the command as done.
+            # Faults first: after an alarm the controller may count the command as done.
             self._check(block)
             if block.motion_done_seq == number:
                 return block.status
@@ -203,11 +197,11 @@ class MotionCommands:
 
 
 def _with_notes(error: DriverError, former: BaseException) -> DriverError:
-    """An error that says what its forerunner had to add: that the feed hold is not set after all, for one."""
+    """Copy the notes of an earlier error, such as a failed feed hold."""
     for note in getattr(former, "__notes__", ()):
         error.add_note(note)
     return error
 
 
 class _MotionStopped(DeviceFault):
-    """The controller is in feed hold already: asking for it once more could undo an abort that is under way."""
+    """The controller is already in feed hold: a further request could undo a running abort."""

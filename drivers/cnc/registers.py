@@ -94,11 +94,11 @@ COMP_RESULT = {
     1: "bad argument",
     2: "interlock: the machine moves or is not ready",
     3: "the bank's CRC differs from the expected one",
-    4: "the generation differs: somebody changed a bank meanwhile",
+    4: "the generation differs: another program or the operator changed a bank",
     5: "the bank is active",
     6: "the bank holds no valid image",
-    7: "the lease is held by another owner, or by nobody",
-    8: "staged: it acts after the control's restart, until then the other bank does",
+    7: "another owner holds the lease, or it is free",
+    8: "staged: it takes effect after the control's restart, until then the other bank acts",
 }
 BANK_STATES = {0: BankState.EMPTY, 1: BankState.WRITING, 2: BankState.SEALED, 3: BankState.LAID_ASIDE}
 ALARM = {1: "e-stop", 2: "stroke limit", 3: "path ran empty"}
@@ -137,13 +137,7 @@ _MUST_BE_SET = {
 
 
 def fingerprint(counts: Mapping[str, int]) -> str:
-    """Say in words what the identity block tells of the register map: whatever of it changes, the map is another one.
-
-    Parameters
-    ----------
-    counts : mapping
-        Decoded identity block.
-    """
+    """Describe the register map by the decoded identity block; any change means another map."""
     return (
         f"map {counts['MAP_VER']}, {counts['N_AXES']} axes, table unit {counts['TABLE_LSB_NM']} nm, "
         f"bank of {counts['BANK_SIZE']} registers, FIFO of {counts['FIFO_SIZE']} points"
@@ -151,7 +145,7 @@ def fingerprint(counts: Mapping[str, int]) -> str:
 
 
 def conditions_of(bits: int) -> Condition:
-    """What STATUS_BITS say; bits that this map does not know are left out."""
+    """Convert STATUS_BITS; bits unknown to this map are left out."""
     found = NOTHING_HOLDS
     for bit, condition in _CONDITIONS.items():
         if bits & bit:
@@ -160,17 +154,14 @@ def conditions_of(bits: int) -> Condition:
 
 
 def interlocks(conditions: Condition) -> list[str]:
-    """Say in words which conditions for motion are not met; empty when the machine may move."""
+    """Describe the unmet conditions for motion; empty if the machine may move."""
     wrong = [text for one, text in _MUST_BE_CLEAR.items() if one in conditions]
     return wrong + [text for one, text in _MUST_BE_SET.items() if one not in conditions]
 
 
 @dataclass(frozen=True, slots=True)
 class StatusBlock:
-    """Registers 16..63: the controller's status, and what became of the commands sent to it.
-
-    ``fifo_free``: points that its path still takes.
-    """
+    """Registers 16..63: the controller's status and the outcome of its commands. ``fifo_free``: free points of its path memory."""
 
     status: ControllerStatus
     alarm_code: int
@@ -183,15 +174,7 @@ class StatusBlock:
 
 
 def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
-    """Turn registers 16..63 of one request into a status.
-
-    Parameters
-    ----------
-    words : sequence of int
-        The 48 registers.
-    host_s : float
-        Monotonic host seconds at the last byte.
-    """
+    """Decode registers 16..63 of one request, which arrived at ``host_s`` (monotonic, last byte)."""
     counts = STATUS.counts(words)
     x, y, z = (STATUS.physical(name, counts[name]) for name in ("POSITION_X", "POSITION_Y", "POSITION_Z"))
     status = ControllerStatus(
@@ -218,12 +201,12 @@ def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
 
 
 def bank_state(number: int) -> BankState:
-    """What BANK_STATE_0 or BANK_STATE_1 says."""
+    """Convert BANK_STATE_0 or BANK_STATE_1."""
     return BANK_STATES.get(number, BankState.UNKNOWN)
 
 
 def decode_comp_status(words: Sequence[int], *, boot_id: int, gen: int) -> CompStatus:
-    """Turn registers 208..223 of one request into a compensation status, with the boot id and generation read around it."""
+    """Decode registers 208..223 of one request, with the boot id and generation read around it."""
     counts = COMP_STATUS.counts(words)
     return CompStatus(
         boot_id=boot_id,
@@ -237,13 +220,7 @@ def decode_comp_status(words: Sequence[int], *, boot_id: int, gen: int) -> CompS
 
 
 def position_counts(point_mm: Point) -> tuple[int, int, int]:
-    """Turn a position in mm into the wire's counts of 10 nm.
-
-    Raises
-    ------
-    ValueError
-        Not three finite numbers, or beyond +-21 m.
-    """
+    """Convert a position in mm to counts of 10 nm. Raises ValueError for values that are not finite or beyond +-21 m."""
     if not all(math.isfinite(value) and abs(value) <= 21_000.0 for value in point_mm):
         raise ValueError(f"{point_mm} is not a position: three finite numbers in mm, at most +-21 m")
     x, y, z = (round(value * COUNTS_PER_MM) for value in point_mm)
@@ -251,13 +228,7 @@ def position_counts(point_mm: Point) -> tuple[int, int, int]:
 
 
 def encode_motion(number: int, command: int, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> tuple[int, ...]:
-    """Build registers 64..73 of a motion command; ``target`` in counts.
-
-    Raises
-    ------
-    ValueError
-        The feed is not a number the register can hold.
-    """
+    """Build registers 64..73 of a motion command; ``target`` in counts. Raises ValueError for a feed that the register cannot hold."""
     if not (math.isfinite(feed_mm_min) and 0 <= feed_mm_min * FEED_PER_MM_MIN <= 0xFFFFFFFF):
         raise ValueError(f"{feed_mm_min} mm/min is not a feed")
     return words_of(struct.pack(">HHiiiI", number, command, *target, round(feed_mm_min * FEED_PER_MM_MIN)))
@@ -274,13 +245,7 @@ def encode_fifo(number: int, points: Sequence[tuple[int, int, int]]) -> tuple[in
 def encode_comp(
     number: int, command: int, *, bank: int = 0, expect_crc: int = 0, expect_gen: int = 0, owner: int = 0, lease_ms: int = 0
 ) -> tuple[int, ...]:
-    """Build registers 230..240 of a compensation command.
-
-    Raises
-    ------
-    ValueError
-        A value does not fit its register.
-    """
+    """Build registers 230..240 of a compensation command. Raises ValueError if a value does not fit its register."""
     try:
         return words_of(struct.pack(">HHHIIII", number, command, bank, expect_crc, expect_gen, owner, lease_ms))
     except struct.error as error:

@@ -1,4 +1,4 @@
-"""What every conversation with the controller needs: identity, coherent status, and noticing that it restarted."""
+"""Shared by all requests to the controller: identity, coherent status, and detection of a restart."""
 
 from __future__ import annotations
 
@@ -12,13 +12,7 @@ from abbe.drivers.links.words import check_clock, check_identity
 
 
 class ControllerSession:
-    """A link whose other end is known to be one and the same run of one controller.
-
-    Parameters
-    ----------
-    link : ModbusLink
-        Open link to the controller.
-    """
+    """A link that verifies that its peer is the same run of the same controller."""
 
     def __init__(self, link: ModbusLink) -> None:
         self.link = link
@@ -30,7 +24,7 @@ class ControllerSession:
         self._last_us = -1
 
     async def identify(self) -> DeviceInfo:
-        """Ask the controller who it is, and accept its boot id as the one that counts from now on.
+        """Read the identity of the controller, and accept its boot id as the current one.
 
         Raises
         ------
@@ -54,13 +48,7 @@ class ControllerSession:
         return DeviceInfo("cnc", f"{counts['N_AXES']}-axis controller", "", counts["BOOT_ID"], self._map)
 
     async def check_boot(self) -> None:
-        """Make sure that it is still the run of the controller that ``identify`` saw.
-
-        Raises
-        ------
-        Rebooted
-            It restarted.
-        """
+        """Raise ``Rebooted`` if the controller restarted since ``identify``."""
         counts = await self._identity()
         if self._boot_id is None:
             self._boot_id = counts["BOOT_ID"]
@@ -70,11 +58,11 @@ class ControllerSession:
             error = Rebooted(self.name, "check boot id", detail, remedy)
             self.link.incidents.note(error, latched=True)
             raise error
-        # Only now: as long as this fails, every status asks again, and nothing is done with a device that was not accepted.
+        # Only now: until this succeeds, every status checks again, and an unverified device gets no command.
         self._connection = self.link.connections
 
     async def status(self) -> ControllerStatus:
-        """How the controller is; see `block`."""
+        """Read the controller's status; see `block`."""
         return (await self.block()).status
 
     async def block(self) -> reg.StatusBlock:
@@ -89,14 +77,14 @@ class ControllerSession:
         """
         words = await self.link.read_block(reg.STATUS)
         block = reg.decode_status(words, time.monotonic())
-        # The boot id is not in this block: a clock that went back, or a new connection, is the reason to ask for it.
+        # This block has no boot id: check it after a new connection, or when the clock went back.
         if self._boot_id is None or block.status.ctrl_us < self._last_us or self._connection != self.link.connections:
             await self.check_boot()
         self._last_us = block.status.ctrl_us
         return block
 
     async def table_format(self) -> TableFormat:
-        """Read in which unit and how large this controller stores tables."""
+        """Read the unit and the size of the controller's table banks."""
         counts = await self._identity()
         return TableFormat(counts["TABLE_LSB_NM"], counts["BANK_SIZE"])
 
@@ -112,7 +100,7 @@ class ControllerSession:
         return counts
 
     def _check_map(self, counts: dict[str, int]) -> None:
-        """Refuse a register map that this driver was not written for, or that changed while we were connected."""
+        """Refuse a register map that this driver does not support, or that changed since ``identify``."""
         found = reg.fingerprint(counts)
         for name, expected in (("N_AXES", reg.AXES), ("BANK_SIZE", reg.BANK_REGISTERS)):
             if counts[name] != expected:

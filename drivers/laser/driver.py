@@ -1,4 +1,4 @@
-"""Conversation with a laser displacement meter: its register map (docs/protocols/laser.md) as data, and the driver."""
+"""Driver of a laser displacement meter, and its register map (docs/protocols/laser.md) as data."""
 
 from __future__ import annotations
 
@@ -52,15 +52,7 @@ RESULT_TEXT = {1: "bad argument", 2: "refused: beam blocked"}
 
 
 def decode_reading(words: Sequence[int], host_s: float) -> LaserReading:
-    """Turn registers 10..27 of one request into a reading.
-
-    Parameters
-    ----------
-    words : sequence of int
-        The 18 registers.
-    host_s : float
-        Monotonic host seconds at the last byte.
-    """
+    """Decode registers 10..27 of one request, which arrived at ``host_s`` (monotonic, last byte)."""
     counts = READING.counts(words)
     return LaserReading(
         host_s=host_s,
@@ -81,30 +73,22 @@ _READ_S = 5.0
 
 
 class ModbusLaser:
-    """A laser displacement meter on Modbus TCP or RTU (docs/protocols/laser.md).
-
-    Parameters
-    ----------
-    link : ModbusLink
-        Open link to the meter.
-    read_timeout_s : float
-        Longest wait for a new output sample.
-    """
+    """A laser displacement meter on Modbus TCP or RTU (docs/protocols/laser.md). ``read_timeout_s``: longest wait for a new sample."""
 
     def __init__(self, link: ModbusLink, *, read_timeout_s: float = _READ_S) -> None:
         self._link = link
         self.name = link.name
         self.incidents = link.incidents
-        """Account of what went wrong on the link: one entry when it was noticed, one when it was over."""
+        """Incidents of the link: one entry for the detection, one for the outcome."""
         self._read_timeout_s = read_timeout_s
         self._boot_id: int | None = None
         self._connection = link.connections
         self._last_us = -1
-        self._shown_at_command: int | None = None  # a command acts on the samples after it: this one may still be the old state
+        self._shown_at_command: int | None = None  # a command acts on later samples: this one may still have the old state
         self._command_lock = asyncio.Lock()
 
     async def identify(self) -> DeviceInfo:
-        """Ask the meter who it is, and accept its boot id as the one that counts from now on.
+        """Read the identity of the meter, and accept its boot id as the current one.
 
         Raises
         ------
@@ -140,7 +124,7 @@ class ModbusLaser:
         await self._command(ZERO, 0, "zero")
 
     async def clear_beam(self) -> None:
-        """Clear the latch of a lost beam. A new ``zero`` is needed after it.
+        """Clear the latch of a lost beam; needs a new ``zero`` afterwards.
 
         Raises
         ------
@@ -152,7 +136,7 @@ class ModbusLaser:
         await self._command(CLEAR_BEAM, 0, "clear beam-lost latch")
 
     async def set_environment_compensation(self, on: bool) -> None:
-        """Switch the compensation of the wavelength in air on or off (off, the meter reads some 270 ppm more).
+        """Switch the compensation of the wavelength in air on or off (without it the meter reads about 270 ppm more).
 
         Raises
         ------
@@ -162,17 +146,12 @@ class ModbusLaser:
         await self._command(ENVIRONMENT, int(on), "switch environmental compensation")
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
-        """Read the current output sample, or wait for one that is newer than ``after_count`` and than the last command.
-
-        Parameters
-        ----------
-        after_count : int, optional
-            ``sample_count`` of an earlier reading: the answer is a later sample, never the same one.
+        """Read the current output sample, or wait for one newer than ``after_count`` (a ``sample_count``) and than the last command.
 
         Raises
         ------
         DeviceFault
-            The beam is or was lost, or nothing was zeroed since: the displacement must not be used.
+            The beam is or was lost, or was not zeroed since: the displacement is not valid.
         ReplyTimeout
             No new sample in time.
         Rebooted, LinkDown, BadFrame
@@ -196,7 +175,7 @@ class ModbusLaser:
         return reading
 
     async def peek(self) -> LaserReading:
-        """Read the current output sample as it is, without waiting for a newer one and without judging its beam: for who watches.
+        """Read the current output sample without waiting for a newer one and without checking its beam, for watchers.
 
         Raises
         ------
@@ -229,7 +208,7 @@ class ModbusLaser:
         self._connection = self._link.connections
 
     async def _identity(self) -> dict[str, int]:
-        """The identity block, proven to be this map's: asked again at every new connection, because another device may be there now."""
+        """Read and verify the identity block; repeated at every new connection, because the device may be another one."""
         counts = IDENTITY.counts(await self._link.read_block(IDENTITY))
         try:
             check_identity(self.name, counts, MAP_VERSION)

@@ -1,1 +1,1 @@
-"""How bytes travel: device URLs, serial lines and sockets, Modbus."""
+"""Transport of bytes: device URLs, serial lines and sockets, Modbus."""

@@ -1,6 +1,6 @@
-"""Trouble on a link as an account that a person can read: one entry when it is noticed, one when it is over, however often it is met.
+"""Incidents of a link as a readable list: one entry for the detection and one for the outcome, regardless of the number of errors.
 
-And how long to wait before the next try at a link that is down (`Backoff`).
+Also the wait before the next attempt at a lost link (`Backoff`).
 """
 
 from __future__ import annotations
@@ -21,18 +21,9 @@ _KEPT = 256
 class Incident:
     """One entry.
 
-    Parameters
-    ----------
-    kind : str
-        ``detected`` or ``outcome``.
-    code, device, run, text : str
-        Of the first error of the trouble.
-    host_s : float
-        Monotonic host seconds.
-    state : str
-        Of an outcome: ``recovered`` (it answers again), ``accepted`` (it was identified anew), ``closed``.
-    times : int
-        Of an outcome: how many errors belonged to it.
+    ``kind``: ``detected`` or ``outcome``; ``code``, ``device``, ``run``, ``text``: of the first error; ``host_s``: monotonic host
+    seconds; ``state`` of an outcome: ``recovered`` (the device answers again), ``accepted`` (identified anew), ``closed``; ``times`` of an
+    outcome: number of errors.
     """
 
     kind: str
@@ -48,15 +39,8 @@ class Incident:
 class Incidents:
     """The latest incidents of one link, at most one of them open.
 
-    Parameters
-    ----------
-    listen : callable, optional
-        Is called with every entry; must not block or raise.
-
-    Attributes
-    ----------
-    run : str
-        The run that the link serves now. What no caller asked for (the heartbeat, a cable that is pulled) happens to it, too.
+    ``listen`` is called with every entry and must not block or raise. ``run``: the run that the link serves now; errors without a caller
+    (heartbeat, pulled cable) belong to it, too.
     """
 
     def __init__(self, listen: Callable[[Incident], None] | None = None) -> None:
@@ -69,16 +53,13 @@ class Incidents:
 
     @property
     def open(self) -> DriverError | None:
-        """The error that began the present trouble; None when there is none."""
+        """First error of the open incident, or None."""
         return self._open
 
     def note(self, error: DriverError, *, latched: bool = False) -> None:
-        """Note an error as it goes to the caller or was overcome. Only the first of a trouble makes an entry.
+        """Note an error, also one that a retry overcame. Only the first of an incident makes an entry.
 
-        Parameters
-        ----------
-        latched : bool
-            A good reply does not end this trouble (another device, a restart): the device has to be identified anew.
+        ``latched``: a good reply does not end the incident (another device, a restart); the device must be identified anew.
         """
         if error.run == NO_RUN:
             error.run = self.run
@@ -89,16 +70,16 @@ class Incidents:
             self._add("detected", error)
 
     def good(self) -> None:
-        """A request was answered as it should be: what was not latched is over."""
+        """End an incident that is not latched, after a good reply."""
         if not self._latched:
             self._end("recovered")
 
     def accepted(self) -> None:
-        """The device was identified anew: every trouble is over."""
+        """End any incident, after a new identification of the device."""
         self._end("accepted")
 
     def closed(self) -> None:
-        """The link is closed: nothing more will come of it."""
+        """End any incident when the link closes."""
         self._end("closed")
 
     def _end(self, state: str) -> None:
@@ -119,23 +100,10 @@ JITTER = 0.2
 
 
 class Backoff:
-    """Waiting times of one device: at once, then 0.5 s, 1 s, 2 s ... 30 s, each 20 % more or less, so that hosts do not knock together.
+    """Waits between attempts: none, then 0.5 s, 1 s, 2 s ... 30 s, each with 20 % jitter, so that hosts do not retry in step.
 
-    A connection that is made proves nothing: a controller may accept and close. Only ``succeeded`` starts anew. At most eight attempts
-    fall into the first minute.
-
-    Parameters
-    ----------
-    first_s, longest_s : float
-        Wait before the second attempt, and the longest one, in s.
-    jitter : float
-        Largest relative deviation of a wait.
-    clock : callable
-        Monotonic seconds.
-    sleep : callable
-        Waits for so many seconds.
-    draw : callable
-        Uniform in 0..1.
+    A connection proves nothing, because a controller may accept and close: only ``succeeded`` resets the waits. At most eight attempts fall
+    into the first minute. ``clock``, ``sleep`` and ``draw`` (uniform in 0..1) can be replaced in tests.
     """
 
     def __init__(
@@ -154,7 +122,7 @@ class Backoff:
         self._wait_s = 0.0
 
     def left_s(self) -> float:
-        """Seconds until the next attempt is due; 0 when it may be made now."""
+        """Seconds until the next attempt is due; 0 if it is due now."""
         return max(0.0, self._next_s - self._clock())
 
     async def due(self) -> None:
@@ -163,10 +131,10 @@ class Backoff:
             await self._sleep(left_s)
 
     def attempted(self) -> None:
-        """Count an attempt, whatever comes of it."""
+        """Count an attempt, successful or not."""
         self._wait_s = min(2 * self._wait_s or self._first_s, self._longest_s)
         self._next_s = self._clock() + self._wait_s * (1 + self._jitter * (2 * self._draw() - 1))
 
     def succeeded(self) -> None:
-        """Start anew: a request was answered."""
+        """Reset the waits after an answered request."""
         self._wait_s, self._next_s = 0.0, float("-inf")

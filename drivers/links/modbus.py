@@ -1,8 +1,8 @@
-"""One Modbus connection, TCP or RTU: open, ask one thing, drop. The only file that knows pymodbus.
+"""One Modbus connection, TCP or RTU: open, send one request, drop. The only file that uses pymodbus.
 
-What the library (3.16.1) does not do by itself and this file adds: no hidden repetition of writes, no hidden reconnects, every reply
-compared with its request (`tcp_mismatch`, `rtu_mismatch`) before the library sees it, the old socket closed before a new one is made, and
-an ear for unsolicited bytes.
+This file adds to the library (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
+(`tcp_mismatch`, `rtu_mismatch`) before the library gets it, closing of the old socket before a new one opens, and detection of unsolicited
+bytes.
 """
 
 from __future__ import annotations
@@ -38,19 +38,9 @@ EXCEPTION_TEXT = {
 
 
 def tcp_mismatch(sent: bytes, heard: bytes) -> str:
-    """Compare what arrived so far on Modbus TCP with what was asked.
+    """Compare the bytes received so far on Modbus TCP with the request frame.
 
-    Parameters
-    ----------
-    sent : bytes
-        The whole request frame.
-    heard : bytes
-        All bytes that arrived since it was sent; may still be incomplete.
-
-    Returns
-    -------
-    str
-        What is wrong, or ``""`` as long as nothing is.
+    ``heard``: all bytes since the request, possibly incomplete. Returns the mismatch, or ``""``.
     """
     if len(heard) >= 2 and heard[:2] != sent[:2]:
         return f"transaction id {int.from_bytes(heard[:2], 'big')} instead of {int.from_bytes(sent[:2], 'big')}"
@@ -70,19 +60,9 @@ def tcp_mismatch(sent: bytes, heard: bytes) -> str:
 
 
 def rtu_mismatch(sent: bytes, heard: bytes) -> str:
-    """Compare what arrived so far on Modbus RTU with what was asked; the check sum is the library's business.
+    """Compare the bytes received so far on Modbus RTU with the request frame; the library verifies the check sum.
 
-    Parameters
-    ----------
-    sent : bytes
-        The whole request frame.
-    heard : bytes
-        All bytes that arrived since it was sent; may still be incomplete.
-
-    Returns
-    -------
-    str
-        What is wrong, or ``""`` as long as nothing is.
+    ``heard``: all bytes since the request, possibly incomplete. Returns the mismatch, or ``""``.
     """
     if heard and heard[0] != sent[0]:
         return f"unit {heard[0]} instead of {sent[0]}"
@@ -116,11 +96,11 @@ def _pdu_mismatch(asked: bytes, heard: bytes) -> str:
     return ""
 
 
-# Everything that goes wrong leaves here as a typed error: the library's own lines would only repeat it on stderr.
+# All failures become typed errors here: the library's own log would only repeat them on stderr.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 READ_HOLDING, READ_INPUT, WRITE = 3, 4, 16
-# A peer that is gone without a word is found by the kernel too, within 3 s.
+# The kernel, too, detects a peer that vanished, within 3 s.
 _KEEPALIVE = (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 2), ("TCP_USER_TIMEOUT", 2500))
 _BITS_PER_BYTE = 11
 _TURNS = 20
@@ -129,7 +109,7 @@ _SHORTEST_GAP_S = 0.00175  # 3.5 characters; above 19200 Bd the standard fixes i
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request. ``values``: of a write."""
+    """One request; ``values`` only for a write."""
 
     function: int
     address: int
@@ -142,20 +122,14 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class ModbusReply:
-    """A reply that answers its request: the registers of a read, or the exception code."""
+    """A matching reply: the registers of a read, or the exception code."""
 
     registers: tuple[int, ...] = ()
     exception: int = 0
 
 
 class ModbusWire:
-    """At most one connection at a time to one unit.
-
-    Parameters
-    ----------
-    url : ModbusTcpUrl or ModbusRtuUrl
-        Where the unit is.
-    """
+    """At most one connection at a time to one unit."""
 
     def __init__(self, url: ModbusTcpUrl | ModbusRtuUrl) -> None:
         self._url = url
@@ -170,15 +144,15 @@ class ModbusWire:
         self.heard_at = float("-inf")
         """Loop time of the last byte."""
         self.strays = 0
-        """Bytes that came when nothing was asked, since the connection was made or ``forget`` was called."""
+        """Number of unsolicited bytes since the connection was made or ``forget`` was called."""
 
     @property
     def up(self) -> bool:
-        """Whether there is a connection, as far as the system knows."""
+        """Whether the system knows of a working connection."""
         return self._client is not None and self._client.connected and not self._lost
 
     async def open(self, timeout_s: float) -> None:
-        """Make a connection, after any former one is closed.
+        """Connect, after closing any former connection.
 
         Raises
         ------
@@ -231,14 +205,14 @@ class ModbusWire:
         return ModbusReply(exception=reply.exception_code) if reply.isError() else ModbusReply(tuple(reply.registers))
 
     async def drop(self) -> None:
-        """Close the connection, if there is one, and see it closed: a device that allows one socket must never see two."""
+        """Close the connection, if any, and wait until it is closed: a device that allows one socket must never see two."""
         client, self._client, self._lost = self._client, None, False
         if client is None:
             return
         transport = client.ctx.transport
         client.close()
         if isinstance(transport, asyncio.Transport):
-            transport.abort()  # what was not sent yet shall not be sent later
+            transport.abort()  # discards unsent bytes
         end = transport.get_extra_info("socket") if isinstance(transport, asyncio.Transport) and not self.rtu else None
         for _ in range(_TURNS):  # the event loop closes a socket in one of its next turns
             await asyncio.sleep(0)
@@ -246,7 +220,7 @@ class ModbusWire:
                 return
 
     def hang_up(self) -> None:
-        """End a pending ``ask`` with ``LinkDown``: this side wants no more."""
+        """End a pending ``ask`` with ``LinkDown``."""
         self._lost = True
         self._interrupt()
 
@@ -309,7 +283,7 @@ class ModbusWire:
         if self.rtu or not isinstance(transport, asyncio.Transport):
             return
         end = transport.get_extra_info("socket")
-        with contextlib.suppress(OSError):  # a system that cannot do it still has the deadlines and the heartbeat
+        with contextlib.suppress(OSError):  # without keep-alive the deadlines and the heartbeat remain
             end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             for name, value in _KEEPALIVE:
                 if (option := getattr(socket, name, None)) is not None:
@@ -317,7 +291,7 @@ class ModbusWire:
 
     def _remedy(self) -> str:
         if isinstance(self._url, ModbusTcpUrl):
-            return "address and port right? device on? only one connection allowed and somebody else has it?"
+            return "address and port right? device on? only one connection allowed and another program has it?"
         path = self._url.path
         if not os.path.exists(path):
             return "adapter plugged in? device path right?"
@@ -332,7 +306,7 @@ class ModbusWire:
         self.heard_at = asyncio.get_running_loop().time()
         if self._deadline is None or self._deadline.expired():
             self.strays += len(data)
-            return b""  # unsolicited: the quarantine hears it, no reply is read from it
+            return b""  # unsolicited: counted for the quarantine, never read as a reply
         self._heard = data
         self._complaint = rtu_mismatch(self._sent, data) if self.rtu else tcp_mismatch(self._sent, data)
         if not self._complaint:

@@ -1,6 +1,6 @@
-"""When an answer on a Modbus line may be believed. TCP numbers its transactions; an RTU line has to prove that it is in step.
+"""Validity of replies on a Modbus line. TCP numbers its transactions; an RTU line must prove that replies match requests.
 
-What may be asked again, and what an exception code means, are two tables.
+Two tables define which requests may be repeated, and the meaning of exception codes.
 """
 
 from __future__ import annotations
@@ -15,30 +15,24 @@ from abbe.drivers.links.words import CANARY_WORDS
 
 
 class ModbusOperation(Enum):
-    """What a request does to the device, as far as repeating it is concerned."""
+    """Effect of a request on the device, which determines whether it may be repeated."""
 
     READ = "read"
     """Changes nothing."""
     LEVEL = "level"
-    """Writes a state, not an event (feed hold): twice is the same as once."""
+    """Writes a state, not an event (feed hold): idempotent."""
     NUMBERED = "numbered"
-    """A command that the device executes only if it carries the next number, or words that are read back: what became of it is asked."""
+    """A command that the device executes only with the next number, or data that are read back: a later read shows the outcome."""
     TRIGGER = "trigger"
-    """Anything else that is written: never sent again, whatever happens."""
+    """Any other write: never repeated."""
 
 
 @dataclass(frozen=True, slots=True)
 class RetryRule:
-    """How one kind of request is treated.
+    """Retries of one kind of request.
 
-    Parameters
-    ----------
-    repeats : int
-        How often it is sent again, over a new or a proven line, when no valid reply came.
-    after_busy : bool
-        Whether it is sent again after exception 6 (busy: not accepted), for at most ``BUSY_S``.
-    after_acknowledge : bool
-        Whether it is sent again after exception 5 (accepted, still working on it), for at most ``BUSY_S``.
+    ``repeats``: number of retries, over a new or verified line, without a valid reply; ``after_busy``: retry after exception 6 (busy: not
+    accepted), ``after_acknowledge``: after exception 5 (accepted, still working), both for at most ``BUSY_S``.
     """
 
     repeats: int
@@ -49,7 +43,7 @@ class RetryRule:
 POLICY = {
     ModbusOperation.READ: RetryRule(repeats=1, after_busy=True, after_acknowledge=True),
     ModbusOperation.LEVEL: RetryRule(repeats=1, after_busy=True, after_acknowledge=True),
-    # 6 says that nothing was executed. 5 says that something may be under way: the acknowledge register decides, never the 5 itself.
+    # 6 means that nothing was executed. 5 means that the command may still execute: only the acknowledge register decides.
     ModbusOperation.NUMBERED: RetryRule(repeats=0, after_busy=True, after_acknowledge=False),
     ModbusOperation.TRIGGER: RetryRule(repeats=0, after_busy=False, after_acknowledge=False),
 }
@@ -60,8 +54,8 @@ ACKNOWLEDGE, BUSY = 5, 6
 
 
 @dataclass(frozen=True, slots=True)
-class Meaning:
-    """What an exception code says, which error it becomes, what a person can do. ``dead``: the far end did not answer."""
+class ExceptionRule:
+    """Text, error class and remedy of an exception code. ``dead``: the device behind a gateway did not answer."""
 
     text: str
     error: type[DriverError]
@@ -71,30 +65,30 @@ class Meaning:
 
 _MAP = "the register map may not fit this device: compare its map version and address with docs/protocols"
 _DIAGNOSE = "look at the device's own diagnostics"
-_WAIT = "it stays busy: try again in a moment, look at the device if it goes on"
+_WAIT = "the device is busy: try again in a moment, look at the device if it persists"
 _GATEWAY = "look at the gateway and at the line behind it"
 
 EXCEPTIONS = {
-    1: Meaning("illegal function", Refused, _MAP),
-    2: Meaning("illegal data address (or not writable)", Refused, _MAP),
-    3: Meaning("illegal data value", Refused, _MAP),
-    4: Meaning("device failure", DeviceFault, _DIAGNOSE),
-    5: Meaning("acknowledged, still busy with it", ReplyTimeout, _WAIT),
-    6: Meaning("busy", ReplyTimeout, _WAIT),
-    8: Meaning("memory parity error", DeviceFault, _DIAGNOSE),
-    10: Meaning("gateway path unavailable", LinkDown, _GATEWAY, dead=True),
-    11: Meaning("gateway target does not respond", LinkDown, _GATEWAY, dead=True),
+    1: ExceptionRule("illegal function", Refused, _MAP),
+    2: ExceptionRule("illegal data address (or not writable)", Refused, _MAP),
+    3: ExceptionRule("illegal data value", Refused, _MAP),
+    4: ExceptionRule("device failure", DeviceFault, _DIAGNOSE),
+    5: ExceptionRule("acknowledged, still busy with it", ReplyTimeout, _WAIT),
+    6: ExceptionRule("busy", ReplyTimeout, _WAIT),
+    8: ExceptionRule("memory parity error", DeviceFault, _DIAGNOSE),
+    10: ExceptionRule("gateway path unavailable", LinkDown, _GATEWAY, dead=True),
+    11: ExceptionRule("gateway target does not respond", LinkDown, _GATEWAY, dead=True),
 }
-_UNKNOWN = Meaning("unknown", DeviceFault, _DIAGNOSE)
+_UNKNOWN = ExceptionRule("unknown", DeviceFault, _DIAGNOSE)
 
 
-def meaning(code: int) -> Meaning:
-    """What an exception code means; codes of no standard are the device's fault."""
+def exception_rule(code: int) -> ExceptionRule:
+    """Return the rule of an exception code; non-standard codes are device faults."""
     return EXCEPTIONS.get(code, _UNKNOWN)
 
 
 def waits(op: ModbusOperation, code: int) -> bool:
-    """Whether the request is sent again after this exception code, within ``BUSY_S``."""
+    """Whether to retry the request after this exception code, within ``BUSY_S``."""
     rule = POLICY[op]
     return (code == BUSY and rule.after_busy) or (code == ACKNOWLEDGE and rule.after_acknowledge)
 
@@ -102,21 +96,15 @@ def waits(op: ModbusOperation, code: int) -> bool:
 _BABBLE_LIMIT = 5
 _PROOFS = 5
 _CONNECT = 3
-"""A TCP connection may take so many reply timeouts: a lost first packet is sent again after a second."""
+"""Reply timeouts that a TCP connection may take: a lost first packet is sent again after a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Canary:
-    """Registers whose content is known: what proves that a line carries this device's answers, and these in the right order.
+    """Registers with known content, which verify that replies come from this device and match their requests.
 
-    Parameters
-    ----------
-    address : int
-        First register.
-    words : tuple of int
-        What stands there.
-    readable : int
-        Registers that may be read from ``address`` on in one request: reads of different lengths cannot be taken for one another.
+    ``words``: content from ``address`` on; ``readable``: registers that one request may read from there, because replies of different
+    length cannot be confused.
     """
 
     address: int = 0
@@ -125,19 +113,11 @@ class Canary:
 
 
 class ModbusLine:
-    """A wire with a memory of what went wrong on it.
+    """A wire that tracks disturbances.
 
-    On RTU, after whatever was not answered as it should be: silence for a whole reply timeout, then the canary, and only then the next
-    request. And behind every answer the canary once more: if a stale reply passed for the answer, the true one comes now and does not fit.
-
-    Parameters
-    ----------
-    wire : ModbusWire
-        The connection.
-    timeout_s : float
-        Longest wait for one reply.
-    canary : Canary or None
-        Without one a disturbed RTU line is only waited silent.
+    On RTU a missing or wrong reply is followed by silence for a whole reply timeout and a read of the canary before the next request. The
+    canary is also read after every reply: if a stale reply passed for the answer, the true one arrives now and does not match. Without a
+    canary a disturbed RTU line gets only the silence. ``timeout_s``: longest wait for one reply.
     """
 
     def __init__(self, wire: ModbusWire, timeout_s: float, canary: Canary | None) -> None:
@@ -149,22 +129,22 @@ class ModbusLine:
         self.closing = False
         """Stop waiting for silence."""
         self.dirty = False
-        """The next request has to wait until the line is proven."""
+        """Whether the line must be verified before the next request."""
         self.foreign_bytes = 0
-        """Bytes that came when nothing was asked: noise, late replies, or a second master."""
+        """Number of unsolicited bytes: noise, late replies, or a second master."""
 
     async def open(self) -> None:
-        """Make a new connection; errors as of ``ModbusWire.open``."""
+        """Make a new connection; raises as ``ModbusWire.open``."""
         self._known = None
         await self._wire.open(self._timeout_s if self._wire.rtu else _CONNECT * self._timeout_s)
 
     async def ready(self) -> None:
-        """Come to a state in which the next answer can be believed.
+        """Bring the line into a state in which the next reply is reliable.
 
         Raises
         ------
         LinkDown
-            The line is never silent, or never proves itself.
+            The line never falls silent, or fails its verification.
         """
         await self._wire.gap()
         if self._wire.strays:
@@ -174,10 +154,10 @@ class ModbusLine:
         if self.dirty:
             await self._quarantine()
 
-    def formed(self, request: Request, lead: int) -> tuple[Request, int]:
-        """The request in the form that this turn has, and how many of the registers read stand before those asked for.
+    def varied(self, request: Request, lead: int) -> tuple[Request, int]:
+        """Return the request in its current variant, and the number of extra registers before the requested ones.
 
-        With a canary: functions 3 and 4 in turn, and up to ``lead`` registers more, so that a reply to an earlier read looks different.
+        With a canary, functions 3 and 4 alternate, with up to ``lead`` extra registers, so that a reply to an earlier read is recognised.
         """
         if self._canary is None or request.function == WRITE:
             return request, 0
@@ -185,13 +165,13 @@ class ModbusLine:
         return Request(self._function(), request.address - skip, request.count + skip), skip
 
     async def ask(self, request: Request) -> ModbusReply:
-        """Send a request once; on RTU believe its answer only when the canary behind it is answered too. Errors as of the wire's."""
+        """Send a request once; on RTU accept its reply only if the canary read after it is right. Raises as the wire."""
         answer = await self._asked(request)
         if self._canary is not None:
             await self._wire.gap()
             if self._wire.strays or not await self._proven(self._canary, 0):
                 self.dirty = True
-                detail = "an answer came, but the canary asked behind it was not answered as it must be: it may have been a stale one"
+                detail = "a reply came, but the canary read after it was wrong: the reply may be stale"
                 raise BadFrame(self._name, str(request), detail, "second master on the line, line noise, or a slow device?")
         return answer
 
@@ -199,14 +179,14 @@ class ModbusLine:
         try:
             return await self._wire.ask(request, self._timeout_s)
         except BaseException as error:
-            # RTU has no transaction number: what was not answered may be answered any time. TCP: a new connection has no past.
+            # RTU has no transaction number: an unanswered request may be answered at any time. TCP: a new connection has no past.
             self.dirty = self._wire.rtu
             if not self._wire.rtu or isinstance(error, LinkDown):
                 await self._wire.drop()
             raise
 
     async def _quarantine(self) -> None:
-        """Let whatever is late come and go, then prove with the canary that answers belong to questions again."""
+        """Let late replies pass, then verify with the canary that replies match requests again."""
         for proof in range(_PROOFS):
             await self._silence()
             self._wire.forget()
@@ -215,8 +195,8 @@ class ModbusLine:
                 return
             if not self._wire.up:
                 break
-        detail = f"the canary registers were not answered as they must be, {_PROOFS} times"
-        raise LinkDown(self._name, "prove the line after a disturbance", detail, "second master on the line, or device off?")
+        detail = f"the canary registers were wrong {_PROOFS} times"
+        raise LinkDown(self._name, "verify the line after a disturbance", detail, "second master on the line, or device off?")
 
     async def _silence(self) -> None:
         clock = asyncio.get_running_loop().time
@@ -229,14 +209,14 @@ class ModbusLine:
             await asyncio.sleep(left_s)
 
     async def _proven(self, canary: Canary, proof: int) -> bool:
-        """Ask the canary. What it has to be is what it was at this connection, twice; whether it is right is for the identification."""
-        words = await self._sung(canary, proof)
+        """Read the canary and compare it with two equal reads of this connection; the identification checks its content."""
+        words = await self._read_canary(canary, proof)
         if words and self._known is None:
-            self._known = words if await self._sung(canary, proof + 1) == words else None
+            self._known = words if await self._read_canary(canary, proof + 1) == words else None
         return bool(words) and words == self._known and not self._wire.strays
 
-    async def _sung(self, canary: Canary, proof: int) -> tuple[int, ...]:
-        """What stands in the canary registers, read in another form each time; empty when no such answer came."""
+    async def _read_canary(self, canary: Canary, proof: int) -> tuple[int, ...]:
+        """Read the canary registers, in another variant each time; empty without a valid reply."""
         longer = (self._turn // 2 + proof) % (canary.readable - len(canary.words) + 1)
         try:
             answer = await self._asked(Request(self._function(), canary.address, len(canary.words) + longer))

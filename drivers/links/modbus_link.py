@@ -1,4 +1,4 @@
-"""Modbus TCP and RTU behind four calls: connect, read, write, close. Decides what is repeated, when to wait, and what may be believed."""
+"""Modbus TCP and RTU behind four calls: connect, read, write, close. Decides on retries, waits and the validity of replies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
 from abbe.drivers.links.incidents import Backoff, Incidents
 from abbe.drivers.links.modbus import READ_HOLDING, WRITE, ModbusReply, ModbusWire, Request
-from abbe.drivers.links.modbus_line import BUSY_POLL_S, BUSY_S, POLICY, Canary, ModbusLine, ModbusOperation, meaning, waits
+from abbe.drivers.links.modbus_line import BUSY_POLL_S, BUSY_S, POLICY, Canary, ModbusLine, ModbusOperation, exception_rule, waits
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.drivers.links.words import RegisterBlock
 
@@ -23,18 +23,13 @@ class ModbusLink:
 
     Parameters
     ----------
-    url : ModbusTcpUrl or ModbusRtuUrl
-        Where the unit is.
     timeout_s : float
         Longest wait for one reply, and for one connection.
     canary : Canary, optional
-        Of devices that have one and answer function 4 like function 3 (docs/protocols). Without it a disturbed RTU line is only waited
-        silent, not proven, and there is no heartbeat.
-    backoff : Backoff, optional
-        Waits between attempts to connect.
+        Of devices that have one and answer function 4 like function 3 (docs/protocols). Without it a disturbed RTU line gets silence but no
+        verification, and there is no heartbeat.
     heartbeat_s : float, optional
-        Ask the canary when nothing else was asked for so long: a peer that went without a word is found within this and one timeout,
-        and a lost one is looked for again.
+        Read the canary after this idle time: this detects a vanished peer within the same time plus one timeout, and reconnects a lost one.
     """
 
     def __init__(
@@ -49,7 +44,7 @@ class ModbusLink:
         self.name = str(url)
         self.incidents = Incidents()
         self.connections = 0
-        """How often the link was (re)connected: a change means that the device may have been restarted in between."""
+        """Number of connections so far: after a change the device may have restarted."""
         self._wire = ModbusWire(url)
         self._line = ModbusLine(self._wire, timeout_s, canary)
         self._canary = canary
@@ -88,7 +83,7 @@ class ModbusLink:
 
     @property
     def state(self) -> str:
-        """``closed``, ``down`` (the next request connects), ``quarantine`` (the next request proves the line first) or ``up``."""
+        """``closed``, ``down`` (the next request connects), ``quarantine`` (the next request verifies the line first) or ``up``."""
         if self._closed:
             return "closed"
         if not self._wire.up:
@@ -97,17 +92,14 @@ class ModbusLink:
 
     @property
     def foreign_bytes(self) -> int:
-        """Bytes that came when nothing was asked: noise, late replies, or a second master."""
+        """Number of unsolicited bytes: noise, late replies, or a second master."""
         return self._line.foreign_bytes
 
     async def read(self, address: int, count: int, *, lead: int = 0) -> tuple[int, ...]:
-        """Read ``count`` (1..125) registers with one request, repeated once over a new or proven line if the first one failed.
+        """Read ``count`` (1..125) registers with one request, with one retry over a new or verified line.
 
-        Parameters
-        ----------
-        lead : int
-            Registers before ``address`` that may be read with them. On RTU some of them are, a few more or less each time: together with
-            functions 3 and 4 in turn, a reply that belongs to an earlier read has another form and is recognised.
+        ``lead``: registers before ``address`` that may be read, too. On RTU a varying number of them is: together with alternating
+        functions 3 and 4 this makes a reply to an earlier read recognisable.
 
         Raises
         ------
@@ -125,7 +117,7 @@ class ModbusLink:
         return await self.read(block.base, block.count, lead=block.lead)
 
     async def write(self, address: int, values: Sequence[int], op: ModbusOperation = ModbusOperation.TRIGGER) -> None:
-        """Write 1..123 registers (FC16); whether it may be sent again is said by ``op`` (drivers/links/modbus_line.py).
+        """Write 1..123 registers (FC16); ``op`` determines whether the write may be repeated (drivers/links/modbus_line.py).
 
         Raises
         ------
@@ -145,7 +137,7 @@ class ModbusLink:
         if self._pulse is not None:
             self._pulse.cancel()
         if self._task is not None and not self._on_wire:
-            self._task.cancel()  # it waits for its next attempt, or for silence
+            self._task.cancel()  # the task waits for its next attempt, or for silence
         try:
             if pending := [task for task in (self._task, self._pulse) if task is not None]:
                 await asyncio.wait(pending)
@@ -155,8 +147,8 @@ class ModbusLink:
 
     async def _transact(self, request: Request, op: ModbusOperation, lead: int = 0, patience_s: float = _PATIENCE_S) -> tuple[int, ...]:
         await self._lock.acquire()
-        # The exchange is a task of its own that keeps the lock: a caller who is cancelled goes at once, but a request that is already on
-        # the wire is still waited for, so its reply can never meet the next request.
+        # The exchange is a task of its own that keeps the lock: a cancelled caller returns at once, but the task still waits for the reply
+        # to a request on the wire, so that the reply can never meet the next request.
         self._on_wire = self._abandoned = False
         task = asyncio.get_running_loop().create_task(self._exchange(request, op, lead, patience_s))
         self._task = task
@@ -166,14 +158,14 @@ class ModbusLink:
         except asyncio.CancelledError:
             if self._closed and task.cancelled():
                 raise LinkDown(self.name, str(request), "the link was closed", "open it again") from None
-            self._abandoned = True  # what is on the wire is awaited, but nothing is sent for a caller that has gone
+            self._abandoned = True  # wait for a request on the wire, but send nothing more for this caller
             if not self._on_wire:
                 task.cancel()
             raise
 
     def _finished(self, task: asyncio.Task[tuple[int, ...]]) -> None:
         if not task.cancelled():
-            task.exception()  # marks it as seen: a cancelled caller is no longer there to see it
+            task.exception()  # marks it as retrieved: a cancelled caller cannot
         self._task = None
         self._lock.release()
 
@@ -181,13 +173,13 @@ class ModbusLink:
         repeats, clock = POLICY[op].repeats, asyncio.get_running_loop().time
         busy_until = clock() + BUSY_S
         while True:
-            sent, skip = self._line.formed(request, lead)
+            sent, skip = self._line.varied(request, lead)
             self._on_wire = False
             try:
                 answer = await self._once(sent, patience_s)
             except (LinkDown, ReplyTimeout, BadFrame) as error:
                 self.incidents.note(error)
-                # Without a connection (nothing on the wire) a second attempt would only hammer the device.
+                # Without a connection (nothing on the wire) a second attempt would only burden the device.
                 if not repeats or not self._on_wire or self._closed or self._abandoned:
                     raise
                 repeats -= 1
@@ -207,13 +199,13 @@ class ModbusLink:
             answer = await self._line.ask(request)
         finally:
             self._asked_at = asyncio.get_running_loop().time()
-        if not meaning(answer.exception).dead:
+        if not exception_rule(answer.exception).dead:
             self._backoff.succeeded()
         return answer
 
     def _refusal(self, request: Request, code: int) -> DriverError:
-        what = meaning(code)
-        error = what.error(self.name, str(request), f"exception {code}: {what.text}", what.remedy)
+        rule = exception_rule(code)
+        error = rule.error(self.name, str(request), f"exception {code}: {rule.text}", rule.remedy)
         self.incidents.note(error)
         return error
 
@@ -227,8 +219,8 @@ class ModbusLink:
     async def _connect(self, patience_s: float) -> None:
         left_s = self._backoff.left_s()
         if left_s > patience_s:
-            detail = f"no connection; it is tried again in {left_s:.1f} s"
-            raise LinkDown(self.name, "connect", detail, "device on? network or cable all right? somebody else connected to it?")
+            detail = f"no connection; next attempt in {left_s:.1f} s"
+            raise LinkDown(self.name, "connect", detail, "device on? network or cable all right? another program connected to it?")
         await self._backoff.due()
         self._backoff.attempted()
         await self._line.open()
@@ -245,5 +237,5 @@ class ModbusLink:
                 continue
             self._asked_at = clock()
             if self._wire.up or not self._backoff.left_s():
-                with contextlib.suppress(DriverError):  # it is in the account already; the next request will say it too
+                with contextlib.suppress(DriverError):  # already noted as an incident; the next request raises it, too
                     await self._transact(Request(READ_HOLDING, canary.address, len(canary.words)), ModbusOperation.READ, patience_s=0.0)

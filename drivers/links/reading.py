@@ -1,7 +1,7 @@
-"""A thread that only reads: bytes from one descriptor into a bounded ring, so that no busy loop, disk or solver makes the kernel's few
-kilobytes run over.
+"""A thread that only reads bytes from a descriptor into a bounded ring, so that no busy loop, disk or solver lets the kernel's small buffer
+overflow.
 
-What does not fit into the ring is counted and handed on as a loss, never left out in silence; before it comes to that, the marks tell.
+Bytes that do not fit into the ring are counted and reported as a loss; the marks warn before that.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
 MARKS = (0.5, 0.8, 1.0)
-"""Warn, stop the machine, data are being lost."""
+"""Fill levels: warning, stop of the machine, loss of data."""
 _READ_BYTES = 65536
 _STOP_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class ReadPiece:
-    """Bytes that arrived together. ``lost_before``: bytes that found no room just before them."""
+    """Bytes that arrived together. ``lost_before``: number of bytes lost just before them for lack of room."""
 
     host_s: float
     data: bytes
@@ -31,13 +31,7 @@ class ReadPiece:
 
 
 class Ring:
-    """First in, first out, at most ``capacity`` bytes; safe between one thread that puts and one that takes.
-
-    Parameters
-    ----------
-    capacity : int
-        Bytes.
-    """
+    """A FIFO of at most ``capacity`` bytes; safe between one thread that puts and one that takes."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -48,17 +42,17 @@ class Ring:
         self._pieces: deque[ReadPiece] = deque()
         self._bytes = 0
         self._lost = 0
-        self._told = 0.0
+        self._last_mark = 0.0
         self._ended = self._idle = False
         self._news = threading.Condition()
 
     @property
     def fill(self) -> float:
-        """How full it is, 0 to 1."""
+        """Fill of the ring, 0 to 1."""
         return self._bytes / self.capacity
 
     def put(self, host_s: float, data: bytes) -> None:
-        """Append bytes that arrived at monotonic ``host_s``; without room they are counted as lost."""
+        """Append bytes that arrived at monotonic ``host_s``; count them as lost if they do not fit."""
         with self._news:
             if self._bytes + len(data) > self.capacity:
                 self._lost += len(data)
@@ -71,56 +65,56 @@ class Ring:
                 fill = self._bytes / self.capacity
                 self._news.notify_all()
             self.highest = max(self.highest, fill)
-            marks = [mark for mark in MARKS if self._told < mark <= fill]
-            self._told = fill if marks else (0.0 if fill < MARKS[0] / 2 else self._told)
+            marks = [mark for mark in MARKS if self._last_mark < mark <= fill]
+            self._last_mark = fill if marks else (0.0 if fill < MARKS[0] / 2 else self._last_mark)
         for mark in marks:
             self.on_mark(mark)
 
     def take(self, timeout_s: float) -> list[ReadPiece] | None:
-        """The oldest pieces, about 64 KiB; waits for the first. Empty after ``timeout_s``, None when nothing will come any more."""
+        """Wait for and return the oldest pieces, about 64 KiB. Empty after ``timeout_s``, None after the end."""
         with self._news:
             if not self._pieces:
-                self._idle = True  # the taker comes back only when it is done with what it took before
+                self._idle = True  # the taker returns only after processing what it took before
                 self._news.notify_all()
                 if not self._ended:
                     self._news.wait(timeout_s)
             self._idle = self._ended and not self._pieces
             pieces: list[ReadPiece] = []
             size = 0
-            while self._pieces and size < _READ_BYTES:  # never all of a full ring: what is taken is out of the ring's sight
+            while self._pieces and size < _READ_BYTES:  # never all of a full ring: taken bytes no longer count towards its fill
                 pieces.append(self._pieces.popleft())
                 size += len(pieces[-1].data)
             self._bytes -= size
             return pieces if pieces or not self._ended else None
 
     def drained(self, timeout_s: float) -> bool:
-        """Wait until everything that was put has been taken and processed; False when that did not happen."""
+        """Wait until everything put so far is taken and processed; False on timeout."""
         with self._news:
             return self._news.wait_for(lambda: self._idle and not self._pieces, timeout_s)
 
     def end(self) -> None:
-        """Nothing will be put any more."""
+        """Mark the end: no more puts."""
         with self._news:
             self._ended = True
             self._news.notify_all()
 
 
 class ReadingThread:
-    """Reads a descriptor into a ring until it is stopped or the device has gone. It neither parses nor logs nor waits for anybody.
+    """Reads a descriptor into a ring until it is stopped or the device is lost. It neither parses nor logs nor waits.
 
     Parameters
     ----------
     descriptor : int
-        Non-blocking; duplicated here, so that its number cannot come to mean something else while the thread lives.
+        Non-blocking; duplicated here, so that its number stays valid while the thread lives.
     ring : Ring
-        Where the bytes go; its end is the thread's end.
+        Destination of the bytes; it ends with the thread.
     lost : callable
-        Called in the thread with the reason (None: end of file) when the device has gone, not when it was stopped.
+        Called in the thread with the reason (None: end of file) when the device is lost, but not after a stop.
 
     Raises
     ------
     OSError, RuntimeError
-        No more descriptors or threads; nothing is left behind.
+        No more descriptors or threads; nothing stays open.
     """
 
     def __init__(self, descriptor: int, ring: Ring, lost: Callable[[OSError | None], None], name: str) -> None:
@@ -148,8 +142,8 @@ class ReadingThread:
     def _run(self) -> None:
         try:
             gone, error = self._read_all()
-        except Exception as defect:  # noqa: BLE001 - a thread that ends in silence would look like a mute device
-            gone, error = True, OSError(f"the program could not go on: {defect!r}")
+        except Exception as defect:  # noqa: BLE001 - a silent end of the thread would look like a silent device
+            gone, error = True, OSError(f"the reading thread failed: {defect!r}")
         finally:
             self._ring.end()
             os.close(self._descriptor)
@@ -177,12 +171,12 @@ class ReadingThread:
                 empty = 0
                 self._ring.put(time.monotonic(), data)
                 continue
-            empty += 1  # a line that was just flushed reads as nothing once; one that has gone does so again and again
+            empty += 1  # a flushed line reads as empty once, a lost one repeatedly
             if empty > 1:
                 return True, None
 
     def _read_rest(self) -> None:
-        """What the kernel holds when the line is closed has been sent, and may be the end of a run."""
+        """Read the rest from the kernel when the line closes: it may be the end of a run."""
         left = self._ring.capacity
         with suppress(OSError):
             while left > 0 and (data := os.read(self._descriptor, _READ_BYTES)):

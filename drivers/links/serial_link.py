@@ -1,7 +1,7 @@
 """Bytes over a serial port or a raw TCP socket (the only file with pyserial).
 
-The event loop reads and writes by itself: cancelling a read really ends it, and an unplugged adapter is noticed at once. Who measures lets
-a thread read instead (`start_reading`), so that a busy loop costs no byte.
+The event loop itself reads and writes: a cancelled read really ends, and an unplugged adapter is detected at once. Measurements use a
+reading thread instead (`start_reading`), so that a busy loop loses no byte.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from abbe.drivers.links.urls import SerialUrl, SocketUrl
 
 @dataclass(frozen=True, slots=True)
 class Adapter:
-    """A serial adapter as the system lists it. ``node`` is where it is now; kind and serial number are what it is."""
+    """A serial adapter as listed by the system. ``node``: current device path; ``kind`` and ``serial_number``: its identity."""
 
     node: str
     kind: str
@@ -37,32 +37,21 @@ class Adapter:
 
 
 def adapter_at(path: str, listed: Sequence[Adapter]) -> Adapter | None:
-    """The adapter behind a path (links are followed); None when it has no serial number by which to recognise it."""
+    """Return the adapter behind a path (following links); None if it has no serial number."""
     real = os.path.realpath(path)
     found = [adapter for adapter in listed if os.path.realpath(adapter.node) == real]
     return found[0] if found and found[0].serial_number else None
 
 
 def path_to_open(device: str, path: str, known: Adapter | None, listed: Sequence[Adapter]) -> str:
-    """Say which path leads to the adapter that was there before.
-
-    Parameters
-    ----------
-    device : str
-        For the error text.
-    path : str
-        What the configuration says; a link by id stays right by itself.
-    known : Adapter or None
-        The adapter that was opened last; None when nothing was, or it cannot be known again.
-    listed : sequence of Adapter
-        What is plugged in now.
+    """Return the current path of the adapter that was opened last (``known``), or the configured one if there is none.
 
     Raises
     ------
     LinkDown
         The adapter is not plugged in.
     WrongDevice
-        It is not, and another one is where it was.
+        The adapter is not plugged in, and another one has its path.
     """
     if known is None:
         return path
@@ -79,14 +68,8 @@ _CONNECT_S = 5.0
 
 
 async def connected(url: SocketUrl) -> socket.socket:
-    """Connect.
-
-    Raises
-    ------
-    LinkDown
-        Refused, unreachable, or no answer within 5 s.
-    """
-    # pyserial's own socket:// connects blockingly, which would freeze every other device of the service for seconds
+    """Connect a socket. Raises LinkDown if refused, unreachable, or without an answer within 5 s."""
+    # pyserial's socket:// connects blockingly, which would freeze all other devices of the service for seconds
     try:
         async with asyncio.timeout(_CONNECT_S):
             return await _connect_any(url)
@@ -97,7 +80,7 @@ async def connected(url: SocketUrl) -> socket.socket:
 
 
 async def _connect_any(url: SocketUrl) -> socket.socket:
-    # a name may stand for several addresses (localhost: ::1 and 127.0.0.1) of which only one is served
+    # a name may have several addresses (localhost: ::1 and 127.0.0.1), of which only one is served
     loop = asyncio.get_running_loop()
     refused = OSError(f"{url.host} has no address")
     for family, kind, protocol, _, address in await loop.getaddrinfo(url.host, url.port, type=socket.SOCK_STREAM):
@@ -125,15 +108,10 @@ _UNPLUGGED = "cable or adapter unplugged? check it, then try again"
 
 
 class ByteLink:
-    """A byte pipe to one device, which may come back at another place.
+    """A byte pipe to one device, which may return at another port.
 
-    Parameters
-    ----------
-    url : SerialUrl or SocketUrl
-        Where the device is. A serial port is locked: a second program (or a second link) cannot open it.
-    adapters : callable, optional
-        Lists the serial adapters that are plugged in. An adapter with a serial number is found again wherever it was plugged in, and
-        no other one is taken for it.
+    A serial port is locked: no second program (or link) can open it. An adapter with a serial number is found again at any port, and no
+    other one is taken for it; ``adapters`` lists those plugged in.
     """
 
     def __init__(self, url: SerialUrl | SocketUrl, adapters: Callable[[], list[Adapter]] | None = None) -> None:
@@ -147,29 +125,29 @@ class ByteLink:
 
     @property
     def serial_no(self) -> int | None:
-        """Serial number of the device that the URL demands, if it does."""
+        """Serial number that the URL requires, or None."""
         return self._url.serial_no
 
     @property
     def is_open(self) -> bool:
-        """True from a successful ``open`` until ``close`` or the loss of the device."""
+        """Whether the port is open: from ``open`` until ``close`` or the loss of the device."""
         return self._port is not None
 
     async def open(self) -> None:
-        """Open the port; does nothing when it is open.
+        """Open the port if it is not open.
 
         Raises
         ------
         LinkDown
-            Missing, forbidden, busy or unreachable; the text says which and what to do.
+            The port is missing, forbidden, busy or unreachable.
         WrongDevice
-            Another adapter is where the one was that was opened before.
+            Another adapter has the path of the one opened before.
         """
         if self._port is None:
             self._port = self._open_serial(self._url) if isinstance(self._url, SerialUrl) else await connected(self._url)
 
     async def read(self, max_bytes: int, *, timeout_s: float) -> tuple[float, bytes]:
-        """Wait for bytes and return all that are there, at least one.
+        """Wait for bytes and return all available ones, at least one.
 
         Returns
         -------
@@ -179,16 +157,16 @@ class ByteLink:
         Raises
         ------
         ReplyTimeout
-            Not a single byte within ``timeout_s``.
+            No byte within ``timeout_s``.
         LinkDown
-            The device has gone.
+            The device is lost.
         """
         descriptor = self._descriptor("read")
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(timeout_s):
                 while True:
-                    # Always wait for readiness first: a serial line without data reads as b"", which would look like a hang-up.
+                    # Always wait for readiness first: an idle serial line reads as b"", which would look like a hang-up.
                     await self._ready(descriptor, loop.add_reader, loop.remove_reader)
                     try:
                         data = os.read(descriptor, max_bytes)
@@ -204,14 +182,9 @@ class ByteLink:
         return time.monotonic(), data
 
     def start_reading(self, ring: Ring, on_lost: Callable[[LinkDown], None]) -> None:
-        """From now on a thread reads every byte into ``ring``, until ``close``; ``read`` must not be used meanwhile.
+        """Start a thread that reads every byte into ``ring`` until ``close``; ``read`` is not allowed during that.
 
-        Parameters
-        ----------
-        ring : Ring
-            Where bytes go with the monotonic time of their arrival; it ends when the thread ends.
-        on_lost : callable
-            Called in the event loop when the device has gone; the port is closed then.
+        ``on_lost`` is called in the event loop when the device is lost; the port is closed then.
 
         Raises
         ------
@@ -223,10 +196,10 @@ class ByteLink:
 
         def lost(error: OSError | None) -> None:
             with suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(tell, error)
+                loop.call_soon_threadsafe(report, error)
 
-        def tell(error: OSError | None) -> None:
-            if self._reading is reading:  # else the port was closed meanwhile on purpose
+        def report(error: OSError | None) -> None:
+            if self._reading is reading:  # else the port was closed on purpose
                 on_lost(self._lost("read", error))
 
         reading = self._reading = ReadingThread(descriptor, ring, lost, self.name)
@@ -237,9 +210,9 @@ class ByteLink:
         Raises
         ------
         ReplyTimeout
-            The line did not take them within ``timeout_s`` (flow control, stuck adapter).
+            The line did not accept them within ``timeout_s`` (flow control, stuck adapter).
         LinkDown
-            The device has gone.
+            The device is lost.
         """
         descriptor = self._descriptor("write")
         loop = asyncio.get_running_loop()
@@ -257,11 +230,11 @@ class ByteLink:
             raise self._lost("write", error) from error
 
     def drop_input(self) -> None:
-        """Throw away what has arrived and was not read yet, so that a late answer cannot pass for a new one."""
+        """Discard unread bytes, so that a late reply cannot pass for a new one."""
         if isinstance(self._port, serial.Serial):
             try:
                 self._port.reset_input_buffer()
-            except (OSError, termios.error) as error:  # pyserial lets termios.error through, which is not an OSError
+            except (OSError, termios.error) as error:  # pyserial passes termios.error on, which is not an OSError
                 raise self._lost("drop input", error) from error
         elif self._port is not None:
             try:
@@ -275,7 +248,7 @@ class ByteLink:
     async def close(self) -> None:
         """Close the port; a pending ``read`` or ``write`` raises ``LinkDown``. Closing twice does nothing.
 
-        What was written leaves first, half a second at the most; what has arrived goes into the ring of `start_reading`.
+        Written bytes are sent first, for at most half a second; received bytes go into the ring of `start_reading`.
         """
         await self._drain()
         self._release()
@@ -287,10 +260,10 @@ class ByteLink:
         clock = asyncio.get_running_loop().time
         until_s = clock() + _DRAIN_S
         with suppress(OSError, termios.error):
-            while port.is_open and port.out_waiting and clock() < until_s:  # noqa: ASYNC110 - the system does not tell when it is empty
+            while port.is_open and port.out_waiting and clock() < until_s:  # noqa: ASYNC110 - the system does not signal an empty buffer
                 await asyncio.sleep(_POLL_S)
             if port.is_open:
-                port.reset_output_buffer()  # else a line that is held (XOFF) makes the close itself wait half a minute
+                port.reset_output_buffer()  # else a stopped line (XOFF) delays the close by half a minute
 
     def _open_serial(self, url: SerialUrl) -> serial.Serial:
         listed = self._adapters()
@@ -344,7 +317,7 @@ def _wake(waiter: asyncio.Future[None]) -> None:
 
 
 def plugged_in() -> list[Adapter]:
-    """The serial adapters of this computer."""
+    """Return the serial adapters plugged into this computer."""
     return [
         Adapter(port.device, f"{port.vid:04x}:{port.pid:04x}", port.serial_number or "")
         for port in list_ports.comports()
@@ -353,15 +326,7 @@ def plugged_in() -> list[Adapter]:
 
 
 def serial_remedy(path: str, error: Exception) -> str:
-    """Say what a person can do about a serial port that does not open.
-
-    Parameters
-    ----------
-    path : str
-        Device path.
-    error : Exception
-        What the attempt raised.
-    """
+    """Return the remedy for a serial port that does not open."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not os.path.exists(path):
         return "adapter plugged in? device path right? prefer the by-id link of the adapter"

@@ -1,4 +1,4 @@
-"""Clean-up that must reach the device although its caller was cancelled."""
+"""Clean-up that must reach the device even if its caller is cancelled."""
 
 from __future__ import annotations
 
@@ -10,22 +10,14 @@ T = TypeVar("T")
 
 
 async def run_to_end(work: Coroutine[Any, Any, T]) -> T:
-    """Run a short piece of clean-up to its end, however often the caller is cancelled meanwhile.
+    """Run a short clean-up to its end, regardless of cancellations, and return its result.
 
-    Parameters
-    ----------
-    work : coroutine
-        Must carry its own timeout: nothing else can end it.
-
-    Returns
-    -------
-    T
-        What the work returned.
+    ``work`` must have its own timeout: nothing else can end it.
 
     Raises
     ------
     asyncio.CancelledError
-        After the work has ended, when the caller was cancelled in between: a cancellation is delayed, never swallowed.
+        After the end of the work, if the caller was cancelled during it: a cancellation is delayed, never swallowed.
     """
     task = asyncio.ensure_future(work)
     interrupted: asyncio.CancelledError | None = None
@@ -37,6 +29,6 @@ async def run_to_end(work: Coroutine[Any, Any, T]) -> T:
             interrupted = error
     if interrupted is not None:
         if not task.cancelled():
-            task.exception()  # marks it as seen: the cancellation is what the caller has to hear about
+            task.exception()  # marks it as retrieved: the caller gets the cancellation instead
         raise interrupted
     return task.result()

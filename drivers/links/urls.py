@@ -1,4 +1,4 @@
-"""Device URLs as people write them in the configuration, parsed once into plain values.
+"""Device URLs of the configuration, parsed into plain values.
 
 ======================================================  =======================================================
 ``serial:///dev/ttyUSB0?baud=460800``                   a serial line, 8N1
@@ -34,7 +34,7 @@ PARITIES = ("none", "even", "odd")
 class SerialUrl:
     """A serial port by its device path; ``baud`` in bit/s, 8 bits, 1 stop bit; ``parity`` none, even or odd.
 
-    ``serial_no``: only the device with this number is accepted there.
+    ``serial_no``: the only accepted device.
     """
 
     path: str
@@ -148,23 +148,18 @@ _ROLES: Mapping[str, tuple[type[DeviceUrl], ...]] = {
 
 
 def is_url_of(role: str, text: str) -> bool:
-    """Whether a URL leads to a device of this role: ballbar, laser, cnc or fixture.
+    """Whether a URL leads to a device of this role: ballbar, laser, cnc or fixture. Raises as `parse_url`.
 
-    Of a URL with an installed driver's scheme the rest is checked by that driver, when it opens the device.
-
-    Raises
-    ------
-    BadUrl
-        As `parse_url`.
+    An installed driver checks URLs of its own scheme when it opens the device.
     """
     return installed(role, text) is not None or isinstance(parse_url(text), _ROLES[role])
 
 
 def installed(role: str, text: str) -> EntryPoint | None:
-    """The driver that an installed package offers for a URL; None: none does, or the scheme is one of ours.
+    """Return the driver of an installed package for a URL; None without one, or for a built-in scheme.
 
-    It is an entry point of the group ``abbe.cnc``, ``abbe.laser`` or ``abbe.ballbar``, its name is the scheme, its object a coroutine
-    function that opens and identifies the device behind such a URL (`abbe.drivers.api`). Nothing is loaded here.
+    A driver is an entry point of the group ``abbe.cnc``, ``abbe.laser`` or ``abbe.ballbar`` with the scheme as its name. Its object is a
+    coroutine function that opens and identifies the device behind such a URL (`abbe.drivers.api`). Nothing is loaded here.
     """
     scheme = text.partition(":")[0].lower()
     if scheme in _BUILDERS:

@@ -1,6 +1,6 @@
-"""Register maps as data, and the pure step from 16-bit words to whole numbers (big-endian, high word first).
+"""Register maps as data, and the pure conversion from 16-bit words to integers (big-endian, high word first).
 
-Also what every device with such a map has: registers that prove which map it is, and commands that carry a number and are acknowledged.
+Also common to all devices with such a map: registers that identify the map, and numbered commands with an acknowledge.
 """
 
 from __future__ import annotations
@@ -18,27 +18,17 @@ _SIZE: dict[Kind, int] = {"u16": 1, "i16": 1, "u32": 2, "i32": 2, "u64": 4, "i64
 
 CANARY_I32 = 0x01020304
 CANARY_F32_BITS = 0x449A5000
-"""The float 1234.5 as it must stand in two registers; compared as bits, so that any word or byte order mistake shows."""
+"""Bits of the float 1234.5 in two registers; compared as bits, so that any mistake in word or byte order shows."""
 CANARY_WORDS = (0x0102, 0x0304, 0x449A, 0x5000)
-"""Both as they stand in registers 0..3 of every device of docs/protocols."""
+"""Both canaries in registers 0..3 of every device of docs/protocols."""
 
 
 @dataclass(frozen=True, slots=True)
 class Register:
     """One value of a register map.
 
-    Parameters
-    ----------
-    address : int
-        0-based address of its first register.
-    kind : str
-        How many bits, signed or not.
-    name : str
-        As in docs/protocols.
-    per_unit : float
-        Counts per unit: the physical value is count / per_unit (dividing keeps 0.01 steps exact to the last bit).
-    unit : str
-        The unit of the physical value.
+    ``address``: of its first register, from 0; ``name``: as in docs/protocols; ``per_unit``: counts per unit, so that the physical value is
+    count / per_unit (a division keeps 0.01 steps exact to the last bit).
     """
 
     address: int
@@ -50,16 +40,10 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class RegisterBlock:
-    """Registers that are read in one request, which makes them coherent.
+    """Registers read in one request, which makes them coherent.
 
-    Parameters
-    ----------
-    base, count : int
-        First register and number of registers of the request.
-    registers : tuple of Register
-        What lies in it.
-    lead : int
-        Registers before ``base`` that the device lets one read in the same request (ModbusLink.read says what for).
+    ``base``, ``count``: first register and number of registers of the request; ``registers``: its values; ``lead``: registers before
+    ``base`` that the same request may read (see ModbusLink.read).
     """
 
     base: int
@@ -76,19 +60,13 @@ class RegisterBlock:
         object.__setattr__(self, "_by_name", {register.name: register for register in self.registers})
 
     def counts(self, words: Sequence[int]) -> dict[str, int]:
-        """Turn the words of this block into whole numbers by name.
-
-        Raises
-        ------
-        ValueError
-            Another number of words than the block has.
-        """
+        """Convert the words of this block to integers by name. Raises ValueError for a wrong number of words."""
         if len(words) != self.count:
             raise ValueError(f"block at {self.base} has {self.count} registers, got {len(words)}")
         return {register.name: _count(register, words, self.base) for register in self.registers}
 
     def physical(self, name: str, count: int) -> float:
-        """Turn a whole number of this block into its physical value, in the register's unit."""
+        """Convert a count of this block to its physical value, in the register's unit."""
         return count / self._by_name[name].per_unit
 
 
@@ -124,27 +102,20 @@ _LONGEST_US = 100 * 365 * 86400 * 10**6
 
 
 def _order(known: int, found: int) -> str:
-    """Which order turns the known value into the one found; empty when none does."""
+    """Return the order that turns the known value into the found one, or an empty string."""
     data = known.to_bytes(4, "big")
     return next((name for name, places in _ORDERS.items() if bytes(data[i] for i in places) == found.to_bytes(4, "big")), "")
 
 
 def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> None:
-    """Compare the canary registers and the map version with what the protocol demands.
+    """Check the canary registers and the map version.
 
-    Parameters
-    ----------
-    device : str
-        For the error text.
-    counts : mapping
-        Decoded identity block with CANARY_I32, CANARY_F32 (bits) and MAP_VER.
-    map_version : int
-        The version this driver was written for.
+    ``counts``: decoded identity block with CANARY_I32, CANARY_F32 (bits) and MAP_VER.
 
     Raises
     ------
     WrongDevice
-        Not the device, another word order, or another map version.
+        Another device, word order, or map version.
     """
     canary, bits = counts["CANARY_I32"] & 0xFFFFFFFF, counts["CANARY_F32"]
     if canary != CANARY_I32 or bits != CANARY_F32_BITS:
@@ -158,18 +129,7 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
 
 
 def check_clock(device: str, device_us: int) -> None:
-    """Refuse a 64-bit device time that no device can have: then the four registers stand in another order than the 32-bit canaries.
-
-    Parameters
-    ----------
-    device_us : int
-        Time since the device was switched on, us.
-
-    Raises
-    ------
-    WrongDevice
-        More than 100 years.
-    """
+    """Raise WrongDevice for a device time since power-on of more than 100 years: its four registers must be in the wrong order."""
     if device_us > _LONGEST_US:
         detail = f"its clock says {device_us:#018x} us since it was switched on: int64: the registers of 64-bit values are swapped"
         raise WrongDevice(device, "identify", detail, _SET_ORDER)
@@ -179,7 +139,7 @@ _POLL_S = 0.005
 
 
 def next_number(acknowledged: int) -> int:
-    """Return the only number the device will execute next (mod 65536)."""
+    """Return the only number that the device will execute next (mod 65536)."""
     return (acknowledged + 1) & 0xFFFF
 
 
@@ -192,40 +152,33 @@ async def run_numbered(
     *,
     settle_s: float = 1.0,
 ) -> int:
-    """Write a numbered command once and find out what became of it.
+    """Write a numbered command once, determine its outcome, and return the device's result code.
 
     Parameters
     ----------
-    device, operation : str
-        For the error text.
     number : int
-        The number inside the command, ``next_number(last acknowledged)``.
+        The number in the command, ``next_number(last acknowledged)``.
     write, read_ack : callable
         Sends the command (called exactly once); reads (acknowledged number, result code).
     settle_s : float
-        How long an acknowledge may take.
-
-    Returns
-    -------
-    int
-        The device's result code.
+        Longest time of an acknowledge.
 
     Raises
     ------
     ReplyTimeout, LinkDown, BadFrame
-        The write got no valid reply and the device's acknowledge says that it was not executed, or nothing could be read at all.
+        The write got no valid reply, and the acknowledge shows no execution or is unreadable.
     """
-    doubt: DriverError | None = None
+    write_error: DriverError | None = None
     try:
         await write()
     except (ReplyTimeout, LinkDown, BadFrame) as error:
-        doubt = error
+        write_error = error
     acknowledged, result = await _last_ack(number, read_ack, settle_s)
     if acknowledged == number:
         return result
-    if doubt is not None:
-        doubt.add_note(f"asked afterwards, the device says that command {number} was not executed (last executed: {acknowledged})")
-        raise doubt
+    if write_error is not None:
+        write_error.add_note(f"afterwards the acknowledge shows that command {number} was not executed (last executed: {acknowledged})")
+        raise write_error
     detail = f"command {number} is not acknowledged (last executed: {acknowledged})"
     raise ReplyTimeout(device, operation, detail, "is another program sending commands to this device?")
 

@@ -1,7 +1,7 @@
 """The capture of one run: every item reaches the disk within tens of milliseconds, and then goes to the database.
 
-It has a thread of its own, which the event loop, the database or a solver cannot delay. The disk can: then `put` waits and the driver's ring
-fills, which stops the machine before a sample is lost.
+It has a thread of its own, which the event loop, the database or a solver cannot delay. The disk can: then `put` waits and the ring of the
+driver fills, which stops the machine before a sample is lost.
 """
 
 from __future__ import annotations

@@ -251,7 +251,7 @@ class Scan:
     tail_bytes : int
         Number of these later bytes.
     broken_links : list of int
-        Records whose hash does not match the previous record: somebody removed, inserted or changed one.
+        Records whose hash does not match the previous record: a record was removed, inserted or changed.
     head : bytes
         SHA-256 of the last good record.
     """
