@@ -56,7 +56,7 @@ def test_a_defect_in_the_reading_thread_is_told_as_the_loss_of_the_line() -> Non
     thread = ReadingThread(reader, ring, lambda error: (told.append(error), gone.set()), "test")
     os.write(writer, b"12345678")
     assert gone.wait(within(10))
-    assert "could not go on: ValueError" in str(told[0])
+    assert "failed: ValueError" in str(told[0])
     assert ring.take(1.0) is not None
     assert ring.take(1.0) is None
     thread.stop()
