@@ -53,7 +53,7 @@ class BarTap(Protocol):
     """Takes every sample of a stream before all consumers, in a thread of the driver, for recording."""
 
     def take(self, batch: BarBatch) -> None:
-        """Take a batch, in order and exactly once. May block while the disk is slow: the ring buffers meanwhile. Never raises."""
+        """Take a batch, in order and exactly once. May block while the disk is slow: the ring buffers the samples. Never raises."""
         ...
 
     def warn(self, text: str) -> None:

@@ -80,7 +80,7 @@ class SequenceTracker:
         gates = open_gates if reads is None else (reads.range_nm, _SLEW_NM_S // rate_hz, 0xFF00, (reads.number & 0xFF) << 8)
         self._plain_limits = ((1.0 - _JITTER) * self._period_us, (1.0 + _JITTER) * self._period_us, *gates)
         self._last_nm: int | None = None
-        self._held: BarSample | None = None
+        self._candidate: BarSample | None = None
         self._stray_before = False
         self.accepted = self.lost = self.overrun = self.duplicates = self.strays = 0
 
@@ -123,15 +123,15 @@ class SequenceTracker:
 
     def rest(self) -> list[SampleRun]:
         """Deliver the sample still on trial at the end of the stream: no further sample can confirm or refute it."""
-        held, self._held = self._held, None
+        candidate, self._candidate = self._candidate, None
         runs: _Runs = []
-        if held is not None:
-            self._give((held.seq - self._next) % _WRAP, (held,), runs)
+        if candidate is not None:
+            self._give((candidate.seq - self._next) % _WRAP, (candidate,), runs)
         return _frozen(runs)
 
     def _plain(self, samples: Sequence[BarSample], at: int) -> int:
         """Return the end of the samples that need no check: the fast path of a good line."""
-        if self._held is not None or self._last_us < 0:
+        if self._candidate is not None or self._last_us < 0:
             return at
         expected, last_us, last_nm = self._next, self._last_us, self._last_nm
         least_us, most_us, limit_nm, step_nm, mask, number = self._plain_limits
@@ -155,7 +155,7 @@ class SequenceTracker:
         if reason:
             self._refuse(sample, kind, reason)
             return
-        for good in self._weighed(sample) if self._held is not None or self._jumps(sample) else (sample,):
+        for good in self._weighed(sample) if self._candidate is not None or self._jumps(sample) else (sample,):
             self._give((good.seq - self._next) % _WRAP, (good,), runs)
 
     def _give(self, missing: int, samples: Sequence[BarSample], runs: _Runs) -> None:
@@ -213,21 +213,21 @@ class SequenceTracker:
 
     def _weighed(self, sample: BarSample) -> tuple[BarSample, ...]:
         """Keep a reading that jumps until the next one shows whether it was a step or a single false value."""
-        held = self._held
-        if held is None:
-            self._held = sample
+        candidate = self._candidate
+        if candidate is None:
+            self._candidate = sample
             return ()
-        if (sample.seq - held.seq) % _WRAP >= _HALF:  # it belongs before the one that is kept
+        if (sample.seq - candidate.seq) % _WRAP >= _HALF:  # it belongs before the one that is kept
             return (sample,)
-        if sample.seq == held.seq:
+        if sample.seq == candidate.seq:
             self.duplicates += 1
             return ()
-        self._held = None
+        self._candidate = None
         back = self._last_nm is not None and abs(sample.reading_nm - self._last_nm) <= 2 * self._plain_limits[3]
-        if back and abs(sample.reading_nm - held.reading_nm) > self._plain_limits[3] and not bar_is_out(sample.status):
+        if back and abs(sample.reading_nm - candidate.reading_nm) > self._plain_limits[3] and not bar_is_out(sample.status):
             self.strays += 1
             return (sample,)
-        return (held, sample)
+        return (candidate, sample)
 
 
 def _frozen(runs: _Runs) -> list[SampleRun]:
