@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
-from abbe.service.campaigns.builtin_recipes import parted
+from abbe.service.campaigns.builtin_recipes import split_recipe_name
 from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board
@@ -96,7 +96,7 @@ class Service:
         book = AuditBook(store, setup.store_url)
         alarms = self._make_alarms(book)
         checks = CheckJobs(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
-        recipes = tuple(dict.fromkeys([*setup.recipes, *(parted(schedule.recipe)[0] for schedule in setup.schedules)]))
+        recipes = tuple(dict.fromkeys([*setup.recipes, *(split_recipe_name(schedule.recipe)[0] for schedule in setup.schedules)]))
         self._jobs = JobRegistry(checks, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed, watchers)
         context = OrderContext(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, setup.control)
         if setup.campaign is not None:

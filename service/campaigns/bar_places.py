@@ -11,7 +11,7 @@ import numpy as np
 
 from abbe.drivers.errors import DriverError
 from abbe.models.arrays import F1, F2
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.devices.session import Session
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import AbbeError, MeasurementFault, PushNotBegun, TableRefused
@@ -74,8 +74,8 @@ class BarPlaces:
             link_mm=None if first else self._end(), samples=SAMPLES,
         )  # fmt: skip
         plan = paced(CampaignPlan(f"{self.name} {what}", (recipe.plan(self.site.machine),)), self.site.max_feed_mm_min)
-        manner = Manner(control=self.control, part=True)
-        ids = await measure(self.session, self.store, self.site, plan, progress=self.progress, manner=manner)
+        options = MeasureOptions(control=self.control, part=True)
+        ids = await measure(self.session, self.store, self.site, plan, progress=self.progress, options=options)
         self.run_ids += ids
         columns = (await asyncio.to_thread(load_run, self.store, ids[0]))["columns"]
         if not all(columns["valid"]):

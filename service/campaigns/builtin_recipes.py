@@ -42,7 +42,7 @@ def named(recipe: str, rate_hz: int) -> str:
     return recipe if rate_hz == USUAL_HZ else f"{recipe} at {rate_hz} Hz"
 
 
-def parted(name: str) -> tuple[str, int]:
+def split_recipe_name(name: str) -> tuple[str, int]:
     """Split a name made by `named` into recipe and rate; a rate that does not divide 1000 stays part of the name."""
     found = _RATE.fullmatch(name)
     if found is None or 1000 % int(found["rate"]):
@@ -52,7 +52,7 @@ def parted(name: str) -> tuple[str, int]:
 
 def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
     """Return the plan of a built-in recipe; ``NAME at 500 Hz`` sets the ball-bar rate. Raises ConfigError for an unknown recipe."""
-    recipe, rate_hz = parted(name)
+    recipe, rate_hz = split_recipe_name(name)
     if recipe not in RECIPES:
         close = get_close_matches(recipe, RECIPES, n=1)
         meant = f"did you mean {close[0]!r}? " if close else ""
@@ -111,7 +111,7 @@ def campaign_source(name: str, folder: Path) -> RecipeSource:
     ConfigError
         The file cannot be read.
     """
-    recipe, rate_hz = parted(name)
+    recipe, rate_hz = split_recipe_name(name)
     if recipe == IDENTIFICATION:
         return RecipeSource(recipe=recipe, rate_hz=rate_hz)
     return RecipeSource(recipe=name, text=recipe_source(folder / name))

@@ -159,7 +159,7 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
 
 
 @dataclass(frozen=True, slots=True)
-class Manner:
+class MeasureOptions:
     """Options of a measurement.
 
     ``control``: interrupts it. ``confirm``: asks a person whether a set-up is untouched. ``source``: of the plan, for `abbe measure
@@ -184,7 +184,7 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     progress: ProgressSink = ignore_progress,
     clock: Clock | None = None,
     campaign: tuple[int, int] | None = None,
-    manner: Manner | None = None,
+    options: MeasureOptions | None = None,
 ) -> list[int]:
     """Run all tests of a plan; return the numbers of their complete runs in the store.
 
@@ -199,8 +199,8 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     Stopped, Aborted
         A person requested it; the current run is closed as stopped or aborted.
     """
-    clock, manner = clock or SystemClock(), manner or Manner()
-    control, resumed = manner.control or Control(), manner.resumed
+    clock, options = clock or SystemClock(), options or MeasureOptions()
+    control, resumed = options.control or Control(), options.resumed
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     await check_devices(session, plan, air=site.watching.air_c is not None)
     if resumed is not None:
@@ -208,11 +208,11 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     campaign = campaign or await start_campaign(session, store, site, plan.name)
     under_way = OpenCampaign(*campaign, dict(resumed.mounted_us) if resumed is not None else {})
     journal = StoreJournal(store, under_way.id)
-    campaign_run = await _campaign_run(session, store, site, plan, journal, manner, control)
+    campaign_run = await _campaign_run(session, store, site, plan, journal, options, control)
     progress_meter = ProgressMeter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
     control.now(State.RUNNING)
     notes, reporting = IncidentNotes(journal, clock), asyncio.create_task(progress_meter.report_states())
-    once = _once(session, store, site, under_way, progress_meter, manner.live)
+    once = _once(session, store, site, under_way, progress_meter, options.live)
     try:
         async with incidents_noted(session, notes):
             run_ids = await _all_tests(plan, [d.duration_s for d in dry], campaign_run, progress_meter, resumed, once)
@@ -222,7 +222,7 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     else:
         await _ended(journal, notes, "complete", None)
     finally:
-        control.now(State.RUNNING if manner.part else State.ENDED)
+        control.now(State.RUNNING if options.part else State.ENDED)
         reporting.cancel()
     return run_ids
 
@@ -240,22 +240,22 @@ async def _ended(journal: StoreJournal, notes: IncidentNotes, how: str, error: B
 
 
 async def _campaign_run(
-    session: Session, store: Store, site: Site, plan: CampaignPlan, journal: StoreJournal, manner: Manner, control: Control
+    session: Session, store: Store, site: Site, plan: CampaignPlan, journal: StoreJournal, options: MeasureOptions, control: Control
 ) -> CampaignRun:
     """Write the journal's first line and return the context of the campaign."""
     comp = await session.controller.comp_status()
     expected = ExpectedTable(comp.boot_id, comp.bank_crc[comp.active_bank])
-    if manner.resumed is not None and manner.resumed.expected is not None:
-        expected = manner.resumed.expected  # the table may have changed since the check, while a question was open
-    source = {} if manner.source is None else asdict(manner.source)
+    if options.resumed is not None and options.resumed.expected is not None:
+        expected = options.resumed.expected  # the table may have changed since the check, while a question was open
+    source = {} if options.source is None else asdict(options.source)
     begun = {"plan": plan_hash(plan), "source": source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
     begun["owner"] = asdict(this_process())
     await journal.add(BEGUN, **begun)
-    campaign_run = CampaignRun(session, control, site.watching, journal, expected, manner.confirm)
+    campaign_run = CampaignRun(session, control, site.watching, journal, expected, options.confirm)
     campaign_run.read_path = lambda test, mounting: read_path(session, store, journal.campaign, test, mounting)
-    if manner.resumed is not None:
-        campaign_run.mountings = dict(manner.resumed.mountings)
-        campaign_run.used = set(manner.resumed.used)
+    if options.resumed is not None:
+        campaign_run.mountings = dict(options.resumed.mountings)
+        campaign_run.used = set(options.resumed.used)
         campaign_run.labels = {run.label for run in await asyncio.to_thread(store.runs.all, journal.campaign)}
     return campaign_run
 

@@ -142,7 +142,7 @@ class ByHand:
 
 async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: RecipeSource, said: ByHand) -> None:
     """The measurement itself, from the beginning or from where it was broken off."""
-    from abbe.service.campaigns.measure import Manner
+    from abbe.service.campaigns.measure import MeasureOptions
     from abbe.service.campaigns.measure import measure as work
     from abbe.service.campaigns.resume import resume as find
     from abbe.service.cli.ask import console_confirm
@@ -160,7 +160,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
         for line in found.messages if found is not None else ():
             typer.echo(line, err=True)
         with display() as sink:
-            await work(session, store, site, plan, progress=sink, manner=Manner(control, confirm, source, found))
+            await work(session, store, site, plan, progress=sink, options=MeasureOptions(control, confirm, source, found))
 
 
 def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:

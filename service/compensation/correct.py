@@ -14,7 +14,7 @@ import numpy as np
 from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.compensation.gate import Admission, PushContext, admit, check_promise, ready
 from abbe.service.compensation.proposal_checks import HoldReason
 from abbe.service.compensation.proposals import (
@@ -215,8 +215,8 @@ class _Correcting:
         number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(context.store.campaigns.all)) + 1
         name = f"{VERIFY}{number}"
         plan = paced(verification(context.site.machine, rate_hz=context.rate_hz, name=name), context.site.max_feed_mm_min)
-        manner = Manner(control=context.control, part=True)
-        ids = await measure(context.session, context.store, context.site, plan, progress=context.progress, manner=manner)
+        options = MeasureOptions(control=context.control, part=True)
+        ids = await measure(context.session, context.store, context.site, plan, progress=context.progress, options=options)
         self.after = figures(await load_runs(context.store, ids))
         self.decision = decide(self.before, self.after, self.pushing.crc if self.pushing is not None else None)
         self.verified_as = name

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from abbe.drivers.errors import DriverError
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.clock import Clock
 from abbe.service.compensation.correct import push
 from abbe.service.compensation.deferred_rollback import finish_when_safe
@@ -126,8 +126,8 @@ async def _before(context: PushContext, order: PushOrder) -> list[dict[str, Any]
     site = context.site
     name = f"verify-before proposal {order.proposal} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
     plan = paced(verification(site.machine, rate_hz=context.rate_hz, name=name), site.max_feed_mm_min)
-    manner = Manner(control=order.control, part=True)
-    ids = await measure(context.session, context.store, site, plan, progress=order.progress, clock=context.clock, manner=manner)
+    options = MeasureOptions(control=order.control, part=True)
+    ids = await measure(context.session, context.store, site, plan, progress=order.progress, clock=context.clock, options=options)
     return await load_runs(context.store, ids)
 
 

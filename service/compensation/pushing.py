@@ -155,7 +155,7 @@ class Pushing:
             raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
         _under_way.add(key)
         # First pauses are closed, then an earlier one is waited for: none can come between and hold an unverified table in force.
-        self.control.hurry = "a table that nobody has verified may be in force: stop it, or let it end"
+        self.control.no_pause_reason = "a table that nobody has verified may be in force: stop it, or let it end"
         try:
             await self.control.gate()
             book = await StoreBook.new(self.store, self.site.name, self.clock, self.site.control)
@@ -164,7 +164,7 @@ class Pushing:
             await self._look_again(ended)
         finally:
             _under_way.discard(key)
-            self.control.hurry = ""
+            self.control.no_pause_reason = ""
         return self._outcome(ended)
 
     async def _order(self, wanted: WantedTable | WantedAgain) -> OperationOrder:

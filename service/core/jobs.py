@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import structlog
 
-from abbe.service.campaigns.builtin_recipes import parted
+from abbe.service.campaigns.builtin_recipes import split_recipe_name
 from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
 from abbe.service.domain.bounds import TEXT, WORD
@@ -237,7 +237,7 @@ class JobRegistry:
             return again
         if campaign is not None:
             return self.begin(requested, campaign)
-        if parted(asked.recipe)[0] not in self._recipes:
+        if split_recipe_name(asked.recipe)[0] not in self._recipes:
             there = ", ".join((*self._recipes, *self.full.names))
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")
         return self.begin(requested, self._checks(by_hand(asked.recipe), self._clock.utc()))
@@ -275,8 +275,8 @@ class JobRegistry:
         control = entry.control
         if control.state is State.ENDED:
             return _answer(asked.request, "conflict", "the measurement of this job is over; its figures are judged now", asked.job)
-        if asked.how == "pause" and control.hurry:
-            return _answer(asked.request, "conflict", f"it cannot be paused now: {control.hurry}", asked.job)
+        if asked.how == "pause" and control.no_pause_reason:
+            return _answer(asked.request, "conflict", f"it cannot be paused now: {control.no_pause_reason}", asked.job)
         {"stop": control.stop, "abort": control.abort, "pause": control.pause, "resume": control.resume}[asked.how]()
         log.info("job steered", job=asked.job, how=asked.how, who=asked.who)
         self._changed()

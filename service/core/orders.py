@@ -112,7 +112,7 @@ class _OrderJob(Job[JobOutcome]):
 
     async def do(self, progress: ProgressSink, control: Control) -> JobOutcome:
         control.now(State.RUNNING)
-        control.hurry = NO_PAUSE if self.kind == ROLLBACK else ""  # a push measures first, and that can be held
+        control.no_pause_reason = NO_PAUSE if self.kind == ROLLBACK else ""  # a push measures first, and that can be held
         return await self._act(progress, control)
 
     async def failed(self, error: Exception) -> JobOutcome:

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from abbe.service.campaigns.builtin_recipes import recipe_plan
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.plausibility import INSTRUMENTS, ended_certificates
 from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock, SystemClock
@@ -56,7 +56,9 @@ async def run_check(
     plan = CampaignPlan(f"{plan.name} {config.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
     with lock_machine(site.urls.cnc):
         async with recovered_session(store, site) as session:
-            run_ids = await measure(session, store, site, plan, progress=progress, clock=clock, manner=Manner(control=control, live=live))
+            run_ids = await measure(
+                session, store, site, plan, progress=progress, clock=clock, options=MeasureOptions(control=control, live=live)
+            )
     runs = await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
     return judged(config, runs, plan.name, started, clock.monotonic_s() - start_s)
 

@@ -9,8 +9,8 @@ import asyncio
 from dataclasses import replace
 
 from abbe.models.compensation.tables import Predicted
-from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, RecipeSource, parted
-from abbe.service.campaigns.measure import Manner, measure, start_campaign
+from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
+from abbe.service.campaigns.measure import MeasureOptions, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
@@ -30,7 +30,7 @@ SOLVING = "all is measured, and nothing moves while it is solved"
 
 def is_full(recipe: str, names: tuple[str, ...]) -> bool:
     """Whether a recipe is one of these full campaigns; with a rate of the ball-bar only the shipped one: a file has its own."""
-    name, rate_hz = parted(recipe)
+    name, rate_hz = split_recipe_name(recipe)
     return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
 
 
@@ -75,7 +75,7 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
     site, store, name = context.site, context.store, context.plan.name
     plan = paced(context.plan, site.max_feed_mm_min)
     prompted = _PromptedPerson(context.control)
-    manner = Manner(control=context.control, source=source, part=True, live=context.live)
+    options = MeasureOptions(control=context.control, source=source, part=True, live=context.live)
     with lock_machine(site.urls.cnc):
         async with recovered_session(store, site, ask=prompted.ask) as session:
             prompted.session = session
@@ -84,7 +84,7 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
             await _check_table_acts(session)
             begun = await start_campaign(session, store, site, name)
             try:
-                await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, manner=manner)
+                await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options)
             except BaseException as error:
                 error.add_note(
                     f"what is complete of campaign {name!r} stays: `abbe measure MACHINE.toml --resume {name!r}` goes on, then "
@@ -95,7 +95,7 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
 
 async def _proposed(context: InvestigationContext, by: str) -> JobOutcome:
     await context.control.gate()
-    context.control.hurry = SOLVING
+    context.control.no_pause_reason = SOLVING
 
     def agree(promised: Predicted) -> None:
         context.control.check()

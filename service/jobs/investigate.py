@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from abbe.models.compensation.tables import Predicted
 from abbe.service.campaign_data.campaign_folder import from_store
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock
 from abbe.service.compensation.gate import check_promise
@@ -94,13 +94,13 @@ async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> 
         return await note(AlarmKind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
     again = "" if tries == 1 else ", anew: the last try was not completed"
     plan = replace(context.plan, name=f"alarm {alarm.number} {context.clock.utc():%Y-%m-%d %H:%M:%S}")
-    site, manner = context.site, Manner(control=context.control, part=True, live=context.live)
+    site, options = context.site, MeasureOptions(control=context.control, part=True, live=context.live)
     with lock_machine(site.urls.cnc):
         async with recovered_session(context.store, site) as session:
             # Only now: while another process has the machine nothing of this try has begun.
             await note(AlarmKind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
             plan = paced(plan, site.max_feed_mm_min)
-            ids = await measure(session, context.store, site, plan, progress=context.progress, clock=context.clock, manner=manner)
+            ids = await measure(session, context.store, site, plan, progress=context.progress, clock=context.clock, options=options)
     return await note(AlarmKind.MEASURED, {"text": f"campaign {plan.name!r} is measured: {len(ids)} runs", "campaign": plan.name})
 
 

@@ -80,7 +80,7 @@ class Control:
     def __init__(self) -> None:
         self._now = Progress(state=State.READY)
         self._pause = self._stop = self._abort = False
-        self.hurry = ""
+        self.no_pause_reason = ""
         """Why the measurement cannot pause now; empty: it can. Earlier requests stay in force: call `gate` first."""
         self.prompts = Prompts()
         """Prompts for a person who is not at the console."""
@@ -91,7 +91,7 @@ class Control:
 
     def pause(self) -> None:
         """Pause at the next safe place: between points at once; a path under recording is stopped and measured again later."""
-        if not (self._stop or self._abort or self._pause or self.hurry):
+        if not (self._stop or self._abort or self._pause or self.no_pause_reason):
             self._pause = True
             self._to(State.PAUSING)
 

@@ -23,8 +23,8 @@ async def paused(
 ) -> bool:
     """Wait until the pause is withdrawn and all preconditions hold; an unmet one is reported, and the pause continues.
 
-    Where no pause is allowed (`Control.hurry`) an unmet precondition ends the run: a closed door alone, without a person's confirmation,
-    must not start motion.
+    Where no pause is allowed (`Control.no_pause_reason`) an unmet precondition ends the run: a closed door alone, without a person's
+    confirmation, must not start motion.
 
     Returns
     -------
@@ -49,7 +49,7 @@ async def paused(
         try:
             await check_preconditions(session, expected, watching, beam=beam)
         except Interlock as trouble:
-            if isinstance(trouble, BeamLost) or control.hurry:
+            if isinstance(trouble, BeamLost) or control.no_pause_reason:
                 raise
             why = f"cannot resume: {trouble.detail}"
             control.pause()

@@ -9,7 +9,7 @@ from typing import Annotated
 from fastapi import FastAPI, Header, HTTPException, Path, Request
 from fastapi.responses import JSONResponse, Response
 
-from abbe.service.campaigns.builtin_recipes import named, parted
+from abbe.service.campaigns.builtin_recipes import named, split_recipe_name
 from abbe.service.channel.messages import Answer, How
 from abbe.service.domain.job_state import JobState
 from abbe.service.queries.reader import json_value
@@ -56,7 +56,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
         recipe = named(wanted.recipe, wanted.rate_hz)
         visit.target = f"recipe {recipe}"
         # The core knows the role, not the scopes of a token.
-        if parted(recipe)[0] in campaigns and Permission.PROPOSE not in visit.principal.permissions:
+        if split_recipe_name(recipe)[0] in campaigns and Permission.PROPOSE not in visit.principal.permissions:
             return problem(
                 403, f"{recipe} ends with a proposal: it needs {Permission.PROPOSE.value!r} as well as {Permission.MEASURE.value!r}"
             )

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.campaigns.campaign_run import Confirm
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.machine_lock import lock_machine
@@ -74,7 +74,7 @@ async def at_work(urls: DeviceUrls, store: Store, site: Site, campaign: Campaign
         # killed between a campaign's first line and its journal's: there is nothing to go on with, and nothing was measured
         empty = next((c for c in store.campaigns.all() if c.name == campaign.name and found is None), None)
         first = None if empty is None else (empty.id, int(empty.doc["ctrl0_us"]))
-        await measure(session, store, site, campaign, campaign=first, manner=Manner(confirm=confirm, resumed=found))
+        await measure(session, store, site, campaign, campaign=first, options=MeasureOptions(confirm=confirm, resumed=found))
 
 
 def main() -> None:

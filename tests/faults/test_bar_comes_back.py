@@ -14,7 +14,7 @@ import pytest
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.errors import DriverError, LinkDown, Rebooted, WrongDevice
 from abbe.service.campaigns.campaign_run import MOST_BREAKS, BarBreaks
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.errors import RunInterrupted, Stopped
@@ -86,7 +86,7 @@ async def test_the_cable_is_pulled_and_put_back_and_the_test_begins_again(place,
     hand = Hand(b, monkeypatch)
     before = b.session.ballbar.settings
     site = replace(b.site, watching=Watching(None, GOES_ON, unknown_s=5.0))
-    (run_id,) = await measure(b.session, store, site, PLAN, manner=Manner(pulled_on_the_path(hand, 0.3), yes))
+    (run_id,) = await measure(b.session, store, site, PLAN, options=MeasureOptions(pulled_on_the_path(hand, 0.3), yes))
     broken, complete = store.runs.all()
     assert [(one.label, one.status) for one in (broken, complete)] == [("test", "failed"), ("test-2", "complete")]
     assert broken.reason.startswith("DRV-002")
@@ -110,10 +110,10 @@ async def test_without_the_option_it_ends_and_goes_on_in_the_same_session(place,
     b, store = place
     hand = Hand(b, monkeypatch)
     with pytest.raises(LinkDown):
-        await measure(b.session, store, b.site, PLAN, manner=Manner(pulled_on_the_path(hand, None), yes))
+        await measure(b.session, store, b.site, PLAN, options=MeasureOptions(pulled_on_the_path(hand, None), yes))
     await b.sim.plug()
     found = await resume(b.session, store, b.site, PLAN, "c", yes)
-    (run_id,) = await measure(b.session, store, b.site, PLAN, manner=Manner(None, yes, None, found))
+    (run_id,) = await measure(b.session, store, b.site, PLAN, options=MeasureOptions(None, yes, None, found))
     assert [(one.label, one.status) for one in store.runs.all()] == [("test", "failed"), ("test-2", "complete")]
     assert whole(store, run_id)[0] == 0
     assert b.session.ballbar.settings.zero_nm == 0
@@ -124,7 +124,7 @@ async def test_whoever_waits_for_the_box_can_be_stopped(place, monkeypatch) -> N
     hand = Hand(b, monkeypatch)
     site = replace(b.site, watching=Watching(None, GOES_ON, unknown_s=5.0))
     control = pulled_on_the_path(hand, None)
-    task = asyncio.create_task(measure(b.session, store, site, PLAN, manner=Manner(control, yes)))
+    task = asyncio.create_task(measure(b.session, store, site, PLAN, options=MeasureOptions(control, yes)))
     async for now in control.watch():
         if now.state == State.SUSPENDED:
             assert "the device has gone" in now.why

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.errors import Aborted, DoorOpen, Stopped
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan, FollowPath, ReadBar, RecordPath, TestPlan
@@ -84,7 +84,7 @@ async def run(b: Bench, store: Store, plan: TestPlan, control: Control) -> tuple
     name = f"c{len(store.campaigns.all())}"
     try:
         async with asyncio.timeout(within(30)):
-            await measure(b.session, store, b.site, CampaignPlan(name, (plan,)), manner=Manner(control))
+            await measure(b.session, store, b.site, CampaignPlan(name, (plan,)), options=MeasureOptions(control))
     except (Stopped, Aborted) as ended:
         error = ended
     lines = commands(b.sim.registers.log[start:])
@@ -264,7 +264,7 @@ async def test_where_nobody_may_pause_a_pause_does_not_go_on(place):
     async for now in control.watch():
         if now.state == State.PAUSED:
             b.sim.world.controller.set_door(is_open=True)
-            control.hurry = "not now"
+            control.no_pause_reason = "not now"
             control.resume()
             break
     with pytest.raises(DoorOpen):

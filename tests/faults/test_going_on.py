@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.campaigns.campaign_run import Resumed, decline
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import DoorOpen, EstopPressed, Interlock, PreconditionsChanged, Stopped, TemperatureOutside, UnsafeToMove
@@ -51,7 +51,7 @@ async def suspended_and_on(
     site = replace(b.site, watching=Watching(None, SUSPENDING, unknown_s=5.0))
     control = AtStep(step, make)
     loop = asyncio.get_running_loop()
-    task = asyncio.create_task(measure(b.session, store, site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, site, plan, options=MeasureOptions(control)))
     began = ended = 0.0
     async for now in control.watch():
         if now.state == State.SUSPENDED and not began:
@@ -108,7 +108,9 @@ async def test_what_is_not_configured_or_does_not_clear_ends_the_run(place, susp
     plan = CampaignPlan("c", (small("Linear"),))
     control = AtStep(step_of(plan, MoveTo, 5), lambda: b.sim.world.controller.set_door(is_open=True))
     with pytest.raises(DoorOpen):
-        await measure(b.session, store, replace(b.site, watching=Watching(None, suspending, unknown_s=5.0)), plan, manner=Manner(control))
+        await measure(
+            b.session, store, replace(b.site, watching=Watching(None, suspending, unknown_s=5.0)), plan, options=MeasureOptions(control)
+        )
     assert statuses(store) == [("test", "failed")]
     assert store.runs.all()[-1].reason.startswith("ILK-003: the door is open")
 
@@ -119,7 +121,7 @@ async def test_an_e_stop_never_goes_on_by_itself(place):
     everything = Suspending(frozenset({"door", "beam", "temperature", "estop", "alarm"}), 10.0, 0.05)
     control = AtStep(step_of(plan, MoveTo, 5), lambda: b.sim.world.controller.set_estop(pressed=True))
     with pytest.raises(EstopPressed):
-        await measure(b.session, store, replace(b.site, watching=Watching(None, everything)), plan, manner=Manner(control))
+        await measure(b.session, store, replace(b.site, watching=Watching(None, everything)), plan, options=MeasureOptions(control))
 
 
 async def test_air_outside_the_window_stops_a_run(place):
@@ -133,7 +135,7 @@ async def broken_off(b: Bench, store: Store, kind: str = "Linear", step: int = 9
     plan = CampaignPlan("c", (small(kind),))
     control = AtStep(step, lambda: b.sim.world.controller.set_estop(pressed=True))
     with pytest.raises(Interlock):
-        await measure(b.session, store, b.site, plan, manner=Manner(control))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(control))
     b.sim.world.controller.set_estop(pressed=False)
     b.sim.world.controller.reset_alarm()
     return plan
@@ -141,7 +143,7 @@ async def broken_off(b: Bench, store: Store, kind: str = "Linear", step: int = 9
 
 async def going_on(b: Bench, store: Store, plan: CampaignPlan, confirm=decline) -> Resumed:
     found = await resume(b.session, store, b.site, plan, "c", confirm)
-    await measure(b.session, store, b.site, plan, manner=Manner(confirm=confirm, resumed=found))
+    await measure(b.session, store, b.site, plan, options=MeasureOptions(confirm=confirm, resumed=found))
     return found
 
 
@@ -179,7 +181,7 @@ async def test_a_machine_that_was_moved_off_the_path_has_its_bar_mounted_anew(pl
     control = AtStep(step_of(plan, RecordPath), lambda: asyncio.get_running_loop().call_later(0.02, stop))
     stop = lambda: b.sim.world.controller.set_estop(pressed=True)  # noqa: E731
     with pytest.raises(EstopPressed):
-        await measure(b.session, store, b.site, plan, manner=Manner(control))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(control))
     controller = b.sim.world.controller
     controller.set_estop(pressed=False)
     controller.reset_alarm()
@@ -205,7 +207,7 @@ async def test_a_set_up_with_complete_runs_is_used_only_if_somebody_vouches_for_
             control.stop()
 
     with pytest.raises(Stopped):
-        await measure(b.session, store, b.site, plan, progress=progress, manner=Manner(control))
+        await measure(b.session, store, b.site, plan, progress=progress, options=MeasureOptions(control))
     asked: list[str] = []
 
     async def confirm(text: str) -> bool:
@@ -260,7 +262,7 @@ async def test_waiting_does_not_count_in_the_eta(place):
     seen: list[tuple[Progress, float]] = []
     loop = asyncio.get_running_loop()
     task = asyncio.create_task(
-        measure(b.session, store, b.site, plan, progress=lambda p: seen.append((p, loop.time())), manner=Manner(control))
+        measure(b.session, store, b.site, plan, progress=lambda p: seen.append((p, loop.time())), options=MeasureOptions(control))
     )
     async for now in control.watch():
         if now.state == State.PAUSED:

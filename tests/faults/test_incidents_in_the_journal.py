@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from abbe.drivers.errors import LinkDown
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.cli.app import app
 from abbe.service.clock import SystemClock
 from abbe.service.sequences.control import State
@@ -76,7 +76,7 @@ async def proxied(folder: Path) -> AsyncIterator[tuple[Bench, ModbusProxy]]:
 async def test_a_connection_that_is_reset_is_two_lines_that_name_the_run(place: Place) -> None:
     plan = CampaignPlan("c", (small("Helix"),))
     control = AtStep(3, lambda: place.proxy.play(FaultScenario("rst", 1, (Fault("rst"),))))
-    (run,) = await measure(place.bench.session, place.store, place.bench.site, plan, manner=Manner(control))
+    (run,) = await measure(place.bench.session, place.store, place.bench.site, plan, options=MeasureOptions(control))
     detected, outcome = place.lines()
     assert (detected["phase"], outcome["phase"], outcome["state"]) == ("detected", "outcome", "recovered")
     assert detected["code"] == outcome["code"] == LinkDown.code
@@ -89,7 +89,7 @@ async def test_a_connection_that_is_reset_is_two_lines_that_name_the_run(place: 
 async def test_show_tells_a_campaigns_incidents_and_how_they_ended(place: Place) -> None:
     plan = CampaignPlan("c", (small("Helix"),))
     control = AtStep(3, lambda: place.proxy.play(FaultScenario("rst", 1, (Fault("rst"),))))
-    (run,) = await measure(place.bench.session, place.store, place.bench.site, plan, manner=Manner(control))
+    (run,) = await measure(place.bench.session, place.store, place.bench.site, plan, options=MeasureOptions(control))
     shown = await asyncio.to_thread(CliRunner().invoke, app, ["show", "c", "--db", place.url])
     assert "incidents of the links: 1" in shown.stdout
     assert re.search(rf"controller +DRV-002 +1 +recovered 1 +run {run} test", shown.stdout)
@@ -107,7 +107,7 @@ async def test_a_cable_that_is_pulled_is_noted_with_its_run_and_as_not_over(plac
 
     control = AtStep(5, pull)
     with pytest.raises(LinkDown) as caught:
-        await measure(session, place.store, place.bench.site, plan, manner=Manner(control))
+        await measure(session, place.store, place.bench.site, plan, options=MeasureOptions(control))
     (run,) = place.store.runs.all()
     assert caught.value.run == f"run {run.id} test"
     lines = [one for one in place.lines() if one["link"] == "ball-bar"]
@@ -146,7 +146,7 @@ async def test_more_incidents_than_may_wait_are_counted_at_the_end_of_the_journa
     monkeypatch.setattr("abbe.service.sequences.incident_notes.MOST_WAITING", 3)
     control = AtStep(3, lambda: [(link.note(LinkDown("laser", "read", "gone")), link.good()) for _ in range(5)])  # type: ignore[func-returns-value]
     link = links_of(place.bench.session)["laser"]
-    await measure(place.bench.session, place.store, place.bench.site, CampaignPlan("c", (small("Helix"),)), manner=Manner(control))
+    await measure(place.bench.session, place.store, place.bench.site, CampaignPlan("c", (small("Helix"),)), options=MeasureOptions(control))
     assert control.state == State.ENDED
     assert len(place.lines()) == 3
     (ended,) = [one for one in place.store.checkpoints.of_campaign(place.store.campaigns.all()[-1].id) if one.kind == ENDED]

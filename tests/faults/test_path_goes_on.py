@@ -13,7 +13,7 @@ import pytest
 from abbe.drivers.errors import Rebooted
 from abbe.service.campaign_data.run_times import times
 from abbe.service.campaigns.campaign_run import decline
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.domain.measured import RunRecord
 from abbe.service.errors import Interlock
@@ -79,7 +79,7 @@ def freed(b: Bench) -> None:
 
 async def broken(b: Bench, store: Store, plan: CampaignPlan, after_s: float) -> None:
     with pytest.raises(Interlock):
-        await measure(b.session, store, b.site, plan, manner=Manner(After(plan, b, after_s, estop(b))))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(After(plan, b, after_s, estop(b))))
     b.sim.pace(SPEED)
     freed(b)
 
@@ -89,7 +89,7 @@ async def resumed_item(b: Bench, store: Store, plan: CampaignPlan, confirm=yes, 
     found = await resume(b.session, store, b.site, plan, plan.name, confirm)
     control = None if again_s is None else After(plan, b, again_s, estop(b), step=1)
     try:
-        await measure(b.session, store, b.site, plan, manner=Manner(control, confirm, None, found))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(control, confirm, None, found))
     except Interlock:
         assert again_s is not None
         freed(b)
@@ -144,7 +144,9 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
     b, store = place
     plan = helix()
     with pytest.raises(Interlock):
-        await measure(b.session, store, b.site, plan, manner=Manner(After(plan, b, 9.0, lambda: b.sim.world.ballbar.push(out=True))))
+        await measure(
+            b.session, store, b.site, plan, options=MeasureOptions(After(plan, b, 9.0, lambda: b.sim.world.ballbar.push(out=True)))
+        )
     b.sim.world.ballbar.push(out=False)
     assert "test goes on at" in await resumed_item(b, store, plan)
     columns = load_run(store, runs(store)[-1].id)["columns"]
@@ -189,7 +191,7 @@ async def test_a_box_restarted_in_a_pause_is_joined_to_nothing(place):
     b, store = place
     plan = helix()
     control = After(plan, b, 9.0, lambda: control.pause())
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control, yes)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control, yes)))
     async for now in control.watch():
         if now.state == State.PAUSED:
             b.sim.box.restart(0xBA12)
@@ -206,7 +208,7 @@ async def test_a_pause_on_the_path_costs_a_stretch(place):
     b, store = place
     plan = helix()
     control = After(plan, b, 9.0, lambda: control.pause())
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     async for now in control.watch():
         if now.state == State.PAUSED:
             control.resume()
@@ -261,6 +263,6 @@ async def test_a_door_that_somebody_vouches_for_suspends_and_the_path_goes_on(pl
         door(is_open=True)
         asyncio.get_running_loop().call_later(0.2, lambda: door(is_open=False))
 
-    await measure(b.session, store, site, plan, manner=Manner(After(plan, b, 9.0, opened), yes))
+    await measure(b.session, store, site, plan, options=MeasureOptions(After(plan, b, 9.0, opened), yes))
     assert [r.status for r in runs(store)] == ["failed", "complete"]
     assert len(runs(store)[-1].start_doc["path"]["pieces"]) == 1

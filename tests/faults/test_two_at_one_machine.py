@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.campaigns.campaign_run import items, mounted_anew, resumed_item
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.errors import (
@@ -71,7 +71,7 @@ async def test_a_campaign_with_two_bars_on_a_cup_is_gone_on_with_on_their_sphere
     plan = on_one_cup(100.0, 60.0)
     inside = kind in (FollowPath, RecordPath)
     control = InTest(store, 1, number(plan, 1, kind), lambda: asyncio.get_running_loop().call_later(0.02 * inside, how, control))
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     async for now in control.watch():
         if now.state == State.PAUSED:
             control.resume()
@@ -90,7 +90,7 @@ async def test_a_machine_that_was_moved_before_a_bar_change_has_its_bar_mounted_
     plan = on_one_cup(100.0, 60.0)
     control = InTest(store, 1, number(plan, 1, TakeBarOut), lambda: control.stop())
     with pytest.raises(Stopped):
-        await measure(b.session, store, b.site, plan, manner=Manner(control))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(control))
     b.sim.world.controller.position_mm = b.sim.world.controller.position_mm + 2.0
     await going_on(b, store, plan, yes)
     last = store.runs.all()[-1]
@@ -106,7 +106,7 @@ async def test_a_campaign_whose_process_lives_is_not_gone_on_with(place):
     b, store = place
     plan = CampaignPlan("c", (small("Helix"),))
     control = InTest(store, 0, step_of(plan, RecordPath), lambda: asyncio.get_running_loop().call_later(0.02, control.pause))
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     async for now in control.watch():
         if now.state == State.PAUSED:
             with pytest.raises(UnsafeToMove, match=r"campaign 'c' is being measured \(process \d+"):
@@ -138,7 +138,7 @@ async def test_somebody_else_s_program_runs_on(place, when):
 
     if when == "pause":
         control = AtStep(7, lambda: control.pause())
-        task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+        task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
         async for now in control.watch():
             if now.state == State.PAUSED:
                 at = len(b.sim.registers.log)
@@ -170,4 +170,4 @@ async def test_a_turning_spindle_forbids_motion(place):
     plan = CampaignPlan("c", (small("Linear"),))
     control = AtStep(7, lambda: setattr(b.sim.world.controller.switches, "spindle_turning", True))
     with pytest.raises(SpindleTurns):
-        await measure(b.session, store, b.site, plan, manner=Manner(control))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(control))

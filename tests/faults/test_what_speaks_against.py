@@ -18,7 +18,7 @@ from abbe.drivers.api import LaserReading
 from abbe.drivers.errors import DeviceFault
 from abbe.service.campaigns import campaign_run
 from abbe.service.campaigns.campaign_run import decline
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import begun_source
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import (
@@ -71,7 +71,7 @@ async def test_an_end_from_outside_is_heard_while_an_interlock_stops_the_axes(pl
     door = b.sim.world.controller.set_door
     control = AtStep(step_of(plan, MoveTo, 6), lambda: (b.sim.pace(2.0), loop.call_later(0.02, lambda: door(is_open=True))))
     site = replace(b.site, watching=Watching(None, SUSPENDING, unknown_s=5.0))
-    task = asyncio.create_task(measure(b.session, store, site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, site, plan, options=MeasureOptions(control)))
     await asyncio.wait({task}, timeout=20)
     assert came
     assert task.cancelled()
@@ -97,7 +97,7 @@ async def test_a_pause_that_is_taken_back_at_once_is_not_told_for_ever(place):
     states: list[str] = []
     control = AtStep(8, lambda: (control.pause(), control.resume()))
     sink = lambda p: states.append(p.state)  # noqa: E731
-    await measure(b.session, store, b.site, plan, progress=sink, manner=Manner(control))
+    await measure(b.session, store, b.site, plan, progress=sink, options=MeasureOptions(control))
     assert control.done
     assert set(states[8:]) == {"running"}
 
@@ -124,7 +124,7 @@ async def test_a_mirror_knocked_in_a_pause_is_found_by_reading_the_last_point_ag
         laser._mount = replace(laser._mount, zero_mm=laser._mount.zero_mm + 0.05)
 
     control = AtStep(9, lambda: control.pause())
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     await door_in_the_pause(b, control, knock)
     await task
     assert statuses(store) == [("test", "aborted"), ("test-2", "failed"), ("test-3", "complete")]
@@ -135,7 +135,7 @@ async def test_a_bar_point_by_point_begins_again_after_the_door_was_open_in_a_pa
     b, store = place
     plan = CampaignPlan("c", (small("HelixPoints"),))
     control = AtStep(step_of(plan, ReadBar, 2) - 1, lambda: control.pause())
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     await door_in_the_pause(b, control, lambda: None)
     await task
     assert statuses(store) == [("test", "aborted"), ("test-2", "complete")]
@@ -151,7 +151,7 @@ async def test_a_used_set_up_is_asked_for_after_the_door_was_open_in_a_pause_on_
         return False
 
     control = InTest(store, 1, number(plan, 1, RecordPath), lambda: asyncio.get_running_loop().call_later(0.02, control.pause))
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control, confirm)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control, confirm)))
     await door_in_the_pause(b, control, lambda: None)
     await task
     assert len(asked) == 1
@@ -162,7 +162,7 @@ async def test_a_pause_with_the_door_shut_goes_on_where_it_was(place):
     b, store = place
     plan = CampaignPlan("c", (small("Linear"),))
     control = AtStep(9, lambda: control.pause())
-    task = asyncio.create_task(measure(b.session, store, b.site, plan, manner=Manner(control)))
+    task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     async for now in control.watch():
         if now.state == State.PAUSED:
             await asyncio.sleep(0.3)
@@ -198,7 +198,7 @@ async def test_a_table_that_changes_while_a_question_stands_is_found(place):
     plan = CampaignPlan("c", (small("Helix", label="out", unmount=False), small("Helix", label="back", mount=False, direction=-1)))
     control = InTest(store, 1, 1, lambda: control.stop())
     with pytest.raises(Stopped):
-        await measure(b.session, store, b.site, plan, manner=Manner(control))
+        await measure(b.session, store, b.site, plan, options=MeasureOptions(control))
     comp, runs = b.sim.world.controller.comp, len(store.runs.all())
 
     async def confirm(_: str) -> bool:
@@ -271,7 +271,7 @@ async def test_what_was_done_stays_done_in_the_progress_after_a_suspension(place
     step = step_of(plan, MoveTo, 14)
     control = AtStep(step, lambda: (door(is_open=True), loop.call_later(0.3, lambda: door(is_open=False))))
     site = replace(b.site, watching=Watching(None, SUSPENDING, unknown_s=5.0))
-    await measure(b.session, store, site, plan, progress=seen.append, manner=Manner(control))
+    await measure(b.session, store, site, plan, progress=seen.append, options=MeasureOptions(control))
     assert statuses(store)[-1] == ("test-2", "complete")
     done = [p.done for p in seen]
     assert min(b - a for a, b in pairwise(done)) > -1.0  # back to the last point, not to the beginning
@@ -294,7 +294,7 @@ async def test_a_test_that_is_suspended_again_and_again_ends(place, monkeypatch)
     site = replace(b.site, watching=Watching(None, Suspending(frozenset({"door"}), 10.0, 0.05), unknown_s=5.0))
     with pytest.raises(DoorOpen, match="3 times in a row without a new point"):
         async with asyncio.timeout(within(30)):
-            await measure(b.session, store, site, plan, manner=Manner(Always()))
+            await measure(b.session, store, site, plan, options=MeasureOptions(Always()))
     assert len(store.runs.all()) == 3
 
 
@@ -316,5 +316,5 @@ async def test_an_e_stop_is_told_although_the_journal_cannot_be_ended(place, mon
     monkeypatch.setattr(store.checkpoints, "add", refuses)
     control = AtStep(9, lambda: b.sim.world.controller.set_estop(pressed=True))
     with pytest.raises(EstopPressed) as told:
-        await measure(b.session, store, b.site, CampaignPlan("c", (small("Linear"),)), manner=Manner(control))
+        await measure(b.session, store, b.site, CampaignPlan("c", (small("Linear"),)), options=MeasureOptions(control))
     assert any("last line could not be written" in note for note in told.value.__notes__)

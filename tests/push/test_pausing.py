@@ -75,7 +75,7 @@ async def test_a_pause_holds_it_before_anything_is_written_or_not_at_all(tmp_pat
         control.resume()
         pushed, paused = await task
         assert (pushed.kept, paused) == (True, [False, False, False])
-        assert control.hurry == ""
+        assert control.no_pause_reason == ""
         control.pause()
         assert control.pausing, "what comes after it can be paused again"
 
@@ -91,6 +91,6 @@ async def test_a_push_that_is_stopped_in_its_pause_has_written_nothing(tmp_path:
         control.stop()
         with pytest.raises(Stopped):
             await task
-        assert (written, read_entries(store, b.site.name), control.hurry) == ([], [], "")
+        assert (written, read_entries(store, b.site.name), control.no_pause_reason) == ([], [], "")
         assert (await brought(b, store, Control()))[0].kept, "nothing of it is left over"
         assert read_entries(store, b.site.name)[-1].state is Push.KEEP

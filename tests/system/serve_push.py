@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.compensation.push_approved import Approved, PushOrder
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
@@ -57,7 +57,7 @@ async def probing(session: Session, store: Store, site: Site, order: PushOrder, 
 
     plan = CampaignPlan("probe", (Diagonal("probe", "P", "holdout", "ppp", 200, "").plan(site.machine),))
     try:
-        await measure(session, store, site, plan, progress=progress, manner=Manner(control=order.control, part=True))
+        await measure(session, store, site, plan, progress=progress, options=MeasureOptions(control=order.control, part=True))
     except asyncio.CancelledError:
         if last:
             host, port = site.urls.fixture.removeprefix("fixture+tcp://").split(":")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, RATES_HZ, RECIPES, named, parted, recipe_plan
+from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, RATES_HZ, RECIPES, named, recipe_plan, split_recipe_name
 from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.numbers import MM, Unit
@@ -73,7 +73,7 @@ class Rehearsals:
 
         A campaign of a recipe file can be started by programs only: its dry run is that of the command line.
         """
-        named = (parted(name)[0] for name in self.recipes if not name.endswith(".toml"))
+        named = (split_recipe_name(name)[0] for name in self.recipes if not name.endswith(".toml"))
         return tuple(dict.fromkeys([*named, *((CAMPAIGN,) if self.told is not None else ())]))
 
     def run(self, recipe: str, rate_hz: int, unit: Unit = MM) -> Rehearsed | None:
@@ -81,7 +81,7 @@ class Rehearsals:
         told = self.told
         if told is None or recipe not in self.choices() or (recipe not in RECIPES and recipe != CAMPAIGN):
             return None
-        startable = recipe in {parted(name)[0] for name in self.recipes}
+        startable = recipe in {split_recipe_name(name)[0] for name in self.recipes}
         try:
             machine = machine_from_doc(
                 {"chain": told.chain, "stroke_mm": told.stroke_mm, "pivots_mm": told.pivots_mm, "tool_mm": told.tool_mm}

@@ -29,7 +29,7 @@ import numpy as np
 
 from abbe.drivers.errors import DriverError
 from abbe.models.machine import Machine
-from abbe.service.campaigns.measure import Manner, measure
+from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, open_session
@@ -185,8 +185,8 @@ async def measured(store: Store, out: Outside, plan: CampaignPlan, tally: Tally,
                 begun = any(c.name == plan.name and store.checkpoints.of_campaign(c.id) for c in store.campaigns.all())
                 found = await resume(session, store, out.site(), plan, plan.name, untouched) if begun else None
                 out.control = Control()
-                manner = Manner(out.control, untouched, None, found)
-                return await measure(session, store, out.site(), plan, progress=say, manner=manner)
+                options = MeasureOptions(out.control, untouched, None, found)
+                return await measure(session, store, out.site(), plan, progress=say, options=options)
         except (AbbeError, DriverError, TimeoutError) as error:
             tally.ends[f"{getattr(error, 'code', type(error).__name__)}" if isinstance(error, Interlock) else _short(error)] += 1
             out.control = None

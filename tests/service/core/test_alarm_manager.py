@@ -217,15 +217,15 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
 
 
 async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(bench: Bench) -> None:
-    """`hurry` is set by `Pushing.bring` (tests/push/test_pausing.py); here only that the book asks for it."""
+    """`no_pause_reason` is set by `Pushing.bring` (tests/push/test_pausing.py); here only that the book asks for it."""
     seen: list[tuple[str, str]] = []
     pausing: list[bool] = []
 
     async def push(order: PushOrder) -> JobOutcome:
         await order.begun()
         order.control.now(State.RUNNING)
-        for hurry in ("a table that nobody has verified may be in force", ""):
-            order.control.hurry = hurry
+        for reason in ("a table that nobody has verified may be in force", ""):
+            order.control.no_pause_reason = reason
             seen.append(await bench.steer("pause"))
             pausing.append(order.control.pausing)
         return JobOutcome("refused", "not today")

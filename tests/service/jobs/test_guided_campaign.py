@@ -148,7 +148,7 @@ async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypat
     seen: list[str] = []
 
     async def made(bench: Any, campaign: str, agree: Any, by: str) -> Any:
-        assert bench.control.hurry, "nothing could hold it: it cannot be paused"
+        assert bench.control.no_pause_reason, "nothing could hold it: it cannot be paused"
         seen.append(f"{campaign} by {by}")
         return SimpleNamespace(number=3, proposed=SimpleNamespace(solution_id=2, reasons=("LIMITS: too much", "STALE")))
 

@@ -8,7 +8,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from abbe.service.campaigns.builtin_recipes import RATES_HZ, named, parted, recipe_plan
+from abbe.service.campaigns.builtin_recipes import RATES_HZ, named, recipe_plan, split_recipe_name
 from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.clock import SystemClock
 from abbe.service.errors import ConfigError
@@ -69,10 +69,10 @@ def test_nothing_is_known_of_a_machine_that_nobody_described() -> None:
 
 
 def test_a_rate_is_part_of_the_name() -> None:
-    assert [parted(named("quick-check", rate)) for rate in RATES_HZ] == [("quick-check", rate) for rate in RATES_HZ]
+    assert [split_recipe_name(named("quick-check", rate)) for rate in RATES_HZ] == [("quick-check", rate) for rate in RATES_HZ]
     assert named("quick-check", 100) == "quick-check"
     for odd in ("quick-check at 300 Hz", "quick-check at 0 Hz", "quick-check at 10000 Hz", "quick-check at 1e3 Hz"):
-        assert parted(odd) == (odd, 100)
+        assert split_recipe_name(odd) == (odd, 100)
         with pytest.raises(ConfigError):
             recipe_plan(odd, MACHINE)
 
