@@ -13,7 +13,7 @@ from abbe.models.paths.lines import DIAGONALS
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
 from abbe.models.planning.plan import PlanStep
-from abbe.service.campaigns.plan import plan_for, plan_report, recipe_of, words
+from abbe.service.campaigns.plan import describe, plan_for, plan_report, recipe_of
 from abbe.service.campaigns.plan_instruments import read_instruments
 from abbe.service.cli.app import app
 from abbe.service.devices.session import DeviceUrls
@@ -315,7 +315,7 @@ def test_too_few_minutes_are_one_clear_line():
 
 
 def test_words_for_the_operator_name_every_kind():
-    assert words(HelixTest((1.0, 2.0, 3.0), 150.0)) == "ball-bar 150 mm about (1, 2, 3)"
-    assert words(HelixTest((1.0, 2.0, 3.0), 150.0, axis=1, opens=-1)) == "ball-bar 150 mm about (1, 2, 3), opening along -Y"
-    assert words(LineTest(1, (0.1, 0.9))) == "laser along Y, X at 10 %, Z at 90 % of the stroke"
-    assert words(DiagonalTest("ppp", "")) == "laser, body diagonal ppp, straight"
+    assert describe(HelixTest((1.0, 2.0, 3.0), 150.0)) == "ball-bar 150 mm about (1, 2, 3)"
+    assert describe(HelixTest((1.0, 2.0, 3.0), 150.0, axis=1, opens=-1)) == "ball-bar 150 mm about (1, 2, 3), opening along -Y"
+    assert describe(LineTest(1, (0.1, 0.9))) == "laser along Y, X at 10 %, Z at 90 % of the stroke"
+    assert describe(DiagonalTest("ppp", "")) == "laser, body diagonal ppp, straight"
