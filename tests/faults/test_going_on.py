@@ -224,7 +224,7 @@ async def test_a_set_up_with_complete_runs_is_used_only_if_somebody_vouches_for_
 async def test_a_changed_world_is_refused_in_one_line(place):
     b, store = place
     plan = await broken_off(b, store)
-    other = CampaignPlan("c", (small("Linear", n=6),))
+    other = CampaignPlan("c", (small("Linear", positions=6),))
     with pytest.raises(PreconditionsChanged, match="begun with another recipe"):
         await resume(b.session, store, b.site, other, "c", yes)
     moved = replace(b.site, doc=b.site.doc | {"tool_mm": [0.0, 0.0, -100.0]})
@@ -257,7 +257,7 @@ async def test_a_campaign_that_somebody_measures_is_left_alone(place):
 
 async def test_waiting_does_not_count_in_the_eta(place):
     b, store = place
-    plan = CampaignPlan("c", (small("Linear", n=9),))
+    plan = CampaignPlan("c", (small("Linear", positions=9),))
     control = AtStep(step_of(plan, MoveTo, 8), lambda: control.pause())
     seen: list[tuple[Progress, float]] = []
     loop = asyncio.get_running_loop()

@@ -265,7 +265,7 @@ async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path):
 
 async def test_what_was_done_stays_done_in_the_progress_after_a_suspension(place):
     b, store = place
-    plan = CampaignPlan("c", (small("Linear", n=9),))
+    plan = CampaignPlan("c", (small("Linear", positions=9),))
     door, seen = b.sim.world.controller.set_door, list[Progress]()
     loop = asyncio.get_running_loop()
     step = step_of(plan, MoveTo, 14)
