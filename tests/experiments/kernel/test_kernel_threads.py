@@ -60,6 +60,9 @@ def run(code, *arguments, **variables):
     return done.stdout.strip()
 
 
+pytestmark = pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="an experiment that no command uses: ABBE_TEST_LONG=1 runs it")
+
+
 @pytest.fixture(autouse=True)
 def numba(require):
     """All of this is about the extra ``fast``."""
