@@ -241,21 +241,21 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     best = int(np.argmin(left))
     scale2 = max(float(left[best]), 1e-12 * sums.yy) / (n - 3)
     slope = float(sums.slope()[best])
-    told = (slope, float(np.sqrt(scale2 * sums.w / (sums.w * sums.rr[best] - sums.r[best] ** 2))))
+    slope_and_u = (slope, float(np.sqrt(scale2 * sums.w / (sums.w * sums.rr[best] - sums.r[best] ** 2))))
     flat = sums.yy - sums.y**2 / sums.w
     if (flat - left[best]) / (2 * scale2) <= f_limit(SIGNIFICANCE, 2, n - 3):
-        return Forecast(np.nan, np.nan, np.nan, "not known: the slope is not significant", *told)
+        return Forecast(np.nan, np.nan, np.nan, "not known: the slope is not significant", *slope_and_u)
     if slope < 0:
-        return Forecast(np.nan, np.nan, np.nan, "moves away from the limit", *told)
+        return Forecast(np.nan, np.nan, np.nan, "moves away from the limit", *slope_and_u)
     reached = max(float(sums.knots[best] - sums.level()[best] / slope), 0.0)
     span = float(days[-1] - days[0])
     ahead = np.concatenate([[0.0], span * np.geomspace(1e-3, FARTHEST, 600)])
-    inside = np.flatnonzero(sums.left_if(ahead) - left[best] <= scale2 * f_limit(1 - level, 1, n - 3))
+    inside = np.flatnonzero(sums.squares_if(ahead) - left[best] <= scale2 * f_limit(1 - level, 1, n - 3))
     if reached == 0.0 and not len(inside):
-        return Forecast(0.0, 0.0, 0.0, "", *told)
+        return Forecast(0.0, 0.0, 0.0, "", *slope_and_u)
     if reached > ahead[-1] or not len(inside) or inside[-1] == len(ahead) - 1:
-        return Forecast(np.nan, np.nan, np.nan, "not known: it may be very long", *told)
-    return Forecast(reached, float(ahead[max(inside[0] - 1, 0)]), float(ahead[inside[-1] + 1]), "", *told)
+        return Forecast(np.nan, np.nan, np.nan, "not known: it may be very long", *slope_and_u)
+    return Forecast(reached, float(ahead[max(inside[0] - 1, 0)]), float(ahead[inside[-1] + 1]), "", *slope_and_u)
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class _Sums:
         """Weighted sum of squares that is left, for each knot."""
         return np.asarray(self.yy - self.level() * self.y - self.slope() * self.yr, dtype=np.float64)
 
-    def left_if(self, reached: F1) -> F1:
+    def squares_if(self, reached: F1) -> F1:
         """The least that is left if the limit is reached at each of these days, whatever the knot."""
         s = 1.0 / (reached[:, None] - self.knots[None, :])
         level2 = (self.y - s * self.yr) ** 2 / (self.w - 2 * s * self.r + s**2 * self.rr)

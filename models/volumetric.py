@@ -33,14 +33,14 @@ def remove_rigid(points_mm: F2, deviation_mm: F2) -> F2:
 
 
 @dataclass(frozen=True, slots=True)
-class FieldFigures:
+class FieldStatistics:
     """Rms and maximum of the deviation's length with the rigid motion removed, mm."""
 
     rms_mm: float
     max_mm: float
 
 
-def field_figures(points_mm: F2, deviation_mm: F2) -> FieldFigures:
+def field_statistics(points_mm: F2, deviation_mm: F2) -> FieldStatistics:
     """Rms and maximum length of the deviation vectors after removing the best-fit rigid motion."""
     length: F1 = np.linalg.norm(remove_rigid(points_mm, deviation_mm), axis=1)
-    return FieldFigures(float(np.sqrt(np.mean(length**2))), float(length.max()))
+    return FieldStatistics(float(np.sqrt(np.mean(length**2))), float(length.max()))

@@ -16,11 +16,11 @@ SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """``lag_s`` > 0: the signal shows the machine where it was so long before. ``told``: whether the readings say anything about it."""
+    """``lag_s`` > 0: the signal is late by this time, with standard uncertainty ``u_s``. ``determined``: the readings carry it."""
 
     lag_s: float
     u_s: float
-    told: bool
+    determined: bool
 
 
 def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | None = None, search_s: float = 0.5) -> Lag:
@@ -64,13 +64,13 @@ def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | 
         slope, rest = without(rise / (2 * width)), left(lag)
         power = float(slope @ slope)
         if power <= SLACK * max(float(rest @ rest) / search_s**2, 1e-300):
-            return Lag(lag, np.inf, told=False)
+            return Lag(lag, np.inf, determined=False)
         change = -float(slope @ rest) / power
         lag = float(np.clip(lag + change, -search_s, search_s))
         if abs(change) < 1e-9:
             break
     u = _newey_west(slope * left(lag)) / power
-    return Lag(lag, u, told=bool(u < 0.5 * search_s and abs(lag) < search_s))
+    return Lag(lag, u, determined=bool(u < 0.5 * search_s and abs(lag) < search_s))
 
 
 def _newey_west(score: F1) -> float:
@@ -111,7 +111,7 @@ def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, s
     slope, half = slope - basis @ (basis.T @ slope), half - basis @ (basis.T @ half)
     power = float(slope @ slope)
     if power <= 1e-30:
-        return Lag(0.0, np.inf, told=False)
+        return Lag(0.0, np.inf, determined=False)
     lag = -float(slope @ half) / power
     u = _newey_west(slope * (half + lag * slope)) / power
-    return Lag(lag, u, told=bool(u < 0.5 * search_s))
+    return Lag(lag, u, determined=bool(u < 0.5 * search_s))

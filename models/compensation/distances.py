@@ -59,7 +59,7 @@ def random_pairs(box_mm: F2, n: int = PAIRS, seed: int = SEED) -> Pairs:
 
 
 @dataclass(frozen=True, slots=True)
-class DistanceFigures:
+class DistanceStatistics:
     """Rms, 95 % quantile and maximum of the absolute distance errors over the pairs, mm."""
 
     rms_mm: float
@@ -67,10 +67,10 @@ class DistanceFigures:
     max_mm: float
 
 
-def figures(error_mm: F1) -> DistanceFigures:
+def figures(error_mm: F1) -> DistanceStatistics:
     """Figures of distance errors, shape (n,)."""
     size = np.abs(error_mm)
-    return DistanceFigures(float(np.sqrt(np.mean(size**2))), float(np.quantile(size, 0.95)), float(size.max()))
+    return DistanceStatistics(float(np.sqrt(np.mean(size**2))), float(np.quantile(size, 0.95)), float(size.max()))
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from abbe.models.compensation.sign_proof import FLOOR_MM, SHARE
 from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 
-TOLD = 3
+SHOWN = 3
 SEEN_MM = 0.003
 """Less than this at the strongest place: a table with the sign turned over could not be distinguished from drift within what is allowed."""
 
@@ -44,7 +44,7 @@ class Probe:
     def text(self) -> str:
         """What was expected and measured where it differs most, or else where most was expected, µm."""
         off = np.abs(self.measured_mm - self.expected_mm)
-        order = np.argsort(-np.nan_to_num(np.abs(self.expected_mm) if self.agrees else off, nan=np.inf), kind="stable")[:TOLD]
+        order = np.argsort(-np.nan_to_num(np.abs(self.expected_mm) if self.agrees else off, nan=np.inf), kind="stable")[:SHOWN]
         pairs = ", ".join(f"{1e3 * self.measured_mm[k]:+.1f} ({1e3 * self.expected_mm[k]:+.1f} expected)" for k in order)
         axes = [axis for axis, seen in zip(AXES, self.seen, strict=True) if not seen]
         blind = f"; too small to prove the sign of {', '.join(axes)}" if axes else ""

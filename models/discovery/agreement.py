@@ -1,4 +1,4 @@
-"""Whether runs that were never fitted agree with the simulation: their residual against noise and the prediction's own uncertainty."""
+"""Agreement of holdout runs with the simulation: residuals against noise and the uncertainty of the prediction."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.probability import f_above
 
 LAGS = 10
-"""Memory that is left in whitened noise is looked for over so many readings: the memory usual for instruments (`noise.MEMORY`) has faded to
-6 % by then, and more lags would add more noise to the sum than memory."""
+"""Lags over which remaining memory of the whitened noise is summed: by then the usual memory (`noise.MEMORY`) has faded to 6 %, and more
+lags would add more noise than memory."""
 BLOCKS, SHORTEST = 12, 8
-"""A run is summed in so many blocks: enough for a wave of up to six periods along it, and eight or more are left once it has set its cup
-and length. Of so many readings or more: over them the usual memory has faded to a tenth, so that sums are nearly independent."""
+"""Blocks per run: they resolve up to six periods, and eight or more remain after cup and length are fitted. Shortest block in readings: the
+usual memory has faded to a tenth, so sums are nearly independent."""
 FREE_MM = 1.0
-"""Prior of what a run may set for itself: wide."""
+"""Wide prior of the unknowns that a run has for itself."""
 NO_NOISE = "the fitted runs do not tell the noise of their instrument"
 TOO_FEW = "too few of their readings count"
 
 
 @dataclass(frozen=True)
 class _Noise:
-    """What the fitted runs say of one instrument's whitened noise.
+    """Whitened noise of one instrument, estimated from the fitted runs.
 
-    ``variance`` of a reading over what was assumed; ``freedom`` that it is known with; ``spread``: how many times more the mean square of
-    readings varies than for independent normal ones; ``long``: its long-run variance over that of a reading, 1 or more.
+    ``variance``: of a reading, over the assumed one. ``freedom``: its degrees of freedom. ``spread``: variance of the mean square over that
+    of independent normal readings. ``long``: long-run variance over that of a reading, 1 or more.
     """
 
     variance: float
@@ -43,55 +43,55 @@ class _Noise:
 
 
 def agreements(
-    scene: WhitenedProblem, solved: SolvedModel, predicted_mm: Mapping[str, F1]
+    problem: WhitenedProblem, solved: SolvedModel, predicted_mm: Mapping[str, F1]
 ) -> tuple[tuple[Agreement, ...], tuple[Unjudged, ...]]:
-    """How every run that only judges agrees with a solution without effects, the worst first.
+    """Agreement of every holdout run with a solution without effects, the worst first.
 
-    A run's whitened residual, reading by reading and in sums over blocks, which see what is smooth, is weighted by the inverse covariance
-    of noise and prediction together; its mean square over that of the fitted runs of the same instrument follows an F distribution. Degrees
-    of freedom are less where readings have memory or long tails; the smaller p counts twice.
+    A run's whitened residual, reading by reading and in block sums (sensitive to smooth deviations), is weighted by the inverse covariance
+    of noise and prediction together. Its mean square over that of the fitted runs of the same instrument follows an F distribution, with
+    fewer degrees of freedom where readings have memory or long tails. p is twice the smaller of the two.
 
     Parameters
     ----------
-    scene : fitted runs with their noise. solved : of the scene, no effects. predicted_mm : reading of every run, shape (n,), by label.
+    problem : fitted runs with their noise. solved : of the problem, no effects. predicted_mm : reading of every run, shape (n,), by label.
 
     Returns
     -------
     tuple of Agreement
         ``p`` family-wise over the runs (Sidak).
     tuple of Unjudged
-        Runs of an instrument whose noise nobody knows, for it was never fitted or its fitted runs went into the unknowns; and runs with too
-        few readings that count.
+        Runs of an instrument whose noise is unknown (never fitted, or its runs only determine unknowns), and runs with too few valid
+        readings.
     """
-    noise = {kind: _noise(scene, kind) for kind in scene.colours}
+    noise = {kind: _noise(problem, kind) for kind in problem.colours}
     root = _root(solved.theta_covariance)
-    seen = {r.path.setup for r in scene.runs}
+    seen = {r.path.setup for r in problem.runs}
     found, open_ = [], []
-    for run in (r for r in scene.case.of("holdout") if r.deviation_mm is not None):
+    for run in (r for r in problem.case.of("holdout") if r.deviation_mm is not None):
         label, known = run.path.label, noise.get(run.path.kind)
         if known is None:
             open_.append(Unjudged(label, NO_NOISE))
             continue
-        told = _worse(*_white(scene, solved, root * np.sqrt(known.long), run, predicted_mm[label], seen), known)
-        if told is None:
+        tested = _worse(*_white(problem, solved, root * np.sqrt(known.long), run, predicted_mm[label], seen), known)
+        if tested is None:
             open_.append(Unjudged(label, TOO_FEW))
         else:
-            found.append((label, *told))
+            found.append((label, *tested))
     tried = len(found)
     every = [Agreement(label, times, float(-np.expm1(tried * np.log1p(-min(p, 1.0 - 1e-12))))) for label, times, p in found]
     return tuple(sorted(every, key=lambda a: (a.p, a.run))), tuple(open_)
 
 
 def _root(covariance: F2) -> F2:
-    """A matrix whose product with its own transpose is a covariance; rounding may have made that a little negative somewhere."""
+    """Factor R with R R^T = ``covariance``; eigenvalues that rounding made negative count as zero."""
     values, vectors = linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _noise(scene: WhitenedProblem, kind: str) -> _Noise | None:
-    """From what the fitted model leaves of the fitted runs of an instrument; None where it leaves too little to know."""
-    res, leverage, use = (scene.by_run(v) for v in (scene.space.residual, scene.space.leverage, scene.use))
-    mine = [k for k, name in enumerate(scene.kinds) if name == kind]
+def _noise(problem: WhitenedProblem, kind: str) -> _Noise | None:
+    """Noise from the residuals of an instrument's fitted runs; None where these have too few degrees of freedom."""
+    res, leverage, use = (problem.by_run(v) for v in (problem.projection.residual, problem.projection.leverage, problem.use))
+    mine = [k for k, name in enumerate(problem.kinds) if name == kind]
     parts = [res[k][use[k] > 0] for k in mine]
     total, count = sum(float(r @ r) for r in parts), sum(r.size for r in parts)
     freedom = sum(float(np.sum((1.0 - leverage[k])[use[k] > 0])) for k in mine)
@@ -104,34 +104,34 @@ def _noise(scene: WhitenedProblem, kind: str) -> _Noise | None:
     return _Noise(total / freedom, freedom, spread, max(long, 1.0))
 
 
-def _white(scene: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, seen: set[str]) -> tuple[F2, int]:
-    """Whitened residual of a run's readings that count, then what may move the prediction (columns, one standard deviation each).
+def _white(problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, seen: set[str]) -> tuple[F2, int]:
+    """Whitened residual of a run's valid readings, then columns of the prediction's uncertainty (one standard deviation each).
 
-    Also how many of these the run sets for itself; they are the last. One standard deviation is that of the noise as it was assumed: what
-    the noise is over that, `_tested` takes for all of it together.
+    Also the number of columns, the last ones, that are the run's own unknowns. One standard deviation is that of the assumed noise;
+    `_tested` applies the ratio of estimated to assumed noise.
     """
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
     left = np.where(run.valid, left_over(run, predicted_mm, seen), 0.0)
     keep = run.valid * lone(left, [p.n], [p.kind])
     free = free_columns(run, seen)
-    columns = np.column_stack([gap, scene.base.linear(data, solved.theta)[1] @ root, FREE_MM * free]) * keep[:, None]
-    white = unscaled(columns, [p.n], [p.kind], scene.colours) / scene.colours[p.kind].sd_mm
+    columns = np.column_stack([gap, problem.base.linear(data, solved.theta)[1] @ root, FREE_MM * free]) * keep[:, None]
+    white = unscaled(columns, [p.n], [p.kind], problem.colours) / problem.colours[p.kind].sd_mm
     return np.asarray(white[keep > 0]), free.shape[1]
 
 
 def _worse(white: F2, free: int, known: _Noise) -> tuple[float, float] | None:
-    """Rms over what is allowed, and p, reading by reading or in sums, whichever is farther off; None where neither can be tested."""
+    """Rms over the allowed one, and p: the worse of single readings and block sums; None where neither can be tested."""
     tests = [_tested(white, free, known, 1.0, known.spread), _tested(_sums(white), free, known, known.long, 1.0)]
-    told = [t for t in tests if t is not None]
-    if not told:
+    tested = [t for t in tests if t is not None]
+    if not tested:
         return None
-    times, p = min(told, key=lambda t: t[1])
-    return times, min(1.0, len(told) * p)
+    times, p = min(tested, key=lambda t: t[1])
+    return times, min(1.0, len(tested) * p)
 
 
 def _sums(white: F2) -> F2:
-    """Sums over blocks of one size; noise that is white keeps its variance."""
+    """Sums over blocks of equal size, scaled to keep the variance of white noise."""
     count = min(BLOCKS, len(white) // SHORTEST)
     if count < 1:
         return np.zeros((0, white.shape[1]))
@@ -140,11 +140,11 @@ def _sums(white: F2) -> F2:
 
 
 def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float) -> tuple[float, float] | None:
-    """Rms over what is allowed, and how often chance gives as much; None where too few values are left to tell.
+    """Rms over the allowed one, and p; None where too few degrees of freedom remain.
 
-    ``free`` of the columns, the last, are the run's own: they take as many degrees of freedom as the values tell of them (a circle about
-    its cup three and not four, sums over whole turns hardly any). ``variance`` of the values' noise over that of a reading; ``spread`` as
-    in `_Noise`.
+    The last ``free`` columns are the run's own unknowns. They use as many degrees of freedom as the values determine (a circle about its
+    cup three, not four; sums over whole turns hardly any). ``variance``: of the values' noise over that of a reading. ``spread``: as in
+    `_Noise`.
     """
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
     inner = known.T @ known

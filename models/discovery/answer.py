@@ -1,4 +1,4 @@
-"""What a discovery found, in mm, rad and s; the border turns it into the answer of run-format.md 5 and into words."""
+"""Result of a discovery, in mm, rad and s; the service renders it as the answer of run-format.md 5 and as text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Verdict = Literal["none", "named", "unknown"]
 
 @dataclass(frozen=True)
 class Significance:
-    """One test of where the gap lives: ``kind`` ("run", "test", "axis", "direction", "feed", "time", "position", "frequency",
+    """One localization test: ``kind`` ("run", "test", "axis", "direction", "feed", "time", "position", "frequency",
     "temperature", "instrument"), ``value`` (which one, for people), statistic, and family-wise p-value."""
 
     kind: str
@@ -23,8 +23,8 @@ class Significance:
 
 
 @dataclass(frozen=True)
-class Where:
-    """Where a gap or an effect lives. None or empty: not located in that respect. Fields as in run-format.md 5 ``where``;
+class Localization:
+    """Where a gap or an effect is. None or empty: not located in that respect. Fields as in run-format.md 5 ``where``;
     ``shape``: what it looks like there, for people."""
 
     tests: tuple[str, ...] = ()
@@ -44,7 +44,7 @@ class Where:
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """One effect that was named.
+    """One named effect.
 
     Attributes
     ----------
@@ -53,11 +53,11 @@ class NamedEffect:
     parameters : non-linear ones by name with their standard uncertainty, (value, u); u is NaN where none is known.
     coefficients, covariance : linear ones, in the units of the effect's columns.
     evidence : gain in log evidence (half the chi-square) after its price.
-    alternatives : rivals the data cannot exclude, by evidence, (label, how much less evidence).
+    alternatives : rivals that the data cannot exclude, (label, evidence lacking), best first.
     where : where its signal is largest.
-    forms : freedoms of form that it needed.
-    needed : rms of the runs that only judge without this effect over that with it, all else as it is: 1 or less, and they do not need it.
-        None: nothing judges, or it moves no reading.
+    forms : freedoms of form in use.
+    needed : rms of the holdout runs without this effect over that with it; 1 or less: not needed. None: no holdout run, or a variance
+        effect, which moves no reading.
     """
 
     name: str
@@ -69,7 +69,7 @@ class NamedEffect:
     covariance: F2
     evidence: float
     alternatives: tuple[tuple[str, float], ...] = ()
-    where: Where = field(default_factory=Where)
+    where: Localization = field(default_factory=Localization)
     forms: tuple[str, ...] = ()
     needed: float | None = None
 
@@ -81,9 +81,8 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class NextTest:
-    """What to measure next: ``adds`` of run-format.md 5, which suspects it separates (labels; of a structure without a name, what it may
-    be, in words), expected separation (None: not known) and time it takes; ``like``: the run that is measured again or varied, if one is
-    meant."""
+    """Proposed measurement: ``adds`` of run-format.md 5, suspects that it separates (labels; for a structure without a name, possible
+    causes as text), expected separation (None: not known), duration; ``like``: the run to repeat or vary, if any."""
 
     adds: tuple[str, ...]
     separates: tuple[str, ...]
@@ -104,7 +103,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A value of the present simulation that these runs show: ``name`` and ``key``, value and standard uncertainty in ``unit``."""
+    """A significant value of the present simulation: ``name`` and ``key``, value and standard uncertainty in ``unit``."""
 
     name: str
     key: str
@@ -115,7 +114,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Unseen:
-    """What a campaign cannot show: ``what`` it is, ``because`` of what, the addition of run-format.md 5 that would show it."""
+    """A blind spot of a campaign: ``what`` it cannot show, ``because`` of what, and the addition of run-format.md 5 that would show it."""
 
     what: str
     because: str
@@ -124,14 +123,13 @@ class Unseen:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How one run that was never fitted agrees with the simulation.
+    """Agreement of one holdout run with the simulation.
 
     Attributes
     ----------
     run : its label.
-    times : rms of its residual, or of sums over its neighbouring readings where that tells more, over what noise and the prediction's own
-        uncertainty allow; about 1 is agreement.
-    p : how often runs that agree would give one that is as far off, over all such runs of the campaign together.
+    times : rms of its residuals (or of their block sums, if worse) over what noise and prediction uncertainty allow; about 1 is agreement.
+    p : family-wise over all holdout runs of the campaign.
     """
 
     run: str
@@ -141,7 +139,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Unjudged:
-    """One run that was never fitted and that nothing can be said of: its label, and ``why``."""
+    """A holdout run that cannot be judged: its label, and ``why``."""
 
     run: str
     why: str
@@ -149,29 +147,29 @@ class Unjudged:
 
 @dataclass(frozen=True)
 class Discovery:
-    """Everything one discovery found.
+    """Complete result of one discovery.
 
     Attributes
     ----------
     verdict : "none": the present model explains the runs; "named"; "unknown": something is missing that the catalogue does not explain.
-    effects : in order of evidence. rejected : labels that were tried and why not, for the protocol: structures without a name, names beside
-        an unknown, what another effect's formula leaves.
-    beside : structures without a name found beside names, (label, evidence), by evidence: what of the gap they close is not the names'.
+    effects : in order of evidence. rejected : rejected labels with the reason, for the protocol: structures without a name, names beside
+        an unknown, residues of other effects.
+    beside : structures without a name found beside names, (label, evidence), by evidence; the names do not explain their part of the gap.
     confounded_with : rivals of the names that the price rule does not exclude.
-    where : where the gap of the present model lives (for "unknown": where the missing thing lives).
+    where : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : by role ("identify", "holdout").
     residual_before_mm, residual_after_mm, predicted_mm, predicted_before_mm : by run label; predictions also of sealed runs.
-    noise_mm : one reading of each run's instrument, by "bar", "laser"; of repeats where they say less than what the fit left.
-    p_value : of the whole finding (how often noise alone gives as much).
+    noise_mm : of one reading, by "bar", "laser"; from repeats where these scatter less than the fit's residuals.
+    p_value : of the whole finding.
     theta, theta_names, theta_covariance : the refitted model without the effects.
-    agreement : of runs that only judge, where nothing was found; the worst first. unjudged : those of them that cannot be judged.
-    unseen : where nothing was found: what these runs could not have shown.
-    fitted : what the present simulation took up that people want to know (the scale of a single axis): not missing, and yet there.
+    agreement : of holdout runs, where nothing was found; the worst first. unjudged : holdout runs that cannot be judged.
+    unseen : blind spots of the runs, where nothing was found.
+    fitted : values of the present simulation that people want to know (the scale of a single axis).
     """
 
     verdict: Verdict
     effects: tuple[NamedEffect, ...]
-    where: Where
+    where: Localization
     next_test: NextTest | None
     gaps: Mapping[str, Gap]
     residual_before_mm: Mapping[str, F1]

@@ -20,7 +20,7 @@ GENEROUS = 3.0
 """Prior standard deviation of a strength over the top of its usual range."""
 SEEN = 1e-5
 """A candidate of which less than this share of its square is left shows nothing."""
-MOST_KEPT = 16
+MOST_CACHED = 16
 """So many picks' columns are kept: a search comes back to those it has just used."""
 Short = NDArray[np.float32]
 
@@ -44,10 +44,10 @@ class Pick:
         """Whether it is a generic rival."""
         return self.effect.name.startswith(UNNAMED)
 
-    def raw(self, scene: WhitenedProblem) -> F2:
+    def raw(self, problem: WhitenedProblem) -> F2:
         """Columns, mm per unit of each coefficient, shape (n, k); those of the forms last."""
-        parts = [scene.raw(self.effect.signal, self.key, self.values)]
-        parts += [scene.raw(f.signal, self.key, self.values) for f in self.forms]
+        parts = [problem.raw(self.effect.signal, self.key, self.values)]
+        parts += [problem.raw(f.signal, self.key, self.values) for f in self.forms]
         return np.concatenate(parts, axis=1)
 
     @property
@@ -55,11 +55,11 @@ class Pick:
         """Label, non-linear parameters and forms: what its columns depend on."""
         return f"{self.label} {sorted(self.values.items())} {[f.name for f in self.forms]}"
 
-    def prior_sd(self, scene: WhitenedProblem, columns: int) -> F1:
+    def prior_sd(self, problem: WhitenedProblem, columns: int) -> F1:
         """Prior standard deviation of each coefficient, shape (columns,)."""
-        if self.label not in scene.widths:
-            scene.widths[self.label] = int(self.effect.signal(scene.paths[:1], self.key, self.values)[0].shape[1])
-        return np.full(columns, coefficient_sd(self.effect, self.values, scene.widths[self.label]))
+        if self.label not in problem.widths:
+            problem.widths[self.label] = int(self.effect.signal(problem.paths[:1], self.key, self.values)[0].shape[1])
+        return np.full(columns, coefficient_sd(self.effect, self.values, problem.widths[self.label]))
 
 
 def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
@@ -96,7 +96,7 @@ def starts_of(effects: Sequence[Effect]) -> list[Pick]:
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """All candidates of a scene with what the present simulation leaves of them.
+    """All candidates of a problem with what the present simulation leaves of them.
 
     Attributes
     ----------
@@ -166,10 +166,10 @@ def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
     return np.asarray(np.maximum((solved * moment).sum(axis=1), 0.0))
 
 
-def bank_of(scene: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
-    """Columns of all candidates; those that no run sees are left out. What another bank of the scene still holds is not made again."""
+def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
+    """Columns of all candidates; those that no run sees are left out. What another bank of the problem still holds is not made again."""
     asked = [p.start for p in picks]
-    held = [b for b in scene.banks if isinstance(b, Bank)]
+    held = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in held if list(b.known) == asked), None)
     if same is not None:
         return replace(same, picks=tuple(p for p in picks if same.known[p.start] >= 0))
@@ -179,7 +179,7 @@ def bank_of(scene: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
     parts, groups = list[Short](), list[_Group]()
     for start in range(0, len(picks), PART):
         some = [p for p in picks[start : start + PART] if p.start not in blind]
-        found = {**old, **dict(_groups(scene, [p for p in some if p.start not in old]))}
+        found = {**old, **dict(_groups(problem, [p for p in some if p.start not in old]))}
         some = [p for p in some if p.start in found]
         if some:
             parts.append(np.concatenate([found[p.start].rows for p in some]))
@@ -191,10 +191,10 @@ def bank_of(scene: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
         tuple(kept), {name: number.get(name, -1) for name in asked}, np.cumsum(size) - size, size, tuple(parts),
         np.concatenate([np.zeros(0), *(g.own for g in groups)]), tuple(g.gram for g in groups),
         np.concatenate([np.zeros(0), *(g.moment for g in groups)]),
-        np.concatenate([np.zeros(0), *(p.prior_sd(scene, g.own.size) for p, g in zip(kept, groups, strict=True))]),
+        np.concatenate([np.zeros(0), *(p.prior_sd(problem, g.own.size) for p, g in zip(kept, groups, strict=True))]),
         np.array([g.log for g in groups]),
     )  # fmt: skip
-    scene.banks.add(bank)
+    problem.banks.add(bank)
     return bank
 
 
@@ -202,15 +202,15 @@ PART = 20
 """So many candidates are whitened together: whitening takes several copies of what it is given."""
 
 
-def _groups(scene: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
+def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
     """Start and group of each pick that some run sees."""
-    blocks = [(p, raw) for p, raw in ((p, p.raw(scene)) for p in picks) if raw.any()]
+    blocks = [(p, raw) for p, raw in ((p, p.raw(problem)) for p in picks) if raw.any()]
     if not blocks:
         return
     raw = np.asfortranarray(np.concatenate([b.T for _, b in blocks]).T)  # a filter along the runs is fastest so
-    columns, space = scene.white(raw), scene.space
-    seen = space.seen(columns)
-    moment = columns.T @ space.y - seen.T @ space.moment
+    columns, projection = problem.white(raw), problem.projection
+    seen = projection.seen(columns)
+    moment = columns.T @ projection.y - seen.T @ projection.moment
     own = np.einsum("nk,nk->k", columns, columns)
     short = columns.T.astype(np.float32)
     size = np.abs(raw)
@@ -223,38 +223,38 @@ def _groups(scene: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str
         yield p.start, _Group(short[at], own[at], gram, moment[at], float(np.log(np.maximum(sees, 2)).sum()))
 
 
-def gain_of(scene: WhitenedProblem, pick: Pick, rows: F2) -> float:
+def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
     """Chi-square that one pick takes away after ``rows`` of others were taken out too.
 
     With all digits: where the simulation leaves little of a column, seven of them put evidence of thousands off by several.
     """
-    space = scene.space
-    columns = scene.white(pick.raw(scene))
-    seen, also = space.seen(columns), rows @ columns
+    projection = problem.projection
+    columns = problem.white(pick.raw(problem))
+    seen, also = projection.seen(columns), rows @ columns
     gram = columns.T @ columns - seen.T @ seen - also.T @ also
-    moment = columns.T @ space.residual - also.T @ (rows @ space.y)
-    sd = pick.prior_sd(scene, columns.shape[1])
+    moment = columns.T @ projection.residual - also.T @ (rows @ projection.y)
+    sd = pick.prior_sd(problem, columns.shape[1])
     return float(_gains(gram[None], moment[None], np.einsum("nk,nk->k", columns, columns)[None], sd[None])[0])
 
 
-def whitened(scene: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
-    """Whitened columns of a pick and what the simulation leaves of them, kept for as long as the scene."""
+def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
+    """Whitened columns of a pick and what the simulation leaves of them, kept for as long as the problem."""
     name = pick.start
-    if name not in scene.kept:
-        if len(scene.kept) >= MOST_KEPT:
-            scene.kept.pop(next(iter(scene.kept)))
-        columns = scene.white(pick.raw(scene))
-        scene.kept[name] = columns, scene.space.left(columns)
-    return scene.kept[name]
+    if name not in problem.column_cache:
+        if len(problem.column_cache) >= MOST_CACHED:
+            problem.column_cache.pop(next(iter(problem.column_cache)))
+        columns = problem.white(pick.raw(problem))
+        problem.column_cache[name] = columns, problem.projection.left(columns)
+    return problem.column_cache[name]
 
 
-def rows_for(scene: WhitenedProblem, picks: Sequence[Pick]) -> F2:
+def rows_for(problem: WhitenedProblem, picks: Sequence[Pick]) -> F2:
     """Rows that take out several picks together, shape (k, n)."""
     if not picks:
-        return np.zeros((0, scene.gap.size))
-    parts = [whitened(scene, p) for p in picks]
+        return np.zeros((0, problem.gap.size))
+    parts = [whitened(problem, p) for p in picks]
     columns, left = (np.concatenate([p[i] for p in parts], axis=1) for i in (0, 1))
-    sd = np.concatenate([p.prior_sd(scene, part[0].shape[1]) for p, part in zip(picks, parts, strict=True)])
+    sd = np.concatenate([p.prior_sd(problem, part[0].shape[1]) for p, part in zip(picks, parts, strict=True)])
     sd = np.minimum(sd, 1.0 / np.sqrt(SEEN * np.einsum("nk,nk->k", columns, columns) + 1e-300))
     return rows_of(left, columns, sd)
 

@@ -1,4 +1,4 @@
-"""The finding in words that others understand: verdict, strengths with uncertainty, rivals, place, what to measure next, gaps."""
+"""The result of a search: verdict, strengths with uncertainty, rivals, localization, proposed measurement, gaps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.agreement import agreements
-from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Verdict, Where
+from abbe.models.discovery.answer import Discovery, Gap, Localization, NamedEffect, NextTest, Verdict
 from abbe.models.discovery.candidates import Pick
 from abbe.models.discovery.experiment.design import SuspectEffect, propose
 from abbe.models.discovery.experiment.unnamed import propose_unnamed
@@ -20,19 +20,19 @@ from abbe.models.discovery.localization import locate
 from abbe.models.discovery.prediction import SolvedModel, left_over, predictions
 from abbe.models.discovery.rivals import EXCLUDED, Rival
 from abbe.models.discovery.selection import Selection
-from abbe.models.discovery.signal_localization import where_of_signal
-from abbe.models.discovery.unnamed import Structure, lacking, structures, told_of
+from abbe.models.discovery.signal_localization import localize_signal
+from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, structures
 from abbe.models.discovery.unseen import unseen
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Family
 from abbe.models.probability import chi2_above
 
-# How large a named effect is, in the unit that people use for it, and how sure that is: noise, form, and what no data can show.
+# Strength of a named effect in its customary unit, and its uncertainty: noise, form, and the share that no data can show.
 
 
 TRUE_TO_FORM: dict[Family, float] = {"drive": 0.03, "structure": 0.03, "thermal": 0.12, "instrument": 0.05, "geometry": 0.1}
-"""No machine is true to a formula: standard uncertainty of a strength from its form, relative, by family. A step is a step; what warms up
+"""Relative standard uncertainty of a strength because no machine follows a formula exactly, by family. A step is a step; a warming part
 follows several time constants, whose end a campaign does not see."""
 TRUE_TO_FORM_OF = {
     "contour_lag": 0.05,  # a second lag in the loop counts in the sum, but shrinks a circle less
@@ -45,13 +45,13 @@ TRUE_TO_FORM_OF = {
     "air_refraction": 0.1,  # a hall does not swing as a sine
     "dead_path": 0.1,  # nor does its air warm up at one rate
 }
-"""The same of effects that are less like their formula than their family."""
+"""`TRUE_TO_FORM` of single effects that differ from their family."""
 CARRYING = ("modulated", "sensor")
-"""Forms of effects that do not warm up which hold part of their size."""
+"""Forms (by prefix) that carry part of an effect's size, thermal effects aside."""
 OFFSET = "offset"
-"""A form that begins so has a constant first: what a sensor followed counts from where it began, and that is no part of a swing."""
+"""Prefix of forms whose first column is a constant: the start value of a sensor is no part of the swing."""
 TIME_TRUE_TO_FORM = 0.3
-"""The same of a time constant: what has several of them looks quicker than it is in a campaign that ends before the slow one does."""
+"""Relative standard uncertainty of a time constant: of several time constants, a short campaign shows the quick ones."""
 
 
 def true_to_form(name: str, family: Family) -> float:
@@ -60,27 +60,27 @@ def true_to_form(name: str, family: Family) -> float:
 
 
 def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Non-linear parameters by name with their standard uncertainty; that of a warming-up's time constant holds its form too."""
+    """Non-linear parameters by name with their standard uncertainty; for thermal time constants it includes `TIME_TRUE_TO_FORM`."""
     times = {"tau_s"} if pick.effect.family == "thermal" else set()
     values = {name: float(pick.values[name]) for name in u}
     return {name: (v, float(np.hypot(u[name], TIME_TRUE_TO_FORM * v)) if name in times else u[name]) for name, v in values.items()}
 
 
-def strength_of(scene: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
+def strength_of(problem: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
     """Strength and its standard uncertainty, in the effect's unit, from its coefficients (forms last) and their covariance.
 
-    Four parts of the uncertainty: that of the coefficients (the non-linear parameters free), that of the form, what the present simulation
-    swallows of the effect whatever it is (`Effect.unseen`), and how far it depends on what is called constant (`as_plain`).
+    The uncertainty has four parts: the coefficients (with free non-linear parameters), the form, the share of the effect that the present
+    simulation absorbs (`Effect.unseen`), and the choice of the constant (`as_plain`).
     """
     effect = pick.effect
-    plain = as_plain(scene, pick)
+    plain = as_plain(problem, pick)
     c_plain, cov_plain = plain @ c, plain @ cov @ plain.T
     seen = float(effect.strength(c_plain, pick.values))
     slope = _slope(effect, c_plain, cov_plain, pick)
     own = float(np.sqrt(max(float(slope @ cov_plain @ slope), 0.0)))
     ratio, u_ratio = effect.unseen
     strength = ratio * seen
-    otherwise = seen - float(effect.strength(as_plain(scene, pick, offset=False) @ c, pick.values))
+    otherwise = seen - float(effect.strength(as_plain(problem, pick, offset=False) @ c, pick.values))
     u = float(np.linalg.norm([ratio * own, true_to_form(effect.name, effect.family) * strength, u_ratio * seen, otherwise]))
     return strength / effect.per_unit, u / effect.per_unit
 
@@ -95,88 +95,86 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
     return out
 
 
-def as_plain(scene: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
-    """Coefficients of the plain effect that comes nearest to the effect with its forms, per coefficient, shape (plain, all).
+def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
+    """Coefficients of the plain effect nearest to the effect with its forms, per coefficient, shape (plain, all).
 
-    Only forms that carry part of the size itself count: an amplitude that changes along the axis, other courses of a warming up, what a
-    sensor followed. What a form adds beside (second harmonic, wind-up) is no part of the strength.
+    Only forms that carry part of the size count: an amplitude that changes along the axis, other thermal courses, a followed sensor.
+    Additions such as a second harmonic or wind-up are no part of the strength.
     """
-    raw = pick.raw(scene)
-    k = scene.raw(pick.effect.signal, pick.key, pick.values).shape[1]
+    raw = pick.raw(problem)
+    k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]
     at = k
     for form in pick.forms:
-        width = scene.raw(form.signal, pick.key, pick.values).shape[1]
+        width = problem.raw(form.signal, pick.key, pick.values).shape[1]
         if pick.effect.family != "thermal" and not form.name.startswith(CARRYING):
             raw[:, at : at + width] = 0.0
         at += width
     if not raw[:, k:].any():
         return np.eye(k, raw.shape[1])
-    beside = [scene.raw(f.signal, pick.key, pick.values)[:, :1] for f in pick.effect.forms if offset and f.name.startswith(OFFSET)]
+    beside = [problem.raw(f.signal, pick.key, pick.values)[:, :1] for f in pick.effect.forms if offset and f.name.startswith(OFFSET)]
     basis = np.concatenate([raw[:, :k], *beside], axis=1)
     scale = np.linalg.norm(basis, axis=0)
     scale[scale == 0.0] = 1.0
     return np.asarray(np.linalg.lstsq(basis / scale, raw, rcond=1e-9)[0] / scale[:, None])[:k]
 
 
-# Names that are only what a stronger effect's formula leaves of its true form: no machine is true to a formula.
+# Names that are only residues of a stronger effect, whose true form differs from its formula.
 
 
 RESIDUE_SHARE = 0.001
-"""A name with less evidence than this share of the largest is nothing that can be told from what the largest one's formula leaves."""
+"""A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
 SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
-"""Scatter of readings that move along with the axes: below this share of the strongest effect of the mean, at any axis, it is its rest; a
-smooth effect leaves less that looks like scatter than one with corners or waves (a true stick-slip lay at 1.0 % of a pitch error)."""
+"""Stick-slip and vibration are residues below this share of the strongest mean effect, whatever the axis. A smooth effect leaves less
+that looks like scatter than one with corners or waves (a true stick-slip had 1.0 % of a pitch error)."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
-"""What a drive shows at the turns of its axis is told from another such effect of the same axis by its form only: below this share it is
-that one's form."""
+"""Effects at the reversals of one axis differ by their form only: below `AXIS_SHARE` the weaker is a residue of the stronger."""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
 KIN_SHARE = 0.03
 CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
 LAG = ("contour_lag", "servo_mismatch")
 SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
-"""Effects that live on the same clock, are curves over the same positions, or lags of the drives: what one's formula leaves, off by a sixth
-(3 % squared), is shaped like another. Counted on 345 cases (lags on 150 others): ten false names of these kinds at 0.2 to 2.9 % of the
-strong one, one true one, at 9 %."""
+"""Effects on the same clock, over the same positions, or lags of drives: the residue of one, off by a sixth (3 % squared), resembles
+another. Counted on 345 cases (lags on 150 others): ten false names at 0.2 to 2.9 % of the strong one, one true name at 9 %."""
 
 
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
-    """Names that a stronger one's form explains.
+    """Names that the form of a stronger effect explains.
 
     A name is a residue with evidence below
 
     - 0.1 % of the strongest name's;
     - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis (0.3 % where that effect is smooth);
-    - 2 % of a stronger effect's of the same drive (lost motion, its change along the axis, spikes, play across, servo mismatch: keys that
-      end with the same axis);
-    - 3 % of a stronger one's of its kin: what warms up on the same clock (a bar from the hand too), is a curve over the same axis or in the
-      same direction (and positioning beside thermal growth of the same axis), or is a lag (of all drives, of one of them).
+    - 2 % of that of a stronger effect of the same drive (lost motion, its change along the axis, spikes, lateral play, servo mismatch: keys
+      that end with the same axis);
+    - 3 % of that of a stronger related effect: thermal effects on the same clock (bar included), curves over the same axis or in the same
+      direction (also positioning beside thermal growth of the same axis), lags of all drives or of one.
 
-    What is weak but of another kind, or shares neither axis nor direction, stays: it is no form of the strong one.
+    A weak effect of another kind, or with neither axis nor direction in common, stays.
 
     Parameters
     ----------
-    effects : everything with a name. scatter : labels of those that were found in the scatter of the readings.
+    effects : all named effects. scatter : labels of those found in the variance.
 
     Returns
     -------
     dict
-        Why, by label, for people.
+        Reasons for people, by label.
     """
     out: dict[str, str] = {}
     for small in effects:
         for big in sorted(effects, key=lambda e: -e.evidence):
             share = _share(small, big, big.label in scatter)
             if small.evidence < share * big.evidence:
-                told = f"{small.evidence:.0f} nats, {small.evidence / big.evidence:.1%} of {big.label}'s"
-                out[small.label] = f"{told}: too small beside it to be more than what its formula leaves"
+                share_text = f"{small.evidence:.0f} nats, {small.evidence / big.evidence:.1%} of {big.label}'s"
+                out[small.label] = f"{share_text}: too small beside it to be more than what its formula leaves"
                 break
     return out
 
 
 def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
-    """Share of the bigger one's evidence below which the smaller one is its residue."""
+    """Share of ``big``'s evidence below which ``small`` is its residue."""
     if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
         return AXIS_SHARE
     grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
@@ -190,7 +188,7 @@ def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
 
 
 def _together(a: str, b: str) -> bool:
-    """Whether two error motions (EYX) or axes (X) share the moving axis or the direction that deviates; the ram's sag (no key) with all."""
+    """Whether two keys (EYX or X) share the moving axis or the deviating direction; an empty key (ram sag) shares with all."""
     if not a or not b or a[-1] == b[-1]:
         return True
     directions = [key[1] for key in (a, b) if len(key) == 3 and key[1] in "XYZ"]
@@ -198,14 +196,14 @@ def _together(a: str, b: str) -> bool:
 
 
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
-"""A name with less evidence than this share of another's, at the same readings, is what the other's formula leaves of its true form."""
+"""A name with less evidence than this share of another's, and this overlap of their signals, is a residue of the other."""
 STARTS = 2000.0
-"""So many starts are compared in a campaign; bounds the p-value of the best."""
+"""Starts compared in a campaign; bounds the p-value of the best."""
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What was found, sorted by what is said of it: mean effects (number in the search), all names, structures, and what is not named."""
+class _Judgement:
+    """Findings sorted: kept mean effects (indices of the search), all named effects, structures without a name, rejected labels."""
 
     mean: tuple[int, ...]
     effects: tuple[NamedEffect, ...]
@@ -215,7 +213,7 @@ class _Told:
 
 
 def finding(
-    scene: WhitenedProblem,
+    problem: WhitenedProblem,
     plain: WhitenedProblem,
     found: Sequence[Selection],
     loud: Sequence[VarianceFinding],
@@ -223,43 +221,43 @@ def finding(
     rivals: Sequence[Sequence[Rival]],
     predicted: tuple[dict[str, F1], dict[str, F1]],
 ) -> Discovery:
-    """Everything that was found, for the one who asked.
+    """Assemble the result of a search.
 
     Parameters
     ----------
-    scene, plain : with the findings' noise, and as the present simulation left it.
-    found, loud : effects of the mean, of the scatter. solved, rivals : of ``found``, in its order.
-    predicted : reading of every run without and with the effects.
+    problem, plain : with the noise after the findings, and without findings.
+    found, loud : effects of the mean and of the variance. solved, rivals : of ``found``, in its order.
+    predicted : readings of every run without and with the effects.
     """
-    case, told = scene.case, _told(scene, found, loud, solved, rivals)
-    is_named, unnamed = told.verdict == "named", told.unnamed
-    seen = {r.path.setup for r in scene.runs}
+    case, judgement = problem.case, _judge(problem, found, loud, solved, rivals)
+    is_named, unnamed = judgement.verdict == "named", judgement.unnamed
+    seen = {r.path.setup for r in problem.runs}
     judged = [r for r in case.runs if r.deviation_mm is not None]
     residuals = [{r.path.label: left_over(r, p[r.path.label], seen) for r in judged} for p in predicted]
-    agreement, unjudged = agreements(scene, solved, predicted[0]) if told.verdict == "none" else ((), ())
-    where, verdict, floor = locate(plain.paths, tuple(plain.by_run(plain.space.residual))), told.verdict, floors(scene)
-    lack = lack_of_fit(scene, residuals[0], floor, agreement) if verdict == "none" else None
+    agreement, unjudged = agreements(problem, solved, predicted[0]) if judgement.verdict == "none" else ((), ())
+    where, verdict, floor = locate(plain.paths, tuple(plain.by_run(plain.projection.residual))), judgement.verdict, floors(problem)
+    lack = lack_of_fit(problem, residuals[0], floor, agreement) if verdict == "none" else None
     if lack is not None:
         verdict, unnamed, where = "unknown", (lacking(lack),), lack
     elif verdict == "unknown":
         where = replace(unnamed[0].where, table=where.table)
     return Discovery(
         verdict=verdict,
-        effects=told.effects if is_named else (),
+        effects=judgement.effects if is_named else (),
         where=where,
-        next_test=_next_test(scene, told.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
-        gaps=gaps_of(scene, residuals[0], residuals[1], floor),
+        next_test=_next_test(problem, judgement.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
+        gaps=gaps_of(problem, residuals[0], residuals[1], floor),
         residual_before_mm=residuals[0],
         residual_after_mm=residuals[1],
         predicted_mm=predicted[1],
         predicted_before_mm=predicted[0],
         noise_mm={k: f.sd_mm for k, f in floor.items()},
         p_value=_p_value(found, loud, lack),
-        theta_names=scene.base.names,
+        theta_names=problem.base.names,
         theta=solved.theta,
         theta_covariance=solved.theta_covariance,
-        rejected=(*told.rejected, *((u.label, u.title) for u in unnamed if lack is not None)),
-        confounded_with=_confounded(told.effects) if is_named else (),
+        rejected=(*judgement.rejected, *((u.label, u.title) for u in unnamed if lack is not None)),
+        confounded_with=_confounded(judgement.effects) if is_named else (),
         beside=tuple((u.label, u.evidence) for u in unnamed) if is_named else (),
         agreement=agreement,
         unjudged=unjudged,
@@ -267,41 +265,41 @@ def finding(
     )
 
 
-def _told(
-    scene: WhitenedProblem,
+def _judge(
+    problem: WhitenedProblem,
     found: Sequence[Selection],
     loud: Sequence[VarianceFinding],
     solved: SolvedModel,
     rivals: Sequence[Sequence[Rival]],
-) -> _Told:
-    """Which findings are named, which have no name, which are only what another one leaves."""
-    companions = _companions(scene, found, solved)
+) -> _Judgement:
+    """Sort findings into names, structures without a name, and residues of others."""
+    companions = _companions(problem, found, solved)
     named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companions]
-    needed = _needed(scene, solved, named)
-    mean = {i: replace(_named(scene, found[i], solved, i, rivals[i]), needed=needed[i]) for i in named}
+    needed = _needed(problem, solved, named)
+    mean = {i: replace(_named(problem, found[i], solved, i, rivals[i]), needed=needed[i]) for i in named}
     scatter = [_of_scatter(f) for f in loud if not is_unnamed(f.name)]
     left = residues([*mean.values(), *scatter], frozenset(e.label for e in scatter))
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
-    unnamed = structures(scene.case, found, loud)
+    unnamed = structures(problem.case, found, loud)
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
-    rejected = [(u.label, told_of(u, beside=verdict == "named")) for u in unnamed]
+    rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
         rejected += [(e.label, f"{e.evidence:.0f} nats, less than what has no name: not named beside it") for e in effects]
     for i, j in companions.items():
         rejected.append((found[i].pick.label, f"{found[i].score / 2.0:.0f} nats: form residue of {found[j].pick.label}"))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
-    return _Told(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
+    return _Judgement(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
 
 
-def _needed(scene: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
+def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
     """Rms of the holdout runs without each effect over that with all of them, by its number (`NamedEffect.needed`)."""
-    seen = {r.path.setup for r in scene.runs}
-    judges = [r for r in scene.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
+    seen = {r.path.setup for r in problem.runs}
+    judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
         return dict.fromkeys(which)
 
     def rms(solution: SolvedModel) -> float:
-        read = predictions(scene, solution)
+        read = predictions(problem, solution)
         return float(np.sqrt(np.nanmean(np.concatenate([left_over(r, read[r.path.label], seen) for r in judges]) ** 2)))
 
     def less(i: int) -> SolvedModel:
@@ -312,21 +310,21 @@ def _needed(scene: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
-    """Rivals that the price rule does not exclude; kin that lie farther behind stay with their effect's alternatives."""
+    """Rivals that the price rule does not exclude; more distant ones remain among their effect's alternatives."""
     return tuple(dict.fromkeys(label for e in effects for label, less in e.alternatives if less < EXCLUDED / 2.0))
 
 
 def _verdict(named: float, unnamed: float) -> Verdict:
-    """By the evidence of everything with a name and of everything without."""
+    """The larger of the two evidences decides."""
     if named == unnamed == 0.0:
         return "none"
     return "unknown" if unnamed > named else "named"
 
 
-def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: Where | None) -> float:
-    """Of a lack of fit, the smallest of its table.
+def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: Localization | None) -> float:
+    """Smallest p of a lack of fit; else a bound on how often noise alone gives the strongest finding.
 
-    Else a bound on how often noise alone would give the strongest finding: chi-square of its parameters times the starts compared.
+    The bound is the chi-square tail of the finding's parameters times the number of starts compared.
     """
     if lack is not None:
         return min((s.p for s in lack.table), default=CHANCE)
@@ -335,11 +333,11 @@ def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: 
     return min(1.0, *bounds) if bounds else 1.0
 
 
-def _companions(scene: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
-    """Findings that are only what another one's formula leaves of its true form: which, and of which."""
+def _companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
+    """Findings that are only residues of another: its index by theirs."""
     power = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
-        size = scene.white(pick.raw(scene) @ c[:, None])[:, 0] ** 2
+        size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2
         power.append(np.sqrt(size / max(size.sum(), 1e-300)))
     out: dict[int, int] = {}
     for i, small in enumerate(found):
@@ -349,11 +347,11 @@ def _companions(scene: WhitenedProblem, found: Sequence[Selection], solved: Solv
     return out
 
 
-def _named(scene: WhitenedProblem, found: Selection, solved: SolvedModel, i: int, rivals: Sequence[Rival]) -> NamedEffect:
+def _named(problem: WhitenedProblem, found: Selection, solved: SolvedModel, i: int, rivals: Sequence[Rival]) -> NamedEffect:
     pick, c, cov = solved.picks[i], solved.coefficients[i], solved.covariance[i]
-    strength, u = strength_of(scene, pick, c, cov)
+    strength, u = strength_of(problem, pick, c, cov)
     shape = shape_of(pick, solved.shape_u[i])
-    where = where_of_signal(scene.paths, tuple(scene.by_run(pick.raw(scene) @ c)))
+    where = localize_signal(problem.paths, tuple(problem.by_run(pick.raw(problem) @ c)))
     return NamedEffect(
         pick.effect.name, pick.key, strength, u, shape, c, cov, 0.5 * found.score,
         tuple((r.pick.label, 0.5 * r.less) for r in rivals), where, tuple(f.name for f in pick.forms),
@@ -366,26 +364,26 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
     return NamedEffect(f.name, f.key, f.strength, u, shape, c, np.array([[u * u]]), f.evidence, where=f.where)
 
 
-def _next_test(scene: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
-    """What tells the most doubtful name from its rivals best."""
+def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
+    """The measurement that best separates the strongest ambiguous name from its rivals."""
     for i in kept:
         if not rivals[i]:
             continue
         pick = solved.picks[i]
-        plain = as_plain(scene, pick) @ solved.coefficients[i]
+        plain = as_plain(problem, pick) @ solved.coefficients[i]
         leader = SuspectEffect(pick.effect, pick.key, pick.values, plain)
         others = tuple(SuspectEffect(r.pick.effect, r.pick.key, r.pick.values) for r in rivals[i][:3])
-        test = propose(scene.case, leader, others, {k: c.sd_mm for k, c in scene.colours.items()})
+        test = propose(problem.case, leader, others, {k: c.sd_mm for k, c in problem.colours.items()})
         if test is not None:
             return test
     return None
 
 
-def gaps_of(scene: WhitenedProblem, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
-    """Of every role with at least one reading that counts."""
+def gaps_of(problem: WhitenedProblem, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
+    """Gaps of every role with at least one valid reading."""
     out = {}
     for role in ("identify", "holdout"):
-        runs = [r for r in scene.case.runs if r.role == role and r.path.label in before]
+        runs = [r for r in problem.case.runs if r.role == role and r.path.label in before]
         if any(np.isfinite(before[r.path.label]).any() for r in runs):
             rms = [float(np.sqrt(np.nanmean(np.concatenate([res[r.path.label] for r in runs]) ** 2))) for res in (before, after)]
             noise = [(r.path.n, floor_of[r.path.kind].sd_mm) for r in runs if r.path.kind in floor_of]

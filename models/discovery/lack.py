@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.answer import Agreement, Where
+from abbe.models.discovery.answer import Agreement, Localization
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.localization import locate
 from abbe.models.discovery.noise import CLEARLY
@@ -45,12 +45,12 @@ class Floor:
     freedom: float
 
 
-def floors(scene: WhitenedProblem) -> dict[str, Floor]:
+def floors(problem: WhitenedProblem) -> dict[str, Floor]:
     """Noise of each instrument: of its repeats, where they say clearly less than what the fit left; that may hold what is missing."""
     out = {}
-    for kind, colour in scene.colours.items():
-        steps = repeat_steps(scene.case, kind)
-        sd = max(float(np.sqrt(np.mean(steps**2) / 2.0)), scene.case.resolution_mm[kind] / np.sqrt(12.0)) if steps.size else np.inf
+    for kind, colour in problem.colours.items():
+        steps = repeat_steps(problem.case, kind)
+        sd = max(float(np.sqrt(np.mean(steps**2) / 2.0)), problem.case.resolution_mm[kind] / np.sqrt(12.0)) if steps.size else np.inf
         chance = 1.0 - f_above((sd / colour.sd_mm) ** 2, steps.size, KNOWN_FREEDOM) if steps.size >= REPEATS else 1.0
         believed = sd < CLEARLY * colour.sd_mm and chance < CHANCE
         out[kind] = Floor(sd, steps.size) if believed else Floor(colour.sd_mm, KNOWN_FREEDOM)
@@ -76,25 +76,25 @@ def repeat_steps(case: Case, kind: str) -> F1:
 
 
 def lack_of_fit(
-    scene: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
-) -> Where | None:
+    problem: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
+) -> Localization | None:
     """Where a solution without effects leaves more than noise; None: nowhere.
 
     Parameters
     ----------
-    scene : fitted runs as the present simulation leaves them. left_mm : residual of every judged run, by label.
+    problem : fitted runs as the present simulation leaves them. left_mm : residual of every judged run, by label.
     floor : of `floors`. agreement : of runs that were never fitted.
     """
-    runs = scene.runs
+    runs = problem.runs
     rest = [np.nan_to_num(left_mm[r.path.label]) / floor[r.path.kind].sd_mm for r in runs]
-    louder = {kind: colour.sd_mm / floor[kind].sd_mm for kind, colour in scene.colours.items()}
-    searched = zip(scene.by_run(scene.space.residual), scene.kinds, strict=True)
-    table = locate(scene.paths, tuple(r * louder[kind] for r, kind in searched)).table
+    louder = {kind: colour.sd_mm / floor[kind].sd_mm for kind, colour in problem.colours.items()}
+    searched = zip(problem.by_run(problem.projection.residual), problem.kinds, strict=True)
+    table = locate(problem.paths, tuple(r * louder[kind] for r, kind in searched)).table
     loud = tuple(r.path.label for r, e in zip(runs, rest, strict=True) if _louder(e, floor[r.path.kind], len(runs)))
     off = tuple(a.run for a in agreement if a.p < CHANCE and a.times > TIMES)
     if not (_times(np.concatenate(rest)) > TIMES or loud or off or (table and table[0].p < CHANCE)):
         return None
-    where = locate(scene.paths, tuple(rest))
+    where = locate(problem.paths, tuple(rest))
     if off and not loud:
         where = replace(where, runs=off)
     shaped = _shape_of([r for r in runs if not loud or r.path.label in loud], left_mm, floor)
@@ -116,7 +116,7 @@ def _louder(rest: F1, floor: Floor, tried: int) -> bool:
     return bool(count >= FEWEST and times > TIMES and tried * f_above(times**2, count, floor.freedom) < CHANCE)
 
 
-def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping[str, Floor]) -> Where | None:
+def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping[str, Floor]) -> Localization | None:
     """What is left along the axis that all runs look along: how far it goes, which way, its period; None where there is no such axis."""
     lines = [r for r in runs if r.path.test == "laser_linear" and np.abs(r.path.look[0]).max() > ALONE]
     axes = {int(np.argmax(np.abs(r.path.look[0]))) for r in lines}
@@ -140,7 +140,7 @@ def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping
     shape = f"a shape along {AXES[a]}, {alike}, {span:.3g} µm from {AXES[a]} {at[low]:.4g} mm (lowest) to {at[top]:.4g} mm (highest)"
     x, y_mm, z = (float(v) for v in q[int(np.argmax(np.abs(y)))])
     ways = () if share > COMMON or not up.any() else (_loudest(y, up),)
-    return Where(axes=(AXES[a],), directions=ways, position_mm=(x, y_mm, z), period_mm=period, shape=shape)
+    return Localization(axes=(AXES[a],), directions=ways, position_mm=(x, y_mm, z), period_mm=period, shape=shape)
 
 
 def _common(x: F1, y: F1, up: F1) -> tuple[F1, F1]:

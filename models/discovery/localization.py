@@ -1,7 +1,7 @@
-"""Where the gap lives: tests of whitened residuals by run, axis, direction, feed, time, place, frequency and temperature.
+"""Localization of the gap: tests of whitened residuals by run, axis, direction, feed, time, place, frequency and temperature.
 
-Every p-value is family-wise (Sidak over everything that was looked at). Energy is looked at reading by reading and in sums over blocks,
-which see what is smooth; noise counts with a little more variance than it is said to have (`ROOM`).
+Every p-value is family-wise (Sidak over all tests). Energy is tested reading by reading and in block sums, which are sensitive to smooth
+deviations; the noise variance is enlarged by `ROOM`.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from itertools import pairwise
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.answer import Significance, Where
-from abbe.models.discovery.signal_localization import where_of_signal
+from abbe.models.discovery.answer import Localization, Significance
+from abbe.models.discovery.signal_localization import localize_signal
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 from abbe.models.probability import chi2_above, normal_above
 
 BLOCKS = 12
-"""Readings of a run are summed in so many blocks, of one size."""
+"""Blocks of equal size per run."""
 LAGS = 10
 SIGNIFICANT = 0.01
 CELLS = 4
 """Position cells along each axis."""
 LEAST = 20
 NEIGHBOURS, DIFFER = " (neighbours)", " up and down differ"
-"""What the table adds to the name of a run or an axis: how it was tested."""
+"""Suffixes in the table that say how a run or an axis was tested."""
 ROOM = 1.15
-"""Energy is judged with so much more variance than the noise is said to have: its size is known to some percent only."""
+"""Factor on the noise variance, which is known to some percent only."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,15 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Readings of all runs: residual, block sums with a variance of one each, and what they are grouped by."""
+    """Residuals of all runs with the run and the block of each reading."""
 
     rest: F1
     run: np.ndarray[tuple[int], np.dtype[np.intp]]
     block: np.ndarray[tuple[int], np.dtype[np.intp]]
 
 
-def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Where:
-    """Where what is left of the readings is more than noise.
+def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Localization:
+    """Find where residuals exceed noise.
 
     Parameters
     ----------
@@ -61,9 +61,8 @@ def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Where:
 
     Returns
     -------
-    Where
-        ``table``: every test that was made, smallest p first. The other fields: what of it is significant (1 %, family-wise); empty where
-        nothing is.
+    Localization
+        ``table``: every test, smallest p first. The other fields: the significant results (1 %, family-wise), empty if there are none.
     """
     rows = _rows(paths, whitened)
     found = [
@@ -80,13 +79,13 @@ def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Where:
     significant = [g for g in table if g.p < SIGNIFICANT]
     table_out = tuple(Significance(g.kind, g.value, g.statistic, g.p) for g in table)
     if not significant:
-        return Where(table=table_out)
+        return Localization(table=table_out)
 
     def values(kind: str) -> tuple[str, ...]:
         return tuple(dict.fromkeys(g.value.removesuffix(NEIGHBOURS).removesuffix(DIFFER) for g in significant if g.kind == kind))
 
-    spread = where_of_signal(paths, _excess(rows, paths))
-    return Where(
+    spread = localize_signal(paths, _excess(rows, paths))
+    return Localization(
         tests=values("test") or values("instrument"), axes=values("axis"), directions=tuple(int(v) for v in values("direction")),
         runs=values("run"), time_s=spread.time_s, position_mm=spread.position_mm, radius_mm=spread.radius_mm,
         depends_on=tuple(dict.fromkeys(DEPENDS[g.kind] for g in significant if g.kind in DEPENDS)), table=table_out,
@@ -123,7 +122,7 @@ def _excess(rows: _Rows, paths: tuple[Path, ...]) -> tuple[F1, ...]:
 
 
 def _by_group(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Energy of readings and of block sums in groups of readings."""
+    """Energy tests by run, test, instrument, feed, axis, position and set-up."""
     q = np.concatenate([p.at.q_mm for p in paths])
     look = np.concatenate([p.look**2 for p in paths])
     for kind, names in (
@@ -147,7 +146,7 @@ def _by_group(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
 
 
 def _energy(kind: str, value: str, rows: _Rows, weight: F1) -> _Group:
-    """Weighted energy of block sums and of single readings against that of noise; both count, the smaller p twice."""
+    """Weighted energy of block sums and of single readings against noise; p is twice the smaller of the two."""
     read = rows.rest != 0.0
     w = weight * read
     count = np.bincount(rows.block, read)
@@ -168,7 +167,7 @@ def _weighted_p(weight: F1, square: F1) -> float:
 
 
 def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_Group]:
-    """Ljung-Box per run, of the first ten lags."""
+    """Ljung-Box test of each run over the first ten lags."""
     for p, r in zip(paths, whitened, strict=True):
         if p.n < 4 * LAGS:
             continue
@@ -179,7 +178,7 @@ def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_G
 
 
 def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Whether an axis reads otherwise on the way up than on the way down; and energy of each direction of the path."""
+    """Energy of each direction of the path, and whether an axis reads differently on the way up and down."""
     way = np.concatenate([np.sign(p.direction) for p in paths])
     for d in (1, -1):
         yield _energy("direction", f"{d:d}", rows, (way == d).astype(np.float64))
@@ -201,13 +200,13 @@ def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
 
 
 def _score(column: F1, rows: _Rows) -> float:
-    """Product of a column with the residual in standard deviations, from the sums over blocks."""
+    """Inner product of a column with the residual, in standard deviations."""
     parts = np.bincount(rows.block, column * rows.rest)
     return float(parts.sum() / np.sqrt(max(float(np.sum((column * (rows.rest != 0)) ** 2)), 1e-300)))
 
 
 def _lines(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Strongest line on the clock between 1/100 Hz and 1/15 Hz, over all bar runs, along each axis."""
+    """Strongest spectral line between 1/100 Hz and 1/15 Hz over all bar runs, along each axis."""
     bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
     inside = np.isin(rows.run, bars)
     if inside.sum() < LEAST:

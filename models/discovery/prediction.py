@@ -40,17 +40,17 @@ class SolvedModel:
     shape_u: tuple[Mapping[str, float], ...]
 
 
-def solve(scene: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
+def solve(problem: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
     """Joint fit of simulation and effects, their non-linear parameters included (Gauss-Newton, inside their bounds)."""
     picks = tuple(picks)
-    raw, first, second = _steps(scene, picks)
+    raw, first, second = _steps(problem, picks)
     for _ in range(STEPS):
         parts = zip(picks, second.coefficients, raw, second.covariance, strict=True)
         moved = tuple(_moved(p, c[r.shape[1] :], cov) for p, c, r, cov in parts)
         if moved == picks:
             break
         picks = moved
-        raw, first, second = _steps(scene, picks)
+        raw, first, second = _steps(problem, picks)
     shape_u = []
     for pick, r, cov in zip(picks, raw, second.covariance, strict=True):
         k = r.shape[1]
@@ -59,14 +59,14 @@ def solve(scene: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
     return SolvedModel(picks, first.theta, second.theta_covariance, first.coefficients, linear, tuple(shape_u))
 
 
-def _steps(scene: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], SolvedModel, SolvedModel]:
+def _steps(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], SolvedModel, SolvedModel]:
     """Columns of the picks, the fit at their non-linear parameters, and the fit in which those may move too."""
-    raw = [p.raw(scene) for p in picks]
-    sd = [p.prior_sd(scene, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
-    first = _fit(scene, raw, sd)
-    slopes = [_slopes(scene, p, c) for p, c in zip(picks, first.coefficients, strict=True)]
+    raw = [p.raw(problem) for p in picks]
+    sd = [p.prior_sd(problem, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
+    first = _fit(problem, raw, sd)
+    slopes = [_slopes(problem, p, c) for p, c in zip(picks, first.coefficients, strict=True)]
     wide = [np.concatenate([r, s], axis=1) for r, s in zip(raw, slopes, strict=True)]
-    return raw, first, _fit(scene, wide, [np.concatenate([s, _shape_sd(p)]) for p, s in zip(picks, sd, strict=True)])
+    return raw, first, _fit(problem, wide, [np.concatenate([s, _shape_sd(p)]) for p, s in zip(picks, sd, strict=True)])
 
 
 def _shape_sd(pick: Pick) -> F1:
@@ -84,23 +84,23 @@ def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:
     return pick if values == dict(pick.values) else with_values(pick, values)
 
 
-def _slopes(scene: WhitenedProblem, pick: Pick, coefficients: F1) -> F2:
+def _slopes(problem: WhitenedProblem, pick: Pick, coefficients: F1) -> F2:
     """What the reading changes by with each non-linear parameter, by central differences, shape (n, parameters)."""
-    out = np.zeros((scene.gap.size, len(pick.effect.shape)))
+    out = np.zeros((problem.gap.size, len(pick.effect.shape)))
     for j, q in enumerate(pick.effect.shape):
         value = pick.values[q.name]
         step = 1e-3 * abs(value) if value else 1e-3 * (q.high - q.low)
-        ends = [with_values(pick, {**pick.values, q.name: value + s * step}).raw(scene) @ coefficients for s in (-1, 1)]
+        ends = [with_values(pick, {**pick.values, q.name: value + s * step}).raw(problem) @ coefficients for s in (-1, 1)]
         out[:, j] = (ends[1] - ends[0]) / (2.0 * step)
     return out
 
 
-def _fit(scene: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> SolvedModel:
-    base, n, tangent, sd_mm = scene.base, scene.base.size, scene.tangent, scene.sd_mm()[:, None]
-    white = scene.white(np.column_stack([scene.gap + tangent.raw @ scene.theta, *raw]))
+def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> SolvedModel:
+    base, n, tangent, sd_mm = problem.base, problem.base.size, problem.tangent, problem.sd_mm()[:, None]
+    white = problem.white(np.column_stack([problem.gap + tangent.raw @ problem.theta, *raw]))
     more = white[:, 1:]
     cross = tangent.columns.T @ (white / sd_mm)
-    gram = np.block([[tangent.blend(scene.colours), cross[:, 1:]], [cross[:, 1:].T, more.T @ more]])
+    gram = np.block([[tangent.blend(problem.colours), cross[:, 1:]], [cross[:, 1:].T, more.T @ more]])
     root = linalg.block_diag(base.root, *(np.diag(s) for s in sd))
     gram = root.T @ gram @ root
     gram.flat[:: len(gram) + 1] += 1.0
@@ -112,26 +112,26 @@ def _fit(scene: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> SolvedM
     return SolvedModel((), x[:n], inverse[:n, :n], tuple(x[p] for p in parts), blocks, ())
 
 
-def predictions(scene: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
+def predictions(problem: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
     """Reading of every run of the case, mm, sealed ones too. Set-ups that no identify run shares: cup and length at nominal."""
-    runs = ordered(scene.case.runs)
+    runs = ordered(problem.case.runs)
     data = [r.data() for r in runs]
-    out = [scene.base.read(d, solved.theta) for d in data]
-    paths = tuple(scene.base.along(r.path, d, solved.theta) for r, d in zip(runs, data, strict=True))
-    identified = tuple(r.path.label in {p.label for p in scene.paths} for r in runs)
+    out = [problem.base.read(d, solved.theta) for d in data]
+    paths = tuple(problem.base.along(r.path, d, solved.theta) for r, d in zip(runs, data, strict=True))
+    identified = tuple(r.path.label in {p.label for p in problem.paths} for r in runs)
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
         used = 0
         for signal in (pick.effect.signal, *(f.signal for f in pick.forms)):
             columns = signal(paths, pick.key, pick.values)
-            width = _width(signal, scene, pick)
+            width = _width(signal, problem, pick)
             part = _spread(columns, identified, c[used : used + width])
             used += width
             out = [o + col @ part for o, col in zip(out, columns, strict=True)]
     return {r.path.label: o for r, o in zip(runs, out, strict=True)}
 
 
-def _width(signal: Signal, scene: WhitenedProblem, pick: Pick) -> int:
-    return int(signal(scene.paths, pick.key, pick.values)[0].shape[1])
+def _width(signal: Signal, problem: WhitenedProblem, pick: Pick) -> int:
+    return int(signal(problem.paths, pick.key, pick.values)[0].shape[1])
 
 
 def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:

@@ -18,15 +18,15 @@ NEAR = 0.02
 """A structure without a name is refined within this share of its parameters' range."""
 
 
-def refined(scene: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
+def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
     """Best values near those of ``pick`` (one parameter after the other, between the neighbouring starts), and the gain there."""
-    best = gain_of(scene, pick, rows)
+    best = gain_of(problem, pick, rows)
     if not pick.effect.shape:
         return pick, best
     for sweep in range(sweeps if len(pick.effect.shape) > 1 else 1):
         before = best
         for parameter in pick.effect.shape:
-            pick, best = _along(parameter, pick, best, lambda p: gain_of(scene, p, rows), shrink=0.5**sweep)
+            pick, best = _along(parameter, pick, best, lambda p: gain_of(problem, p, rows), shrink=0.5**sweep)
         if best - before < 0.3:
             break
     return pick, best

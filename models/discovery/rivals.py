@@ -29,14 +29,14 @@ class Rival:
 def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
     """Names that the readings do not exclude in place of pick ``i``, the nearest first; variants of the same name are not rivals."""
     picks = [f.pick for f in found]
-    rows = others(contest.scene, picks, i)
+    rows = others(contest.problem, picks, i)
     own = found[i]
     without = [p.label for p in picks]
     out = []
     for candidate in contest.shortlist(rows, without, TRIED):
         if candidate.pick.unnamed or _nested(candidate.pick, own.pick) or candidate.gain < 0.3 * own.gain:
             continue
-        pick, gain = refined(contest.scene, candidate.pick, rows)
+        pick, gain = refined(contest.problem, candidate.pick, rows)
         pick, gain, score = _formed(contest, pick, rows, gain)
         rival = Rival(pick, own.score - score, gain / own.gain)
         if rival.less < EXCLUDED or rival.share > 1.0 - KIN:
@@ -54,7 +54,7 @@ def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, 
     score = gain - contest.price(pick)
     for form in pick.effect.forms:
         more = replace(pick, forms=(*pick.forms, form))
-        with_form = gain_of(contest.scene, more, rows)
+        with_form = gain_of(contest.problem, more, rows)
         if with_form - gain < FORM_LEAST * gain:  # as for the name that won: less would be no matter of form
             continue
         if with_form - contest.price(more) > score:

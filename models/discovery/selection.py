@@ -1,4 +1,4 @@
-"""Which effects are missing: forward with a price for every parameter and every label tried, with back-steps (discovery.md 4.6)."""
+"""Forward selection of missing effects with backward steps and a price for every parameter and label tried (discovery.md 4.6)."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ from abbe.models.effects.effect import Effect
 MOST_EFFECTS = 5
 SHORTLIST = 6
 THRESHOLD = 4.0
-"""Paid by every new name on top of its parameters and of how many names were tried."""
+"""Price of every new name on top of those for its parameters and for the number of names tried."""
 UNNAMED_PRICE = 6.0
 VARIANT_PRICE = 4.0
-"""Paid by a name that holds a simpler one beside its own freedom (`abbe.models.effects.effect.Effect.variant_of`): as much as for being
-new, for it says something new of what the simpler one says already."""
+"""Price of a name that contains a simpler one (`abbe.models.effects.effect.Effect.variant_of`), equal to the price of a new name."""
 FORM_LEAST = 0.0002
-"""... and explains at least this share of what the effect itself does; less would change its strength more than it is worth."""
+"""A freedom of form must explain at least this share of its effect's gain; a smaller one would shift the strength for nothing."""
 NEARLY = 0.93
-"""A name that explains this share of what a structure without a name explains goes first."""
+"""A name that explains this share of the gain of a structure without a name is preferred to it."""
 HOPELESS = 0.5
 """A start that gains less than this share of the best name so far is not refined."""
 UNNAMED_LABELS = 40
-"""So many kinds of structure without a name are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
+"""Kinds of structure without a name that are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
-"""A freedom of form of an effect already there pays this share of the price of its parameters, and this on top."""
+"""A freedom of form of a chosen effect pays this share of the price of its parameters, plus this."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """A pick with the chi-square it took away given all others, and what is left of that after its price."""
+    """A pick with its gain (reduction of chi-square beside all others) and its score (gain less price)."""
 
     pick: Pick
     gain: float
@@ -45,7 +44,7 @@ class Selection:
 
 
 def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
-    """What a new name has to gain: for each parameter, for the number of names that were tried, for being new.
+    """Gain that a new name needs: for each parameter, for the number of names tried, and for being new.
 
     ``logs``: sum of the logarithms of how many readings see each of its columns; a non-linear parameter takes all ``readings``.
     """
@@ -59,35 +58,35 @@ def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
 
 
 def form_price(logs: float) -> float:
-    """The same for a freedom of form."""
+    """Gain that a freedom of form needs."""
     return FORM_SHARE * logs + FORM_PRICE
 
 
 @dataclass(frozen=True)
 class Contest:
-    """The search over one scene: its bank of named candidates, the price of each label's columns, how many labels there are."""
+    """The search over one problem: its bank of named candidates, the price of each label's columns, how many labels there are."""
 
-    scene: WhitenedProblem
+    problem: WhitenedProblem
     banks: list[Bank]
     widths: dict[str, float]
     labels: int
     readings: int
 
     @classmethod
-    def of(cls, scene: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
-        """All starts of all effects of the mean that the present simulation does not hold."""
-        bank = bank_of(scene, starts_of(competing(effects, scene.case.includes)))
+    def of(cls, problem: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
+        """A contest of all starts of all mean effects that the present simulation does not contain."""
+        bank = bank_of(problem, starts_of(competing(effects, problem.case.includes)))
         widths = {p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)}
-        return cls(scene, [bank], widths, len(widths) + UNNAMED_LABELS, int(scene.use.sum()))
+        return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(problem.use.sum()))
 
     def look_for_unnamed(self, rows: F2) -> None:
-        """Structures without a name, with starts where what ``rows`` leave stands out; they take part from now on."""
-        scene = self.scene
-        left = scene.space.residual - rows.T @ (rows @ scene.space.y)
-        labels = [p.label for p in scene.paths]
-        sigma = {kind: c.sd_mm for kind, c in scene.colours.items()}
-        rivals = generic_rivals(scene.case, dict(zip(labels, scene.by_run(left), strict=True)), sigma)
-        bank = bank_of(scene, starts_of(competing(rivals, scene.case.includes)))
+        """Add structures without a name to the contest, with starts at the peaks of the residuals after ``rows``."""
+        problem = self.problem
+        left = problem.projection.residual - rows.T @ (rows @ problem.projection.y)
+        labels = [p.label for p in problem.paths]
+        sigma = {kind: c.sd_mm for kind, c in problem.colours.items()}
+        rivals = generic_rivals(problem.case, dict(zip(labels, problem.by_run(left), strict=True)), sigma)
+        bank = bank_of(problem, starts_of(competing(rivals, problem.case.includes)))
         self.widths.update({p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)})
         self.banks[1:] = [bank]
 
@@ -99,7 +98,7 @@ class Contest:
     def _form_width(self, pick: Pick, i: int) -> float:
         key = f"{pick.label}/{pick.forms[i].name}"
         if key not in self.widths:
-            columns = np.abs(self.scene.raw(pick.forms[i].signal, pick.key, pick.values))
+            columns = np.abs(self.problem.raw(pick.forms[i].signal, pick.key, pick.values))
             self.widths[key] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())
         return self.widths[key]
 
@@ -107,7 +106,7 @@ class Contest:
         """Best candidate of each label on the grid, best labels first."""
         best: dict[str, Selection] = {}
         for bank in self.banks:
-            for pick, gain in zip(bank.picks, bank.gains(self.scene.space.y, rows), strict=True):
+            for pick, gain in zip(bank.picks, bank.gains(self.problem.projection.y, rows), strict=True):
                 if pick.label not in without and (pick.label not in best or gain > best[pick.label].gain):
                     best[pick.label] = Selection(pick, float(gain), float(gain) - self.price(pick))
         return sorted(best.values(), key=lambda f: (-f.score, f.pick.label))[:most]
@@ -119,19 +118,19 @@ class Contest:
             most = max([beat, *(f.score for f in tried)])
             if candidate.gain < HOPELESS * most - 20.0 or candidate.score < -30.0:
                 continue
-            pick, gain = refined(self.scene, candidate.pick, rows)
+            pick, gain = refined(self.problem, candidate.pick, rows)
             tried.append(Selection(pick, gain, gain - self.price(pick)))
         good = [f for f in tried if f.score > beat]
         if not good:
             return None
         best = max(good, key=lambda f: f.score)
-        if best.pick.unnamed:  # a structure that holds a name's formula beside its own freedom: the name's own forms come next
+        if best.pick.unnamed:  # it contains a name's formula: prefer the name, whose own forms come next
             near = [f for f in good if not f.pick.unnamed and f.gain > NEARLY * best.gain]
             return max(near, key=lambda f: f.score, default=best)
         return best
 
     def next_form(self, picks: Sequence[Pick], rows: F2) -> tuple[int, Pick, float] | None:
-        """The best freedom of form of an effect that is there: its place, the pick with the form, its score."""
+        """The best freedom of form of a chosen effect: index of the pick, the pick with the form, its score."""
         best: tuple[int, Pick, float] | None = None
         for i, pick in enumerate(picks):
             for form in pick.effect.forms:
@@ -139,9 +138,9 @@ class Contest:
                     continue
                 more = replace(pick, forms=(*pick.forms, form))
                 only = replace(pick.effect, name=UNNAMED + "form", signal=form.signal, forms=())
-                gain = gain_of(self.scene, Pick(only, pick.key, pick.values), rows)
+                gain = gain_of(self.problem, Pick(only, pick.key, pick.values), rows)
                 score = gain - form_price(self._form_width(more, len(more.forms) - 1))
-                if gain < FORM_LEAST * gain_of(self.scene, pick, others(self.scene, picks, i)):
+                if gain < FORM_LEAST * gain_of(self.problem, pick, others(self.problem, picks, i)):
                     continue
                 if score > 0.0 and (best is None or score > best[2]):
                     best = (i, more, score)
@@ -150,9 +149,9 @@ class Contest:
 
 def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Selection]:
     """All effects that are worth their price, with back-steps after every addition."""
-    picks, scene = list(start), contest.scene
+    picks, problem = list(start), contest.problem
     for _ in range(3 * most):
-        rows = rows_for(scene, picks)
+        rows = rows_for(problem, picks)
         form = contest.next_form(picks, rows)
         contest.look_for_unnamed(rows)
         new = contest.next(picks, rows) if len(picks) < most else None
@@ -166,18 +165,18 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
     return weighed(contest, dropped(contest, picks))
 
 
-def others(scene: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
-    """Rows of all picks but one."""
-    return rows_for(scene, [p for j, p in enumerate(picks) if j != i])
+def others(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
+    """Projection rows of all picks but one."""
+    return rows_for(problem, [p for j, p in enumerate(picks) if j != i])
 
 
 def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Every older pick refined again beside the newer ones, and put in question by every other name."""
+    """Refine every pick again beside the others, and replace it by another name that explains more."""
     if len(picks) < 2:
         return picks
     for i in range(len(picks)):
-        rows = others(contest.scene, picks, i)
-        own, gain = refined(contest.scene, picks[i], rows, sweeps=1)
+        rows = others(contest.problem, picks, i)
+        own, gain = refined(contest.problem, picks[i], rows, sweeps=1)
         score = gain - contest.price(own)
         rival = contest.next([p for j, p in enumerate(picks) if j != i], rows, without=[picks[i].label], beat=score + 1.0)
         picks[i] = own if rival is None else rival.pick
@@ -185,17 +184,17 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Two names of one kind put in question by one: where only Y trails, X and Z that lead it by as much say nearly the same."""
+    """Replace two picks of one effect by one where that scores higher: Y that trails looks much like X and Z that lead equally."""
     for i, j in combinations(range(len(picks)), 2):
         a, b = picks[i], picks[j]
         if a.effect.name != b.effect.name or a.unnamed:
             continue
         rest = [p for k, p in enumerate(picks) if k not in (i, j)]
-        rows = rows_for(contest.scene, rest)
-        both = gain_of(contest.scene, a, rows) + gain_of(contest.scene, b, rows_for(contest.scene, [*rest, a]))
+        rows = rows_for(contest.problem, rest)
+        both = gain_of(contest.problem, a, rows) + gain_of(contest.problem, b, rows_for(contest.problem, [*rest, a]))
         beat = both - contest.price(a) - contest.price(b)
         others_of_kind = contest.shortlist(rows, [a.label, b.label, *(p.label for p in rest)], most=len(contest.widths))
-        one = (refined(contest.scene, f.pick, rows) for f in others_of_kind if f.pick.effect.name == a.effect.name)
+        one = (refined(contest.problem, f.pick, rows) for f in others_of_kind if f.pick.effect.name == a.effect.name)
         tried = [Selection(pick, gain, gain - contest.price(pick)) for pick, gain in one]
         best = max(tried, key=lambda f: f.score, default=None)
         if best is not None and best.score > beat:
@@ -204,7 +203,7 @@ def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Without picks that the others have made worthless."""
+    """Drop picks whose score beside the others is not positive, the worst first."""
     while picks:
         found = weighed(contest, picks)
         worst = min(found, key=lambda f: f.score)
@@ -215,9 +214,9 @@ def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
-    """Each pick with what it takes away beside all others, in the order of the picks."""
+    """Gain and score of each pick beside all others, in the order of the picks."""
     out = []
     for i, pick in enumerate(picks):
-        gain = gain_of(contest.scene, pick, others(contest.scene, picks, i))
+        gain = gain_of(contest.problem, pick, others(contest.problem, picks, i))
         out.append(Selection(pick, gain, gain - contest.price(pick)))
     return out

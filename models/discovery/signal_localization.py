@@ -1,4 +1,4 @@
-"""Where a signal lives: tests, runs, axes, directions, time and place that hold most of its energy."""
+"""Localization of a signal: tests, runs, axes, directions, time and place that hold most of its energy."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import TypeVar
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
 SHARE = 0.9
-"""Runs and times that hold this share of a signal are where it lives."""
+"""A signal is located at the runs and times that hold this share of its energy."""
 PRESENT = 0.2
 """A test, axis or direction counts as affected from this share of the mean square of the strongest one on."""
 LOCAL = 0.25
-"""A signal lives in one place or moment only when what holds it is at most this share of all there is."""
+"""A signal is confined in place or time when the part that holds it is at most this share of the campaign."""
 
 K = TypeVar("K", str, int)
 
@@ -34,28 +34,28 @@ class _Rows:
     direction: F1
 
 
-def where_of_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Where:
-    """Where the readings of a named effect are largest.
+def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localization:
+    """Locate the energy of an effect's signal.
 
     Parameters
     ----------
     signal : one array (n,) per path
-        What the effect adds to the readings, any unit that all share (mm, or sigmas).
+        Contribution of the effect to the readings, in one unit for all (mm, or sigmas).
 
     Returns
     -------
-    Where
+    Localization
         Tests and runs that see it, axes it lies along (by the square of the look), directions of the path, and, only where it is confined,
         the time and the place that hold 90 % of its energy. Empty for a signal of zeros.
     """
     rows = _rows(paths, signal)
     if not rows.energy.sum() > 0:
-        return Where()
+        return Localization()
     mean = {p.label: float(np.mean(s**2)) for p, s in zip(paths, signal, strict=True)}
     along = rows.along.T @ rows.energy / (rows.along.sum(axis=0) + 1e-12)
     ways = {d: float(np.mean(rows.energy[rows.direction == d])) for d in (1, -1) if (rows.direction == d).any()}
     time_s, (place, radius) = _time(rows), _place(rows)
-    return Where(
+    return Localization(
         tests=_strong(_by_test(paths, signal)), axes=_strong(dict(zip(AXES, along.tolist(), strict=True))), directions=_strong(ways),
         runs=_strong(mean), time_s=time_s, position_mm=place, radius_mm=radius,
     )  # fmt: skip
@@ -84,7 +84,7 @@ def _strong(sizes: dict[K, float]) -> tuple[K, ...]:
 
 
 def _time(rows: _Rows) -> tuple[float, float] | None:
-    """Shortest stretch between two readings that holds the share, where it is a small part of the campaign."""
+    """Shortest interval that holds the share, if it is a small part of the campaign."""
     order = np.argsort(rows.t_s, kind="stable")
     t, held = rows.t_s[order], np.cumsum(rows.energy[order])
     low, high = np.interp([(1 - SHARE) / 2 * held[-1], (1 + SHARE) / 2 * held[-1]], held, t)

@@ -1,32 +1,32 @@
-"""Structures without a name that a search found: how much evidence, where they live, in words."""
+"""Structures without a name that a search found: evidence, location, description."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed, where_of
 from abbe.models.discovery.selection import Selection
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 
 TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
-"""Of the structures of the scatter."""
+"""Titles of the variance structures."""
 
 
 @dataclass(frozen=True)
 class Structure:
-    """One of them; ``title`` for people."""
+    """A structure without a name; ``title`` for people."""
 
     label: str
     title: str
     evidence: float
-    where: Where
+    where: Localization
 
 
 def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
-    """Those among the effects of the mean (``found``) and of the scatter (``loud``), by evidence."""
+    """Structures among the effects of the mean (``found``) and of the variance (``loud``), by evidence."""
     out = [
         Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, where_of(f.pick.effect, f.pick.key, f.pick.values, case))
         for f in found
@@ -36,21 +36,21 @@ def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFi
     return tuple(sorted(out, key=lambda s: (-s.evidence, s.label)))
 
 
-def lacking(where: Where) -> Structure:
-    """What a lack of fit is called: a shape along an axis, or that something is left at a place."""
+def lacking(where: Localization) -> Structure:
+    """A lack of fit as a structure."""
     axis = f":{where.axes[0]}" if len(where.axes) == 1 else ""
     if where.shape:
         return Structure(f"{PREFIX}smooth{axis}", where.shape, 0.0, where)
     return Structure(f"{PREFIX}place{axis}", "more is left than noise", 0.0, where)
 
 
-def told_of(structure: Structure, *, beside: bool) -> str:
-    """``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: that it closes gap which the names do not."""
+def describe_structure(structure: Structure, *, beside: bool) -> str:
+    """``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: names were found too."""
     parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.where)]
     return ", ".join(parts) + ("; what it closes of the gap is not the names'" if beside else "")
 
 
-def _place(where: Where) -> list[str]:
+def _place(where: Localization) -> list[str]:
     out = []
     if where.time_s is not None:
         out.append(f"at {where.time_s[0]:.0f} to {where.time_s[1]:.0f} s")

@@ -1,4 +1,4 @@
-"""What a campaign could not have shown, whether it is there or not: asked where nothing was found."""
+"""Blind spots of a campaign in which nothing was found."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from abbe.models.discovery.experiment.candidates import one_feed, one_radius, on
 from abbe.models.effects.path import Path
 
 LATE_S = 3600.0
-"""A repeat this long after the first time is a late one: axes and spindle warm up within 20 minutes to two hours (effects.md, thermal)."""
+"""A repeat counts as late after this time: axes and spindle warm up within 20 minutes to two hours (effects.md, thermal)."""
 SAME_MM = 2.0
-"""Paths that reach as far to this in every direction are one path: run again at another feed, its readings lie elsewhere along it."""
+"""Two paths are the same when their extents agree to this in every direction: at another feed the readings lie elsewhere along it."""
 SAME_LOOK = 0.01
 """Beams whose unit vectors differ by less in every direction are parallel."""
 GROWS = "what grows with the feed (lag, servo mismatch, vibration of the drives) looks like geometry"
@@ -25,9 +25,9 @@ MOVING = "what shows in motion on a curve only (reversals of two axes, servo mis
 
 
 def unseen(case: Case) -> tuple[Unseen, ...]:
-    """What the fitted runs of a campaign cannot show, with the measurement that would; empty where nothing of the kind is known.
+    """Blind spots of the fitted runs of a campaign, each with the measurement that would cover it.
 
-    A run that was never fitted does not count: nothing is looked for in it.
+    Runs that were not fitted do not count: the search does not use them.
     """
     paths = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in paths if p.kind == "bar"], [p for p in paths if p.kind == "laser"]
@@ -51,7 +51,7 @@ def unseen(case: Case) -> tuple[Unseen, ...]:
 
 
 def _late(paths: list[Path]) -> bool:
-    """Whether some path was run again, either way, long after its first time."""
+    """Whether some path was repeated, in either direction, `LATE_S` or more after its first run."""
     first: list[tuple[str, F1, float]] = []
     for p in sorted(paths, key=lambda p: float(p.at.t_s[0])):
         place, began = _place(p), float(p.at.t_s[0])
@@ -64,7 +64,7 @@ def _late(paths: list[Path]) -> bool:
 
 
 def _place(path: Path) -> F1:
-    """Where a path runs, whichever way: how far it reaches along every axis, a bar's cup and radius, mm; a beam's look on that scale."""
+    """Signature of a path regardless of direction: extent along every axis, a bar's cup and radius, mm; a beam's direction, scaled."""
     reach = [path.at.q_mm.min(axis=0), path.at.q_mm.max(axis=0)]
     if path.kind == "bar":
         return np.concatenate([*reach, path.centre_mm, [path.radius_mm]])

@@ -1,4 +1,4 @@
-"""Readings of a campaign made ready for the search: present simulation fitted, noise known, everything it may still change taken out."""
+"""Readings of a campaign, prepared for the search: present simulation fitted, noise estimated, the simulation's unknowns projected out."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import Baseline
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.noise import Colour, level, lone, unscaled
-from abbe.models.discovery.projection import ROWS, SignalSpace
+from abbe.models.discovery.projection import ROWS, SignalProjection
 from abbe.models.effects.effect import Signal, Values
 from abbe.models.effects.path import Path
 
 FIRST_NOISE = {"bar": Colour(4e-4), "laser": Colour(2.5e-4)}
 STEPS = 2
 WIDE = 10.0
-"""Testing takes out the simulation's unknowns with priors this much wider than usual, so that nothing rests on what is usual."""
+"""Factor on the priors of the simulation's unknowns when they are projected out for testing, so that no finding rests on a prior."""
 ROUNDS = 2
 LOUDEST_MM = 0.1
-"""Prior standard deviation of what is taken out besides."""
+"""Prior standard deviation of the coefficients of ``also``."""
 STEADY = 0.02
-"""Noise that changes by less is known."""
+"""The noise has converged when its relative change is smaller."""
 FITTED = 3.0
-"""The same of the point about which the simulation is linearised."""
+"""Factor on the priors where the simulation is fitted for linearisation."""
 
 
 @dataclass(frozen=True)
 class WhitenedProblem:
-    """Identify runs, stacked in the order of time.
+    """Identify runs stacked in time order, whitened, with the fitted simulation.
 
     Attributes
     ----------
-    paths : as the fitted machine looks along them.
+    paths : lines of sight of the fitted machine.
     gap : array, shape (n,): reading less the fitted simulation, mm.
     use : array, shape (n,): 1, or 0 for readings that do not count (flagged, or lone ones far off).
     theta : array, shape (p,): unknowns of the fitted simulation.
     tangent : columns of the simulation's unknowns, whitened but for the size of the noise.
-    space : what is left of the whitened gap.
-    also : array, shape (n, k): columns that are no part of the simulation and are taken out too (waves of a vibration), mm per mm.
-    kept : whitened columns of picks and what the simulation leaves of them; banks : banks of candidates of this very scene that somebody
-        still holds; widths : columns of an effect along one run, by label. Work that is not done twice, no part of what the scene says.
+    projection : of the whitened gap onto the complement of the simulation's unknowns.
+    also : array, shape (n, k): further columns to project out that are no part of the simulation (waves of a vibration), mm per mm.
+    column_cache : whitened columns of picks and their projection. banks : live banks of candidates of this problem. widths : columns of an
+        effect along one run, by label. All three are caches.
     """
 
     case: Case
@@ -56,9 +56,9 @@ class WhitenedProblem:
     theta: F1
     colours: Mapping[str, Colour]
     tangent: Tangent
-    space: SignalSpace
+    projection: SignalProjection
     also: F2
-    kept: dict[str, tuple[F2, F2]] = field(default_factory=dict)
+    column_cache: dict[str, tuple[F2, F2]] = field(default_factory=dict)
     banks: WeakSet[object] = field(default_factory=WeakSet)
     widths: dict[str, int] = field(default_factory=dict)
 
@@ -91,13 +91,13 @@ class WhitenedProblem:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives (n, p) with seven digits: they are first order about the perfect machine and right to 1e-4 anyway."""
+    """Derivatives (n, p) in single precision: linearising about the perfect machine leaves a relative error of 1e-4 anyway."""
 
     short: NDArray[np.float32]
 
     @classmethod
     def of(cls, runs: Sequence[CaseRun], base: Baseline) -> Slopes:
-        """Of the readings of runs with respect to the simulation's unknowns."""
+        """Derivatives of the readings with respect to the simulation's unknowns."""
         out = np.empty((sum(r.path.n for r in runs), base.size), dtype=np.float32)
         start = 0
         for run in runs:
@@ -113,10 +113,10 @@ class Slopes:
 
 @dataclass(frozen=True)
 class Tangent:
-    """Derivatives of all readings with respect to the simulation's unknowns about the perfect machine, whitened for noise of 1 mm.
+    """Derivatives of all readings with respect to the simulation's unknowns at the perfect machine, whitened for noise of 1 mm.
 
-    Errors are micrometres, so they turn bar and beam by 1e-4 at most: the derivatives do not change, only the reading itself is taken
-    exactly. ``columns`` (n, p); ``gram`` (p, p) of the rows of each instrument; ``raw`` (n, p) as they are.
+    Errors of micrometres turn bar and beam by 1e-4 at most, so the derivatives are constant and only the reading is computed exactly.
+    ``columns``: whitened, (n, p). ``gram``: (p, p) per instrument. ``raw``: not whitened, (n, p).
     """
 
     raw: Slopes
@@ -125,7 +125,7 @@ class Tangent:
 
     @classmethod
     def of(cls, raw: Slopes, use: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> Tangent:
-        """Whiten and multiply out once, run by run: there is never more than one large matrix besides what is given."""
+        """Whiten run by run and accumulate the Gram matrices, with no more than one large matrix besides ``raw``."""
         n, p = raw.short.shape
         columns = np.empty((n, p))
         gram = {kind: np.zeros((p, p)) for kind in dict.fromkeys(kinds)}
@@ -139,76 +139,78 @@ class Tangent:
         return cls(raw, columns, gram)
 
     def blend(self, colours: Mapping[str, Colour]) -> F2:
-        """Columns^T columns of whitened columns, shape (p, p)."""
+        """Gram matrix of the columns whitened with the noise of each instrument, shape (p, p)."""
         return np.asarray(sum(g / colours[kind].sd_mm ** 2 for kind, g in self.gram.items()))
 
 
 def ordered(runs: Sequence[CaseRun]) -> tuple[CaseRun, ...]:
-    """Runs by the time of their first reading, so that the order in which they were handed over does not matter."""
+    """Runs sorted by the time of their first reading: results do not depend on the caller's order."""
     return tuple(sorted(runs, key=lambda r: (float(r.path.at.t_s[0]), r.path.label)))
 
 
-def scene_of(case: Case, base: Baseline) -> WhitenedProblem:
-    """Fit the present simulation to the identify runs and take it out."""
+def whiten(case: Case, base: Baseline) -> WhitenedProblem:
+    """Fit the present simulation to the identify runs and project it out."""
     runs = ordered(case.of("identify"))
     use = np.concatenate([r.valid.astype(float) for r in runs])
     paths, n = tuple(r.path for r in runs), use.size
     tangent = Tangent.of(Slopes.of(runs, base), use, [p.n for p in paths], [p.kind for p in paths], FIRST_NOISE)
-    scene = WhitenedProblem(
-        case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, SignalSpace.nothing(n), np.zeros((n, 0))
+    problem = WhitenedProblem(
+        case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, SignalProjection.nothing(n), np.zeros((n, 0))
     )
-    scene = replace(scene, gap=np.concatenate([r.data().deviation_mm for r in runs]))
+    problem = replace(problem, gap=np.concatenate([r.data().deviation_mm for r in runs]))
     for _ in range(STEPS):
-        scene = linearised(scene, np.zeros((n, 0)), np.zeros(0))
-    return quieted(scene, ())
+        problem = linearised(problem, np.zeros((n, 0)), np.zeros(0))
+    return with_estimated_noise(problem, ())
 
 
-def linearised(scene: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedProblem:
-    """One step towards the exact simulation, together with columns of effects (mm per unit, n x k) that stay outside of it."""
-    base, tangent = scene.base, scene.tangent
-    data = [r.data() for r in scene.runs]
-    sd_mm = scene.sd_mm()[:, None]
-    white = scene.white(np.column_stack([scene.gap + tangent.raw @ scene.theta, extra]))
+def linearised(problem: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedProblem:
+    """One Gauss-Newton step of the simulation, jointly with columns of effects (mm per unit, n x k) that the step leaves outside."""
+    base, tangent = problem.base, problem.tangent
+    data = [r.data() for r in problem.runs]
+    sd_mm = problem.sd_mm()[:, None]
+    white = problem.white(np.column_stack([problem.gap + tangent.raw @ problem.theta, extra]))
     y, more = white[:, 0], white[:, 1:]
     cross = (tangent.columns.T @ (white / sd_mm)).T
-    gram = np.block([[tangent.blend(scene.colours), cross[1:].T], [cross[1:], more.T @ more]])
+    gram = np.block([[tangent.blend(problem.colours), cross[1:].T], [cross[1:], more.T @ more]])
     sd = np.concatenate([base.prior_sd * FITTED, extra_sd])
     gram = gram * sd[:, None] * sd
     gram.flat[:: len(gram) + 1] += 1.0
     solution = sd * np.linalg.solve(gram, sd * np.concatenate([cross[0], more.T @ y]))
     theta = solution[: base.size]
     value = np.concatenate([base.read(d, theta) for d in data])
-    paths = tuple(base.along(r.path, d, theta) for r, d in zip(scene.runs, data, strict=True))
+    paths = tuple(base.along(r.path, d, theta) for r, d in zip(problem.runs, data, strict=True))
     gap = np.concatenate([d.deviation_mm for d in data]) - value
-    scene.kept.clear()  # another scene takes its place: what was only kept for speed would be as large
-    return replace(scene, theta=theta, gap=gap, paths=paths, kept={}, banks=WeakSet())
+    problem.column_cache.clear()  # the old problem's cache would take as much memory again
+    return replace(problem, theta=theta, gap=gap, paths=paths, column_cache={}, banks=WeakSet())
 
 
-def taken_out(scene: WhitenedProblem) -> WhitenedProblem:
-    """The same with its space made anew from gap, columns and noise."""
-    y = scene.white(scene.gap[:, None])[:, 0]
-    tangent = scene.tangent
-    scene.kept.clear()
-    space = SignalSpace.of(y, tangent.columns, tangent.blend(scene.colours), scene.base.prior_sd * WIDE, 1.0 / scene.sd_mm())
-    if scene.also.shape[1]:
-        space = space.without(scene.white(scene.also), np.full(scene.also.shape[1], LOUDEST_MM))
-    return replace(scene, space=space, kept={}, banks=WeakSet())
+def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
+    """The problem with its projection recomputed from gap, columns and noise."""
+    y = problem.white(problem.gap[:, None])[:, 0]
+    tangent = problem.tangent
+    problem.column_cache.clear()
+    projection = SignalProjection.of(
+        y, tangent.columns, tangent.blend(problem.colours), problem.base.prior_sd * WIDE, 1.0 / problem.sd_mm()
+    )
+    if problem.also.shape[1]:
+        projection = projection.without(problem.white(problem.also), np.full(problem.also.shape[1], LOUDEST_MM))
+    return replace(problem, projection=projection, column_cache={}, banks=WeakSet())
 
 
-def quieted(scene: WhitenedProblem, found: Sequence[tuple[F2, F1]]) -> WhitenedProblem:
-    """The same with the noise that is left once the effects ``found`` (raw columns, prior sd) are taken out too."""
+def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]]) -> WhitenedProblem:
+    """The problem with the noise re-estimated after the effects ``found`` (raw columns, prior sd) were projected out too."""
     for _ in range(ROUNDS):
-        scene = taken_out(scene)
-        space = scene.space
+        problem = with_projection(problem)
+        projection = problem.projection
         for raw, sd in found:
-            space = space.without(scene.white(raw), sd)
-        left = space.residual * scene.sd_mm()
-        use = scene.use * lone(left, scene.lengths, scene.kinds)
-        colours = level(left, scene.lengths, scene.kinds, use, space.leverage, scene.case.resolution_mm)
-        if (use != scene.use).any():
-            scene = replace(scene, use=use, tangent=Tangent.of(scene.tangent.raw, use, scene.lengths, scene.kinds, colours))
-        small = all(abs(colours[k].sd_mm / scene.colours[k].sd_mm - 1.0) < STEADY for k in colours)
-        scene = replace(scene, colours=colours)
+            projection = projection.without(problem.white(raw), sd)
+        left = projection.residual * problem.sd_mm()
+        use = problem.use * lone(left, problem.lengths, problem.kinds)
+        colours = level(left, problem.lengths, problem.kinds, use, projection.leverage, problem.case.resolution_mm)
+        if (use != problem.use).any():
+            problem = replace(problem, use=use, tangent=Tangent.of(problem.tangent.raw, use, problem.lengths, problem.kinds, colours))
+        small = all(abs(colours[k].sd_mm / problem.colours[k].sd_mm - 1.0) < STEADY for k in colours)
+        problem = replace(problem, colours=colours)
         if small:
             break
-    return taken_out(scene)
+    return with_projection(problem)

@@ -30,11 +30,11 @@ OBLIQUE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Where hemispheres open: ``side`` (1 or -1) of ``axis``; ``doubt``: why that may be wrong, in words, empty where the tool says it."""
+    """Where hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why that may be wrong; empty where the tool states it."""
 
     axis: int
     side: int
-    doubt: str = ""
+    warning: str = ""
 
     @property
     def words(self) -> str:
@@ -56,10 +56,10 @@ def opening(machine: Machine, vertical: int = 2) -> Opening:
     if sizes[1] < OBLIQUE * sizes[2]:
         return found
     tool = ", ".join(f"{v:g}" for v in machine.tool_mm)
-    doubt = (
+    warning = (
         f"hemispheres open along {found.words}, against the longest part of tool_mm ({tool}): it is oblique, look where the spindle goes"
     )
-    return Opening(found.axis, found.side, doubt)
+    return Opening(found.axis, found.side, warning)
 
 
 def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple[Measurement, ...]:

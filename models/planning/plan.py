@@ -105,7 +105,7 @@ class Plan:
         What stays not observable, in words.
     goal : Goal or None
         What became of the wanted uncertainty, if one was given.
-    doubts : tuple of str
+    warnings : tuple of str
         What the operator has to look at before anything moves.
     """
 
@@ -117,7 +117,7 @@ class Plan:
     u_temperature_mm: float = 0.0
     open_questions: tuple[str, ...] = ()
     goal: Goal | None = None
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def recipes(self) -> tuple[Measurement, ...]:
@@ -174,9 +174,9 @@ def plan_campaign(
         chosen, reached = shortest(search, rows, goal_mm, minutes, PASSES)
     if not chosen:
         raise ValueError(f"planner: no measurement fits into {minutes:g} minutes")
-    doubt = opening(machine, vertical).doubt
+    warning = opening(machine, vertical).warning
     helices = any(isinstance(t, HelixTest) for tests in chosen.values() for t in tests)
-    plan = replace(laid_out(search, chosen, goal_mm if reached else None), doubts=(doubt,) if doubt and helices else ())
+    plan = replace(laid_out(search, chosen, goal_mm if reached else None), warnings=(warning,) if warning and helices else ())
     if goal_mm is None:
         return plan
     floor_mm, limit_by = limit(search, rows)

@@ -31,11 +31,11 @@ from abbe.models.solvers.observability.parameters import (
 from abbe.models.solvers.observability.rank import (
     CampaignColumns,
     Knowledge,
-    SeenInformation,
+    ObservedInformation,
     campaign_columns,
     compressed,
+    observed_information,
     stated_knowledge,
-    what_is_seen,
 )
 from abbe.models.solvers.observability.volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume
 from abbe.models.solvers.observations import RunData
@@ -58,7 +58,7 @@ class Observability:
     machine, terms, model
         Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution carries higher
         orders along, for honest uncertainties).
-    seen : SeenInformation
+    seen : ObservedInformation
         Rank, effective rank, condition, null space (unit columns).
     reachable : int
         Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
@@ -78,7 +78,7 @@ class Observability:
     machine: Machine
     terms: tuple[Term, ...]
     model: tuple[Term, ...]
-    seen: SeenInformation
+    seen: ObservedInformation
     reachable: int
     known: tuple[str, ...]
     hidden: tuple[HiddenGroup, ...]
@@ -217,7 +217,7 @@ def _report(
     terms = tuple(model.terms[i] for i in counted)
     few = compressed(replace(columns, machine=columns.machine[:, counted]))
     known = stated_knowledge(terms, runs, columns.setup_names) if known is None else known
-    seen, prior_sd = what_is_seen(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
+    seen, prior_sd = observed_information(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
     found = picture(CampaignLayout(machine, terms, runs, few, known), seen, prior_sd[counted])
     names = (*(t.name for t in model.terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
     secret = hidden_terms(terms, seen.null_space)

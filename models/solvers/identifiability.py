@@ -13,7 +13,7 @@ RANK_TOLERANCE = 1e-9
 EFFECTIVE_TOLERANCE = 1e-3
 HIDDEN = 1e-6
 """A parameter takes part in what is hidden if its unit column has this component in the null space."""
-TOLD = 1e-3
+LEAST_SHARE = 1e-3
 """Words name members of a combination from this share of its largest on."""
 
 
@@ -22,16 +22,16 @@ class Combination:
     """A direction of parameter space that the observations do not see.
 
     ``weights`` relate the parameters in units of their typical size, largest first, small members too: without them the combination leaves
-    a trace. ``text`` says it in words, of the members that matter (`TOLD`).
+    a trace. ``text`` says it in words, of the members that matter (`LEAST_SHARE`).
     """
 
     weights: tuple[tuple[str, float], ...]
     text: str
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def members(self) -> tuple[str, ...]:
         """Names of the members that matter, largest first."""
-        return _told(self.weights)
+        return _members(self.weights)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def taking_part(names: tuple[str, ...], null_space: F2) -> frozenset[str]:
 
 def combinations_of(names: tuple[str, ...], null_space: F2) -> tuple[Combination, ...]:
     """A null space, shape (p, k), as sparse combinations in words."""
-    return tuple(_in_words(names, v) for v in sparse_rows(null_space.T))
+    return tuple(_sentence(names, v) for v in sparse_rows(null_space.T))
 
 
 def project_out(a: F2, nuisance: F2) -> F2:
@@ -123,18 +123,18 @@ def sparse_rows(null: F2) -> F2:
     return m
 
 
-def _told(parts: tuple[tuple[str, float], ...]) -> tuple[str, ...]:
-    return tuple(n for n, w in parts if abs(w) > TOLD)
+def _members(parts: tuple[tuple[str, float], ...]) -> tuple[str, ...]:
+    return tuple(n for n, w in parts if abs(w) > LEAST_SHARE)
 
 
-def _in_words(names: tuple[str, ...], v: F1) -> Combination:
+def _sentence(names: tuple[str, ...], v: F1) -> Combination:
     order = np.argsort(-np.abs(v))
     parts = tuple((names[i], float(v[i])) for i in order if abs(v[i]) > HIDDEN)
-    told = _told(parts)
-    shown = told[:4]
-    if len(told) == 1:
+    members = _members(parts)
+    shown = members[:4]
+    if len(members) == 1:
         text = f"{shown[0]} leaves no trace in these data"
     else:
-        more = f" and {len(told) - 4} more" if len(told) > 4 else ""
+        more = f" and {len(members) - 4} more" if len(members) > 4 else ""
         text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be told apart"
     return Combination(parts, text)

@@ -21,7 +21,7 @@ from abbe.models.solvers.identifiability import Identifiability, combinations_of
 from abbe.models.solvers.information import KINDS, total
 from abbe.models.solvers.least_squares import ParameterEstimate
 from abbe.models.solvers.observability.parameters import hidden_free
-from abbe.models.solvers.observability.rank import campaign_columns, compressed, stated_knowledge, what_is_seen
+from abbe.models.solvers.observability.rank import campaign_columns, compressed, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns, with_tool
 from abbe.models.solvers.order import RIGID6, OrderChoice, choose, term_levels
@@ -237,7 +237,7 @@ def _rank(problem: CampaignProblem, order: int) -> Identifiability:
     terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)
     columns = compressed(campaign_columns(problem.machine, terms, problem.runs, problem.setup))
     known = stated_knowledge(terms, problem.runs, problem.setup.names)
-    seen = what_is_seen(columns, known)
+    seen = observed_information(columns, known)
     hidden = combinations_of(names, seen.null_space * (seen.factor / problem.sizes.typical[inside])[:, None])
     involved = taking_part(names, seen.null_space) | hidden_free(columns, known, seen)
     return Identifiability(len(names), seen.rank, seen.effective_rank, seen.condition, hidden, involved)

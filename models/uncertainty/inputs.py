@@ -72,7 +72,7 @@ class StatedInputs:
         """The same for a machine whose scales are as warm as while it was measured: without the temperature of the scales."""
         return replace(self, u_scale_temperature_k=0.0)
 
-    def of_the_data_alone(self) -> StatedInputs:
+    def without_stated_inputs(self) -> StatedInputs:
         """The same without everything that is only stated: what is left is the covariance of the solution itself."""
         return replace(
             self,

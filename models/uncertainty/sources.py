@@ -305,7 +305,7 @@ def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -
     Returns
     -------
     ErrorSources
-        Without the stated inputs (`StatedInputs.of_the_data_alone`) the sources add up to ``solution.term_covariance``.
+        Without the stated inputs (`StatedInputs.without_stated_inputs`) the sources add up to ``solution.term_covariance``.
     """
     inputs = inputs or StatedInputs()
     r = response(solution)

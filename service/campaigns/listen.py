@@ -107,7 +107,7 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
     for line in lines:
         report(f"{test.label}: {line}")
     doc = {"standstills": {"trouble": list(lines), "missing": list(found.missing), "noise_mm": found.noise}, "mounted_us": mounted_us}
-    if lag is not None and lag.told:
+    if lag is not None and lag.determined:
         doc["lag"] = {"laser_behind_position_ms": lag.lag_s * 1e3, "u_ms": lag.u_s * 1e3}
     return doc | {"heard": [[r.device_us, r.displacement_tenth_nm] for r in heard.readings]}
 

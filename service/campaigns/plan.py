@@ -80,7 +80,7 @@ def plan_for(
     campaign = paced(CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes)), site.max_feed_mm_min)
     dry = dry_run_campaign(site.machine, campaign, site.max_feed_mm_min)
     note = f"for {site.name}, {plan.minutes:.0f} minutes with set-ups; expected worst U {_um(COVERAGE * plan.u_worst_mm)} um"
-    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*notes, *plan.doubts))
+    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*notes, *plan.warnings))
 
 
 def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:

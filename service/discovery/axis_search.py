@@ -14,7 +14,7 @@ from abbe.models.discovery.discover import Progress, discover
 from abbe.models.discovery.finding import gaps_of
 from abbe.models.discovery.lack import Floor
 from abbe.models.discovery.prediction import left_over, predictions, solve
-from abbe.models.discovery.whitened_problem import scene_of
+from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.effect import Effect
 from abbe.models.probability import chi2_above
 from abbe.models.solvers.priors import U_WAVELENGTH
@@ -62,9 +62,9 @@ def _without(case: Case, drifts: dict[str, F1]) -> Case:
 
 def _together(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, F1], table: tuple[Significance, ...]) -> Discovery:
     """Drift and what was named in the rest as one finding; before is the present simulation of the readings as they were measured."""
-    scene = scene_of(case, baseline_of(case))
-    before = predictions(scene, solve(scene, ()))
-    seen = {r.path.setup for r in scene.runs}
+    problem = whiten(case, baseline_of(case))
+    before = predictions(problem, solve(problem, ()))
+    seen = {r.path.setup for r in problem.runs}
     left = {r.path.label: left_over(r, before[r.path.label], seen) for r in case.runs if r.deviation_mm is not None}
     floor = {kind: Floor(sd, 1.0) for kind, sd in found.noise_mm.items()}
     return replace(
@@ -73,7 +73,7 @@ def _together(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, 
         effects=(*drift.effects, *found.effects),
         where=replace(found.where, table=table),
         next_test=drift.next_test or found.next_test,
-        gaps=gaps_of(scene, left, found.residual_after_mm, floor),
+        gaps=gaps_of(problem, left, found.residual_after_mm, floor),
         residual_before_mm=left,
         predicted_mm={label: v + drifts[label] for label, v in found.predicted_mm.items()},
         predicted_before_mm=before,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from abbe.models.discovery.answer import NextTest, Where
+from abbe.models.discovery.answer import Localization, NextTest
 from abbe.service.domain.finding import EffectFound, Finding
 
 FORMAT = "abbe-discovery/1"
@@ -61,6 +61,6 @@ def _next_test(test: NextTest) -> dict[str, Any]:
     return doc | ({"like": test.like} if test.like else {})
 
 
-def where_doc(where: Where) -> dict[str, Any]:
+def where_doc(where: Localization) -> dict[str, Any]:
     """What is known of the place, without the table of tests."""
     return {k: v for k, v in asdict(where).items() if k != "table" and v not in (None, (), [], "")}

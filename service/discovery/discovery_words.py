@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from abbe.models.discovery.answer import NextTest, Where
+from abbe.models.discovery.answer import Localization, NextTest
 from abbe.service.discovery.changed_words import changed_lines
 from abbe.service.discovery.discovery_states import LEFT, entering, judge, not_entered
 from abbe.service.discovery.never_fitted import disagreeing, nothing_missing
@@ -80,7 +80,7 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
 
 def _none_words(finding: Finding, gap: str) -> tuple[str, str, str]:
     where = finding.where
-    if where.tests and where.table and where == Where(tests=where.tests, table=where.table):
+    if where.tests and where.table and where == Localization(tests=where.tests, table=where.table):
         return "ok", "No common drift", _repeat_words(finding)
     if disagreeing(finding):
         sign, word = "open", "Nothing is missing in the fitted runs, but the others do not agree"
@@ -223,7 +223,7 @@ def unseen_lines(finding: Finding) -> list[str]:
     return [f"could not be seen: {u.what}, because {u.because}; what would show it: {ADDS.get(u.adds, u.adds)}" for u in finding.unseen]
 
 
-def where_lines(where: Where) -> list[str]:
+def where_lines(where: Localization) -> list[str]:
     """Where something lives, in words."""
     axes = () if len(where.axes) == len(AXES) else where.axes  # all three: it tells nothing
     out = [

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.unseen import LATE_S
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS
@@ -57,7 +57,7 @@ def next_plan(
     *,
     name: tuple[str, str],
     max_feed_mm_min: float,
-    about: Where | None = None,
+    about: Localization | None = None,
 ) -> NextPlan:
     """Recipes for what a discovery wants to have added (``next_test.adds``).
 
@@ -84,7 +84,7 @@ def next_plan(
 
 
 def _tests(
-    add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: Where | None
+    add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: Localization | None
 ) -> tuple[TestPlan, ...] | str:
     """The tests of one addition, or what a person reads who has to see to it."""
     make = MAKERS.get(add)
@@ -123,12 +123,12 @@ def _within(
     return f"{add} ({why})"
 
 
-def _is_helix(runs: list[dict[str, Any]], about: Where) -> bool:
+def _is_helix(runs: list[dict[str, Any]], about: Localization) -> bool:
     """Whether the run that is to be measured again is a helix."""
     return "ballbar_helix" in [r["test"] for r in runs if r.get("run_id") in about.runs]
 
 
-def _showing(runs: list[dict[str, Any]], about: Where) -> list[dict[str, Any]]:
+def _showing(runs: list[dict[str, Any]], about: Localization) -> list[dict[str, Any]]:
     """Runs, first those that are to be measured again."""
     return sorted(runs, key=lambda run: run.get("run_id") not in about.runs)
 

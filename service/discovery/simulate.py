@@ -11,7 +11,7 @@ from abbe.models.arrays import F1
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import CaseRun, Role
 from abbe.models.discovery.prediction import left_together, predictions, solve
-from abbe.models.discovery.whitened_problem import scene_of
+from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discover import DiscoveryJob
 from abbe.service.discovery.finding import noise_mm_of, rms
 from abbe.service.domain.finding import Finding, GapUm, RunFit, RunSeries
@@ -39,12 +39,12 @@ class Simulation:
 
 def simulate(job: DiscoveryJob) -> Simulation:
     """Fit the present model to the identify runs and predict every run of the campaign."""
-    scene = scene_of(job.case, baseline_of(job.case))
-    predicted = predictions(scene, solve(scene, ()))
-    seen = {r.path.setup for r in scene.runs}
+    problem = whiten(job.case, baseline_of(job.case))
+    predicted = predictions(problem, solve(problem, ()))
+    seen = {r.path.setup for r in problem.runs}
     left = left_together([r for r in job.case.runs if r.deviation_mm is not None], predicted, seen)
     total = {label: p + job.known_mm[label] + job.table_mm.get(label, 0.0) for label, p in predicted.items()}
-    return Simulation(total, left, {kind: c.sd_mm for kind, c in scene.colours.items()})
+    return Simulation(total, left, {kind: c.sd_mm for kind, c in problem.colours.items()})
 
 
 def simulated_finding(job: DiscoveryJob, simulation: Simulation) -> Finding:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from abbe.models.discovery.answer import Agreement, Fitted, NextTest, Unjudged, Unseen, Verdict, Where
+from abbe.models.discovery.answer import Agreement, Fitted, Localization, NextTest, Unjudged, Unseen, Verdict
 from abbe.service.domain.discovery_file import FoundThinning
 from abbe.service.domain.packed_arrays import PackedCovariance, PackedReadings
 
@@ -88,7 +88,7 @@ class EffectSize:
     remedy: str
     remedy_text: str = ""
     source: str = ""
-    where: Where = field(default_factory=Where)
+    where: Localization = field(default_factory=Localization)
 
     @property
     def words(self) -> str:
@@ -208,7 +208,7 @@ class Finding:
     suspects: tuple[EffectFound, ...] = ()
     proved: bool = False
     proof: str = ""
-    where: Where = field(default_factory=Where)
+    where: Localization = field(default_factory=Localization)
     next_test: NextTest | None = None
     rejected: tuple[tuple[str, str], ...] = ()
     confounded_with: tuple[str, ...] = ()

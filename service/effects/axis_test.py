@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.answer import Discovery, Gap, NamedEffect, NextTest, Significance, Where
+from abbe.models.discovery.answer import Discovery, Gap, Localization, NamedEffect, NextTest, Significance
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.repeats import RepeatDrift, repeat_drift
 from abbe.models.effects.effect import Effect, Values
@@ -68,7 +68,7 @@ def drift_found(case: Case) -> Discovery | None:
     before = {r.path.label: _left(r, place, reading, None) for r in judged}
     after = {r.path.label: _left(r, place, reading - drift.drift_mm, span) for r in judged} if drift.named else before
     axis = AXES[int(np.argmax(np.abs(case.runs[0].path.look[0])))]
-    where = Where(tests=("laser_linear",), axes=(axis,), depends_on=("time",))
+    where = Localization(tests=("laser_linear",), axes=(axis,), depends_on=("time",))
     table = (Significance("time", f"drift alike at all positions explains {drift.share:.0%} of the repeat variance", drift.share, drift.p),)
     predicted = {
         r.path.label: _predicted(r, place, reading - drift.drift_mm * drift.named, span if drift.named else None) for r in case.runs
@@ -76,7 +76,7 @@ def drift_found(case: Case) -> Discovery | None:
     return Discovery(
         verdict="named" if drift.named else "none",
         effects=(_named(drift, axis, where),) if drift.named else (),
-        where=Where(tests=("laser_linear",), axes=(axis,) if drift.named else (), table=table),
+        where=Localization(tests=("laser_linear",), axes=(axis,) if drift.named else (), table=table),
         next_test=_next(axis) if drift.named else None,
         gaps={role: _gap(role, judged, before, after, drift) for role in sorted({r.role for r in judged})},
         residual_before_mm=before,
@@ -106,7 +106,7 @@ def _fitted(case: Case) -> tuple[F1, F1, F1]:
     return place, t, reading
 
 
-def _named(drift: RepeatDrift, axis: str, where: Where) -> NamedEffect:
+def _named(drift: RepeatDrift, axis: str, where: Localization) -> NamedEffect:
     tau = {} if drift.tau_s is None else {"tau_s": (drift.tau_s, drift.tau_s)}  # from a coarse list: known to a factor
     evidence = -0.5 * np.log(max(1.0 - drift.share, 1e-12)) * drift.drift_mm.size
     rivals = tuple((label, 0.0) for label in (f"spindle_thermal_drift:{axis}", "dead_path", f"axis_thermal_growth:{axis}"))

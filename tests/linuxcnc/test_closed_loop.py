@@ -29,7 +29,7 @@ from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, str
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.models.solvers.observe import perpendicular
-from abbe.models.volumetric import field_figures
+from abbe.models.volumetric import field_statistics
 from tests.linuxcnc.instance import Instance
 from tests.linuxcnc.test_control import OWNER, controller, push, until
 from tests.linuxcnc.test_files import settled
@@ -136,7 +136,7 @@ def best_rms(truth: Truth, solution: JointSolution, points: np.ndarray) -> float
     known = -truth.deviation(nodes).reshape(*COUNTS, 3)
     table = GridTable(shape.position_mm, np.rint(known / LSB_MM) * LSB_MM, shape.u_mm, shape.compensated, shape.reference)
     added = table.correction_at(points)
-    return field_figures(points, truth.deviation(points + added) + added).rms_mm
+    return field_statistics(points, truth.deviation(points + added) + added).rms_mm
 
 
 class Screws(Truth):
@@ -198,11 +198,11 @@ async def volumetric(machine: Instance) -> dict[str, float]:
         measured = time.monotonic()
         solution = await asyncio.to_thread(solve_joint, MACHINE, runs, order=9, sigma_mm=SIGMA, floor_mm=FLOOR)
         solved = time.monotonic()
-        before = field_figures(points, truth.deviation(points)).rms_mm
+        before = field_statistics(points, truth.deviation(points)).rms_mm
         assert np.abs(await behind.deviation(points[:5]) - truth.deviation(points[:5])).max() < 1e-9  # nothing is corrected yet
         await push(cnc, image_of(quantise_grid(grid_table(solution, COUNTS), LSB_MM)))
         pushed = time.monotonic()
-        after = field_figures(points, await behind.deviation(points)).rms_mm
+        after = field_statistics(points, await behind.deviation(points)).rms_mm
     return {
         "rows_usable": behind.usable,
         "rows_least": behind.least_rows,

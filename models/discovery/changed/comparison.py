@@ -89,11 +89,11 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
         raise ValueError("changes: no runs")
     problem = build(known.machine, known.terms, runs, Priors(), expected_noise(runs, None, None))
     fit = settle(problem, _silent)
-    bench = ChangeContext(known, problem, fit)
-    whole = bench.choose(total(fit.parts))
-    by_half = [bench.choose(total(half)) for half in _halves(fit.parts, problem)]
-    before, after, judged = bench.judged(by_half) if by_half else (None, None, None)
-    return Changed(_changes(bench, whole, by_half), before, after, bench.floor_mm(), judged, bench.hidden(whole))
+    context = ChangeContext(known, problem, fit)
+    whole = context.choose(total(fit.parts))
+    by_half = [context.choose(total(half)) for half in _halves(fit.parts, problem)]
+    before, after, judged = context.judged(by_half) if by_half else (None, None, None)
+    return Changed(_changes(context, whole, by_half), before, after, context.floor_mm(), judged, context.hidden(whole))
 
 
 def _silent(_: str) -> None:
@@ -109,11 +109,11 @@ def _halves(parts: tuple[InformationSums, ...], problem: CampaignProblem) -> lis
     return [parts[odd::2] for odd in (0, 1)]
 
 
-def _changes(bench: ChangeContext, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
+def _changes(context: ChangeContext, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
     """All that were chosen by all runs, the largest evidence first."""
     out = []
     for taken in whole.taken:
-        value, u = bench.size(whole, taken.asked)
+        value, u = context.size(whole, taken.asked)
         halves = sum(taken.asked.name in {t.asked.name for t in half.taken} for half in by_half)
         out.append(Change(taken.asked.name, value, u, taken.gain, taken.rivals, halves))
     return tuple(sorted(out, key=lambda c: -c.evidence))

@@ -63,8 +63,8 @@ def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) ->
     low = linalg.cholesky(inside, lower=True)
     half = linalg.solve_triangular(low, base.T @ np.column_stack([gram, moment]), lower=True)
     own = gram - half[:, :-1].T @ half[:, :-1]
-    told = moment - half[:, :-1].T @ half[:, -1]
-    return [_one(a, own, told) for a in asked]
+    gradient = moment - half[:, :-1].T @ half[:, -1]
+    return [_one(a, own, gradient) for a in asked]
 
 
 def log_evidence(gram: F2, moment: F1, base: F2) -> float:
@@ -94,9 +94,9 @@ LINEAR_SIZES = (3e-6, 10e-6, 30e-6, 100e-6, 300e-6)
 SHAPE_SIZES = (0.1, 0.3, 1.0, 3.0)
 """Sizes of a change of a motion's shape that are tried, in documented sizes of the motion itself (`abbe.models.solvers.priors`)."""
 ENOUGH = 3.0
-"""Evidence (natural logarithm) after its price from which on a change is told: twenty times as likely with it."""
+"""A change is named from this evidence on (natural logarithm, after its price): the readings are twenty times as likely with it."""
 NEAR = 3.0
-"""A rival with so much less evidence or less is one that the runs cannot tell from what is named."""
+"""The runs cannot distinguish a named change from a rival whose evidence is lower by no more than this."""
 MOST = 6
 POINTS = 41
 
@@ -161,12 +161,12 @@ class ChangeContext:
         return self.problem.sizes.root[:, [k for k, t in enumerate(self.known.terms) if t.motion == motion and _is_shape(t)]]
 
     def choose(self, sums: InformationSums) -> Chosen:
-        """Take in what gains most, one after another, until nothing gains enough; what has become needless goes.
+        """Add the candidate with the largest gain until none gains enough; drop those that have become needless.
 
-        That alone would go wrong twice. A shape is so pliant that it may gain more at first than either of two linear changes which explain
+        Greedy selection alone fails twice. A shape is so pliant that it may gain more at first than either of two linear changes which explain
         all together. And of an equal growth of all axes each alone gains nothing, because a laser's wavelength explains it nearly as
-        well. So the linear ones also get the first word, one by one, and all together less what is needless; the choice that makes the
-        readings most likely is taken, none included.
+        well. So selection also starts from each linear candidate and from all of them; the choice that makes the readings most likely
+        wins, the empty one included.
         """
         weight = np.exp(-self.fit.components.eta)
         gram, moment = np.tensordot(weight, sums.gram, 1), weight @ sums.moment

@@ -104,9 +104,11 @@ def propose(
         return None
     useful = [p for p in found if p.gain.max() >= WORTH]
     best = useful[0] if useful else max(found, key=lambda p: float(p.gain.max()))
-    told = best.gain >= min(WORTH, float(best.gain.max()))
-    labels = [r.label for r, t in zip(rivals, told, strict=True) if t]
-    return NextTest((best.offer.adds,), (leader.label, *labels), float(best.sigmas[told].min()), float(best.offer.minutes), best.offer.why)
+    separated = best.gain >= min(WORTH, float(best.gain.max()))
+    labels = [r.label for r, t in zip(rivals, separated, strict=True) if t]
+    return NextTest(
+        (best.offer.adds,), (leader.label, *labels), float(best.sigmas[separated].min()), float(best.offer.minutes), best.offer.why
+    )
 
 
 def prospects(

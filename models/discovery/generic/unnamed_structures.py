@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, ScanResult, bumps, bursts, periods, pitches, step_moments
 from abbe.models.discovery.generic.shapes import SIGNALS, lobe_latitude, place_at
-from abbe.models.discovery.signal_localization import where_of_signal
+from abbe.models.discovery.signal_localization import localize_signal
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
@@ -66,7 +66,7 @@ def generic_rivals(
     return tuple(e for e in _all(starts, paths) if bar or e.name not in ("unnamed_lobes", "unnamed_burst"))
 
 
-def where_of(effect: Effect, key: str, values: Values, case: Case) -> Where:
+def where_of(effect: Effect, key: str, values: Values, case: Case) -> Localization:
     """Where an unnamed structure lives, from its parameters (time, place, period, lobes) and from where its columns are (tests, axes).
 
     Parameters
@@ -75,7 +75,7 @@ def where_of(effect: Effect, key: str, values: Values, case: Case) -> Where:
     """
     paths = tuple(r.path for r in case.of("identify", "holdout"))
     columns = effect.signal(paths, key, values)
-    base = where_of_signal(paths, tuple(np.linalg.norm(c, axis=1) for c in columns))
+    base = localize_signal(paths, tuple(np.linalg.norm(c, axis=1) for c in columns))
     said: dict[str, object] = {"tests": base.tests, "runs": base.runs}
     letters = key[1:] if key[:1] == "E" else key
     said["axes"] = tuple(a for a in AXES if a in letters) or base.axes
@@ -94,7 +94,7 @@ def where_of(effect: Effect, key: str, values: Values, case: Case) -> Where:
     elif kind == "bump":
         x, y, z = place_at(paths, values["at_s"])
         said |= {"position_mm": (float(x), float(y), float(z)), "radius_mm": 2.0 * values["width_mm"]}
-    return Where(**said, depends_on=DEPENDS[kind])  # type: ignore[arg-type]
+    return Localization(**said, depends_on=DEPENDS[kind])  # type: ignore[arg-type]
 
 
 DEPENDS: dict[str, tuple[str, ...]] = {

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.noise import Colour
-from abbe.models.discovery.signal_localization import where_of_signal
+from abbe.models.discovery.signal_localization import localize_signal
 from abbe.models.discovery.variance.rough import gated_roughness, loud_windows
 from abbe.models.discovery.variance.spectrum import fast, line_of_axis
 from abbe.models.effects.path import Path
@@ -133,7 +133,7 @@ class VarianceFinding:
     u_strength: float
     parameters: Mapping[str, float]
     evidence: float
-    where: Where
+    where: Localization
 
     @property
     def label(self) -> str:
@@ -229,8 +229,8 @@ def _vibration(
     if line is None:
         return []
     evidence = float(line.gain - np.log(line.tried * 3.0) - NAME_PRICE)
-    where = where_of_signal(paths, tuple(np.abs(p.look[:, axis]) for p in paths))
-    where = Where(where.tests, (AXES[axis],), where.directions, where.runs, period_s=1.0 / line.frequency_hz, depends_on=("time",))
+    where = localize_signal(paths, tuple(np.abs(p.look[:, axis]) for p in paths))
+    where = Localization(where.tests, (AXES[axis],), where.directions, where.runs, period_s=1.0 / line.frequency_hz, depends_on=("time",))
     size, u, v = line.amplitude_mm * UM, line.u_mm * UM, _creep(axis, paths)
     if v is not None and line.p_harmonics < SAW_P:
         # at one creeping speed a saw-tooth in position is one in time; how much of it that speed leaves is not known
@@ -256,8 +256,8 @@ def _stick_slip(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[f
     out = []
     for axis, rough in gated_roughness(paths, rest, sigma_mm).items():
         evidence = rough.gain - np.log(rough.tried * 3.0) - NAME_PRICE
-        where = where_of_signal(paths, rough.weight)
-        where = Where(where.tests, (AXES[axis],), where.directions, where.runs, depends_on=("speed", "reversal"))
+        where = localize_signal(paths, rough.weight)
+        where = Localization(where.tests, (AXES[axis],), where.directions, where.runs, depends_on=("speed", "reversal"))
         size, u = rough.size_mm * UM, rough.u_mm * UM
         out.append(VarianceFinding("stick_slip", AXES[axis], size, u, {"v_c": rough.v_c}, float(evidence), where))
     return out
@@ -268,7 +268,7 @@ def _burst(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float,
     if loud is None:
         return []
     gain, tried, k, t0, width, excess = loud
-    where = Where(
+    where = Localization(
         tests=(paths[k].test,), runs=(paths[k].label,), time_s=(t0 - width, t0 + width), depends_on=("time",)
     )  # fmt: skip
     size = float(np.sqrt(2.0 * max(excess, 0.0))) * sigma_mm[k] * UM
@@ -283,7 +283,7 @@ def _outliers(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[flo
     off = np.abs(stacked) > max(OFF, 0.5 * found.size)
     size, u = found.size * sigma * UM, found.u_size * sigma * UM
     weight = tuple(np.asarray(part, dtype=np.float64) for part in np.split(off, np.cumsum([p.n for p in paths])[:-1]))
-    where = Where(tests=tuple(dict.fromkeys(p.test for p in paths)), runs=where_of_signal(paths, weight).runs)
+    where = Localization(tests=tuple(dict.fromkeys(p.test for p in paths)), runs=localize_signal(paths, weight).runs)
     evidence, (bound, (x, y, z)) = float(found.gain - NAME_PRICE), bound_to_places(np.concatenate([p.at.q_mm for p in paths]), stacked, off)
     if bound > PLACE_Z:
         place = replace(where, position_mm=(float(x), float(y), float(z)), radius_mm=NEAR_MM, depends_on=("position",))

@@ -288,7 +288,7 @@ class KwonCalibration:
     @property
     def statement(self) -> str:
         """What the figures rest on, in one sentence."""
-        return "; ".join([*self._seen(), *self._doubts(), "every stated uncertainty is conditional on the prior"])
+        return "; ".join([*self._seen(), *self._warnings(), "every stated uncertainty is conditional on the prior"])
 
     def _seen(self) -> list[str]:
         n, seen = len(PARAMETERS), self.identifiability
@@ -299,23 +299,23 @@ class KwonCalibration:
         hidden = ", ".join(_combination(h) for h in seen.hidden)
         return [*parts, f"combinations that leave no trace and rest on the prior alone: {hidden}"] if hidden else parts
 
-    def _doubts(self) -> list[str]:
+    def _warnings(self) -> list[str]:
         test, factor = self.prior_test, self.estimate.variance_factor
-        doubts = []
+        warnings = []
         if test.conflict:
-            doubts.append(
+            warnings.append(
                 f"the points CONTRADICT the prior (chi2 {test.chi2:.4g} in {test.dof} carried directions, p = {test.p:.2g}): "
                 "the machine deviates more than the prior allows"
             )
         if self.prior_factor > 1.0:
-            doubts.append(f"all prior standard deviations were widened by {self.prior_factor:.3g}, as the carried directions demand")
+            warnings.append(f"all prior standard deviations were widened by {self.prior_factor:.3g}, as the carried directions demand")
         if factor > 1.0:
-            doubts.append(f"the points scatter {np.sqrt(factor):.3g} times as much as stated and were weighed so")
+            warnings.append(f"the points scatter {np.sqrt(factor):.3g} times as much as stated and were weighed so")
         if self.outlying:
             rows = ", ".join(str(i) for i in self.outlying[:SHOWN])
             more = f" and {len(self.outlying) - SHOWN} more" if len(self.outlying) > SHOWN else ""
-            doubts.append(f"outlying point rows, not left out: {rows}{more}")
-        return doubts
+            warnings.append(f"outlying point rows, not left out: {rows}{more}")
+        return warnings
 
     def predict_mm(self, lambda_mm: F2) -> F2:
         """Where the ball centre is for commands, CMM coordinates, shape (n, 3)."""
@@ -441,7 +441,7 @@ def _result(
 
 def _combination(hidden: Combination) -> str:
     """All parameters that a hidden combination moves together."""
-    return " with ".join(hidden.told)
+    return " with ".join(hidden.members)
 
 
 def _largest(errors_mm: F2) -> float:

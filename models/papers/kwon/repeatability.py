@@ -36,7 +36,7 @@ class Repeatability:
 
 
 @dataclass(frozen=True, slots=True)
-class ResidualFigures:
+class ResidualStatistics:
     """Residuals of one component beside the repeatability.
 
     Attributes
@@ -76,7 +76,7 @@ def repeatability(readings_mm: F3) -> Repeatability:
     return Repeatability(sd, COVERAGE * sd.max(axis=0), np.sqrt(variance.mean(axis=0)), r.shape[1] * (r.shape[0] - 1))
 
 
-def residual_figures(residual_mm: F1, df_res: int, repeat_sd_mm: float, repeat_dof: int) -> ResidualFigures:
+def residual_statistics(residual_mm: F1, df_res: int, repeat_sd_mm: float, repeat_dof: int) -> ResidualStatistics:
     """Whether the residuals of a surface are more than repeatability (test of lack of fit for single readings).
 
     Parameters
@@ -99,4 +99,6 @@ def residual_figures(residual_mm: F1, df_res: int, repeat_sd_mm: float, repeat_d
         raise ValueError(f"residual figures: expected finite residuals of shape (n,), got shape {residual.shape} or a value not finite")
     variance = float((residual**2).sum()) / df_res
     ratio = variance / repeat_sd_mm**2
-    return ResidualFigures(float(np.sqrt(variance)), float(np.abs(residual).max()), ratio, float(special.fdtrc(df_res, repeat_dof, ratio)))
+    return ResidualStatistics(
+        float(np.sqrt(variance)), float(np.abs(residual).max()), ratio, float(special.fdtrc(df_res, repeat_dof, ratio))
+    )

@@ -23,7 +23,7 @@ from abbe.models.solvers.observability.parameters import Play, play
 from abbe.models.solvers.observability.rank import (
     CampaignColumns,
     Knowledge,
-    SeenInformation,
+    ObservedInformation,
     campaign_columns,
     stated_knowledge,
     with_knowledge,
@@ -106,7 +106,7 @@ def _stepped(run: RunData) -> list[tuple[str, str]]:
     return [("".join("p" if s == signs[0] else "n" for s in signs), "".join(AXES[a] for a in first))]
 
 
-def place_words(axis: int, place_mm: F1) -> str:
+def place_text(axis: int, place_mm: F1) -> str:
     """Where a line along an axis stands: "Y = 40 mm, Z = 30 mm"."""
     return ", ".join(f"{AXES[k]} = {place_mm[k]:.0f} mm" for k in range(3) if k != axis)
 
@@ -195,10 +195,10 @@ def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
         if not places:
             cause, cure = f"nothing here measures {a} alone against a known length", f"a laser line along {a}"
         else:
-            where = "; ".join(place_words(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
+            where = "; ".join(place_text(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
             count = "one line" if len(places) == 1 else f"{len(places)} lines"
             cause = f"{a} alone was measured along {count} only ({where})"
-            cure = f"another laser line along {a} at {place_words(k, corner)}"
+            cure = f"another laser line along {a} at {place_text(k, corner)}"
         out.append(Addition(f"line {a}", cause, cure, (_line(machine, k, corner, order),)))
     return out
 
@@ -339,16 +339,16 @@ class CureTrial:
 
     def shows(self, combinations: F2) -> int:
         """How many of some hidden combinations, columns (k, m) of orthonormal coordinates, it makes visible."""
-        return count_seen(self.seen @ combinations)
+        return count_observed(self.seen @ combinations)
 
 
-def count_seen(seen: F2) -> int:
+def count_observed(seen: F2) -> int:
     """How many hidden combinations a design, shape (rows, k), shows; what was hidden shows less than 1e-9 there (unit columns)."""
     s = singular_values(seen) if seen.size else np.zeros(0)
     return int((s > SHOWN).sum())
 
 
-def trials(campaign: CampaignLayout, seen: SeenInformation) -> list[CureTrial]:
+def trials(campaign: CampaignLayout, seen: ObservedInformation) -> list[CureTrial]:
     """Try every usual addition on what is hidden; none if nothing is hidden."""
     if not seen.null_space.shape[1]:
         return []
@@ -363,7 +363,7 @@ def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, i
     out: list[tuple[Addition, int]] = []
     stack, left, shown = np.zeros((0, hidden)), list(found), 0
     while left and shown < hidden:
-        counts = [count_seen(np.concatenate([stack, t.seen])) for t in left]
+        counts = [count_observed(np.concatenate([stack, t.seen])) for t in left]
         best = int(np.argmax(counts))
         if counts[best] <= shown:
             break

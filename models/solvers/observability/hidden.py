@@ -15,7 +15,7 @@ from abbe.models.machine import AXES, Machine
 from abbe.models.solvers.identifiability import RANK_TOLERANCE, sparse_rows
 from abbe.models.solvers.least_squares import singular_values, svd
 from abbe.models.solvers.observability.cures import Addition, CampaignLayout, CureTrial, best_sequence, trials
-from abbe.models.solvers.observability.rank import SeenInformation
+from abbe.models.solvers.observability.rank import ObservedInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
 from abbe.models.solvers.observe import with_tool
 
@@ -44,7 +44,7 @@ class Family:
     exact: bool
 
 
-def motion_words(motion: str) -> str:
+def motion_text(motion: str) -> str:
     """An error motion in words with its ISO name: ``EAX`` is "the roll of X (EAX)"."""
     if motion in _PAIRS:
         return f"the squareness of {_PAIRS[motion]} ({motion})"
@@ -57,9 +57,9 @@ def motion_words(motion: str) -> str:
     return f"the {turn} of {axis} ({motion})" if turn else f"the tilt of {axis} about {AXES['ABC'.index(what)]} ({motion})"
 
 
-def part_words(motion: str, orders: Iterable[int]) -> str:
+def part_text(motion: str, orders: Iterable[int]) -> str:
     """Which part of a motion: its slope (order 1, for positioning the scale), its shape (order 2 and more), or all of it."""
-    found, whole = sorted(set(orders)), motion_words(motion)
+    found, whole = sorted(set(orders)), motion_text(motion)
     if found == [0] or not found:
         return whole
     if found == [1]:
@@ -72,7 +72,7 @@ def part_words(motion: str, orders: Iterable[int]) -> str:
 
 def sentence(terms: tuple[Term, ...], family: Family, ending: str = "") -> str:
     """What cannot be told apart, and how much of one looks like how much of the other where that is one number."""
-    parts = [part_words(m, _orders(terms, family, m)) for m in family.motions]
+    parts = [part_text(m, _orders(terms, family, m)) for m in family.motions]
     if len(parts) == 1:
         return f"{_upper(parts[0])} leaves no trace{ending}"
     if not family.exact and len(parts) > LISTED:
@@ -272,7 +272,7 @@ class HiddenDirection:
     reachable: int
 
 
-def picture(campaign: CampaignLayout, seen: SeenInformation, prior_sd: F1) -> HiddenDirection:
+def picture(campaign: CampaignLayout, seen: ObservedInformation, prior_sd: F1) -> HiddenDirection:
     """Everything about the null space; ``prior_sd``: typical size of every coefficient, shape (p,)."""
     terms = campaign.terms
     field = _fields(campaign, seen.factor)
@@ -340,7 +340,7 @@ def _typical(family: Family, prior_sd: F1) -> F2:
 
 
 def _group(
-    terms: tuple[Term, ...], family: Family, seen: SeenInformation, tried: list[CureTrial], effect_mm: float, prior_sd: F1
+    terms: tuple[Term, ...], family: Family, seen: ObservedInformation, tried: list[CureTrial], effect_mm: float, prior_sd: F1
 ) -> HiddenGroup:
     count = family.vectors.shape[1]
     coordinates = linalg.qr(seen.null_space.T @ (family.vectors / seen.factor[:, None]), mode="economic", check_finite=False)[0]
@@ -354,16 +354,16 @@ def _group(
     )
     ending = full[0].ending if full else ""
     partly = max(shown, key=lambda item: item[1], default=None)
-    return replace(group, text=" ".join((sentence(terms, family, ending) + ".", _effect_words(group), _cure_words(group, partly))))
+    return replace(group, text=" ".join((sentence(terms, family, ending) + ".", _effect_text(group), _cure_text(group, partly))))
 
 
-def _effect_words(group: HiddenGroup) -> str:
+def _effect_text(group: HiddenGroup) -> str:
     if group.harmless:
         return "With the tools in use it moves nothing, with another tool it does."
     return f"It may hide {group.effect_mm * 1e3:.2g} µm somewhere in the inner 80 % of the volume."
 
 
-def _cure_words(group: HiddenGroup, partly: tuple[Addition, int] | None) -> str:
+def _cure_text(group: HiddenGroup, partly: tuple[Addition, int] | None) -> str:
     if group.cures:
         return f"Why: {group.cause}. It would be seen with {' or '.join(group.cures)}."
     if partly is None or not partly[1]:

@@ -16,7 +16,7 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.identifiability import HIDDEN, RANK_TOLERANCE, taking_part
 from abbe.models.solvers.least_squares import svd
-from abbe.models.solvers.observability.rank import CampaignColumns, Knowledge, SeenInformation, with_knowledge
+from abbe.models.solvers.observability.rank import CampaignColumns, Knowledge, ObservedInformation, with_knowledge
 
 NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""
@@ -45,8 +45,8 @@ class Play:
     size: F2
 
 
-def play(columns: CampaignColumns, known: Knowledge, seen: SeenInformation) -> Play:
-    """Null space of machine and free unknowns together, from that of the machine alone (`what_is_seen`)."""
+def play(columns: CampaignColumns, known: Knowledge, seen: ObservedInformation) -> Play:
+    """Null space of machine and free unknowns together, from that of the machine alone (`observed_information`)."""
     machine, free, groups = with_knowledge(columns, known)
     unit, factor = unit_columns(free)
     u, s, vt = svd(unit, full_matrices=True)
@@ -57,7 +57,7 @@ def play(columns: CampaignColumns, known: Knowledge, seen: SeenInformation) -> P
     return Play(groups, hidden, -answer * factor[:, None], loose * factor[:, None], factor[:, None])
 
 
-def hidden_free(columns: CampaignColumns, known: Knowledge, seen: SeenInformation) -> frozenset[str]:
+def hidden_free(columns: CampaignColumns, known: Knowledge, seen: ObservedInformation) -> frozenset[str]:
     """Free unknowns that take part in what is hidden, by name.
 
     Among them lost motion of axes that never reverse, like the pole axis of one helix. What is known (`Knowledge.held`) is not free.

@@ -110,7 +110,7 @@ class CampaignColumns:
 
 
 @dataclass(frozen=True)
-class SeenInformation:
+class ObservedInformation:
     """What the readings show of the machine.
 
     Attributes
@@ -191,7 +191,7 @@ def with_knowledge(columns: CampaignColumns, known: Knowledge) -> tuple[F2, F2, 
     return machine, np.concatenate([columns.setup[:, :0], *free], axis=1), tuple(groups)
 
 
-def what_is_seen(columns: CampaignColumns, known: Knowledge) -> SeenInformation:
+def observed_information(columns: CampaignColumns, known: Knowledge) -> ObservedInformation:
     """Rank and null space of the machine's coefficients, whatever the free set-up unknowns and the lost motion are.
 
     Raises
@@ -210,7 +210,7 @@ def what_is_seen(columns: CampaignColumns, known: Knowledge) -> SeenInformation:
     rank = int((s > RANK_TOLERANCE * top).sum())
     condition = top / float(s[rank - 1]) if rank else float("inf")
     effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
-    return SeenInformation(rank, effective, condition, factor, np.asarray(s), vt[:rank].T, vt[rank:].T)
+    return ObservedInformation(rank, effective, condition, factor, np.asarray(s), vt[:rank].T, vt[rank:].T)
 
 
 def _without_rounding(a: F2) -> F2:

@@ -19,7 +19,7 @@ from abbe.models.discovery.candidates import SEEN, UNNAMED
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
 from abbe.models.discovery.selection import Contest
-from abbe.models.discovery.whitened_problem import scene_of
+from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.finding import finding_of
@@ -51,16 +51,16 @@ def candidates_of(case: Case, *, unnamed: bool = True) -> Candidates:
 
     ``unnamed``: also structures without a name, placed where the gap stands out. Without them nobody can say "unknown".
     """
-    scene = scene_of(case, baseline_of(case))
-    contest = Contest.of(scene, CATALOGUE)
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
     if unnamed:
-        contest.look_for_unnamed(np.zeros((0, scene.gap.size)))
+        contest.look_for_unnamed(np.zeros((0, problem.gap.size)))
     labels: list[str] = []
     sizes: list[int] = []
     parts = []
     while contest.banks:  # one after the other is let go: memory is compared too
         bank = contest.banks.pop(0)
-        left = np.concatenate([scene.space.left(part.T.astype(np.float64)) for part in bank.parts], axis=1)
+        left = np.concatenate([problem.projection.left(part.T.astype(np.float64)) for part in bank.parts], axis=1)
         length = np.linalg.norm(left, axis=0)
         seen = length**2 > SEEN * bank.own
         for pick, first, size in zip(bank.picks, bank.first, bank.size, strict=True):
@@ -68,8 +68,8 @@ def candidates_of(case: Case, *, unnamed: bool = True) -> Candidates:
             sizes.append(int(seen[first : first + size].sum()))
         parts.append(left[:, seen] / length[seen])
         del bank, left
-    y = np.array(scene.space.residual)
-    del scene, contest
+    y = np.array(problem.projection.residual)
+    del problem, contest
     return grouped(y, np.concatenate(parts, axis=1), labels, sizes)
 
 

@@ -20,7 +20,7 @@ from functools import partial
 
 import numpy as np
 
-from abbe.models.compensation.distances import DistanceFigures, Pairs, figures, inner_box_mm, predict_distances, random_pairs
+from abbe.models.compensation.distances import DistanceStatistics, Pairs, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import grid_table, quantise_grid
 from abbe.models.compensation.tables import nine_tables, quantise
 from abbe.models.planning.instruments import Instruments
@@ -46,9 +46,9 @@ class Row:
     seed: int
     chain: str
     order: int
-    before: DistanceFigures
-    nine: DistanceFigures
-    grid: DistanceFigures
+    before: DistanceStatistics
+    nine: DistanceStatistics
+    grid: DistanceStatistics
     solution_mm: float
     table_mm: float
     predicted_mm: float

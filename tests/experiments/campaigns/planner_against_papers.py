@@ -31,7 +31,7 @@ TRAVEL_MM = np.array([812.8, 495.0, 508.0])
 OFFSETS_MM = ((0.0, 0.0), (-200.0, -75.0), (-200.0, 75.0), (200.0, -75.0), (200.0, 75.0))
 """Yang's origins across the hemisphere's axis, on his machine (math.md 4.3: the centre and four about it), scaled to other strokes."""
 RADII_MM = (175.0, 100.0)
-TOOLS = Instruments(inputs=StatedInputs().of_the_data_alone())
+TOOLS = Instruments(inputs=StatedInputs().without_stated_inputs())
 CAMPAIGNS = ("one helix", "5 origins x 2 radii", "4 step diagonals", "both")
 
 

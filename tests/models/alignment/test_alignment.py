@@ -170,7 +170,7 @@ def test_lag_of_a_signal_behind_the_position_stream_within_its_uncertainty():
         t = np.sort(rng.uniform(1.0, 19.0, 400))
         drift = 0.001 * np.cumsum(rng.normal(size=t.size))
         fit = fit_lag(t, np.interp(t - lag, stream_s, x_mm) + 0.05 * rng.normal(size=t.size) + 5.0 + drift, stream_s, x_mm)
-        assert fit.told
+        assert fit.determined
         z.append((fit.lag_s - lag) / fit.u_s)
     assert 0.89 <= np.mean(np.abs(z) <= 2.0) <= 0.99
 
@@ -195,8 +195,8 @@ def test_lag_of_a_bar_from_both_ways_round_within_its_uncertainty():
 
 def test_where_nothing_moves_there_is_no_lag_to_tell():
     t = np.linspace(0.0, 10.0, 100)
-    assert not fit_lag(t, np.zeros(100), t, np.zeros(100)).told
-    assert not lag_between_ways(np.arange(0.0, 20.0, 0.01), np.zeros(2000), np.zeros(2000)).told
+    assert not fit_lag(t, np.zeros(100), t, np.zeros(100)).determined
+    assert not lag_between_ways(np.arange(0.0, 20.0, 0.01), np.zeros(2000), np.zeros(2000)).determined
 
 
 def test_positions_at_sample_times_come_from_the_stream_or_the_path_and_are_unknown_outside():

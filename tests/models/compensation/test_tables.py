@@ -7,7 +7,7 @@ import abbe.models.compensation.additive as additive
 from abbe.models.compensation.tables import nine_tables
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.volumetric import field_figures, volume_grid
+from abbe.models.volumetric import field_statistics, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
 
@@ -34,8 +34,8 @@ def figures():
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(additive, "DIAGONAL_WEIGHT", weight)
                 tables = nine_tables(solution, (25, 21, 19))
-            before = field_figures(grid, truth.deviation(grid)).rms_mm
-            after = field_figures(grid, truth.deviation(grid) + tables.correction_at(grid)).rms_mm
+            before = field_statistics(grid, truth.deviation(grid)).rms_mm
+            after = field_statistics(grid, truth.deviation(grid) + tables.correction_at(grid)).rms_mm
             row.append((largest_range_mm(truth.deviation, tables) / largest_range_mm(truth.deviation), after / before))
         out.append(row)
     return np.array(out)

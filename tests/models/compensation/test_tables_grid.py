@@ -183,7 +183,7 @@ def test_stated_inputs_are_in_the_uncertainties_of_tables_and_can_be_given(solve
 
 def test_uncertainties_of_the_nodes_are_those_of_the_field_without_rigid_motion(solved):
     _, s = solved
-    table = grid_table(s, (4, 4, 4), sources=error_sources(s, StatedInputs().of_the_data_alone()))
+    table = grid_table(s, (4, 4, 4), sources=error_sources(s, StatedInputs().without_stated_inputs()))
     p = nodes_mm(table.position_mm)
     root = np.linalg.cholesky(s.term_covariance + 1e-30 * np.eye(len(s.terms)))
     drawn = design(MACHINE, s.terms, p) @ root @ np.random.default_rng(1).standard_normal((len(s.terms), 2000))

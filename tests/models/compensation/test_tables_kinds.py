@@ -87,7 +87,7 @@ def test_parameters_and_their_tables_correct_the_same_distances_as_the_nine(solv
 def test_squareness_parameters_carry_the_uncertainty_of_the_very_slopes_they_are(solved):
     """Slopes of the tables, for draws of the machine from its covariance: their scatter is u, and they are not the mean over the volume."""
     _, s = solved
-    data = error_sources(s, StatedInputs().of_the_data_alone())
+    data = error_sources(s, StatedInputs().without_stated_inputs())
     counts = (9, 8, 7)
     found = squareness_tables(s, counts, sources=data).parameters
     root = np.linalg.cholesky(s.term_covariance + 1e-32 * np.eye(len(s.terms)))

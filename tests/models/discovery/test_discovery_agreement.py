@@ -18,7 +18,7 @@ from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.prediction import SolvedModel, predictions, solve
-from abbe.models.discovery.whitened_problem import WhitenedProblem, scene_of
+from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten
 from abbe.service.discovery.never_fitted import ALARM
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import write_case
@@ -35,9 +35,9 @@ def solved(folder: Path, number: int) -> tuple[WhitenedProblem, SolvedModel, dic
     name = f"null{number:04d}"
     write_case(make_case(name, FIRST_SEED + number, "null"), folder)
     case = read_case(folder, name)
-    scene = scene_of(case, baseline_of(case))
-    solution = solve(scene, ())
-    return scene, solution, predictions(scene, solution)
+    problem = whiten(case, baseline_of(case))
+    solution = solve(problem, ())
+    return problem, solution, predictions(problem, solution)
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(folder: Path, number: int, change: dict[str, np.ndarray] | None = None) -> tuple[Agreement, ...]:
-    scene, solution, predicted = solved(folder, number)
-    return agreements(replace(scene, case=_off(scene.case, change or {})), solution, predicted)[0]
+    problem, solution, predicted = solved(folder, number)
+    return agreements(replace(problem, case=_off(problem.case, change or {})), solution, predicted)[0]
 
 
 def _off(case: Case, change: dict[str, np.ndarray]) -> Case:
@@ -68,33 +68,33 @@ def test_a_smooth_miss_of_half_the_noise_in_one_run_is_seen(folder: Path) -> Non
     """A tenth more rms: the fixed factor that was here before hardly saw it."""
     seen = []
     for k in range(CASES):
-        scene = solved(folder, k)[0]
-        bars = [r.path for r in scene.case.of("holdout") if r.path.kind == "bar"]
+        problem = solved(folder, k)[0]
+        bars = [r.path for r in problem.case.of("holdout") if r.path.kind == "bar"]
         if bars:
             p = bars[0]
-            wave = np.sin(2.0 * np.pi * 3.0 * np.arange(p.n) / p.n) * np.sqrt(2.0) * 0.5 * scene.colours["bar"].sd_mm
+            wave = np.sin(2.0 * np.pi * 3.0 * np.arange(p.n) / p.n) * np.sqrt(2.0) * 0.5 * problem.colours["bar"].sd_mm
             worst = judged(folder, k, {p.label: wave})[0]
             seen.append(worst.p < ALARM and worst.run == p.label)
     assert np.mean(seen) > 0.5
 
 
 def test_a_run_far_off_is_the_worst_one_and_told_by_how_much(folder: Path) -> None:
-    scene = solved(folder, 0)[0]
-    p = scene.case.of("holdout")[-1].path
+    problem = solved(folder, 0)[0]
+    p = problem.case.of("holdout")[-1].path
     rng = np.random.default_rng(1)
-    worst = judged(folder, 0, {p.label: 3.0 * scene.colours[p.kind].sd_mm * rng.normal(size=p.n)})[0]
+    worst = judged(folder, 0, {p.label: 3.0 * problem.colours[p.kind].sd_mm * rng.normal(size=p.n)})[0]
     assert worst.run == p.label
     assert worst.p < 1e-6
     assert worst.times == pytest.approx(np.sqrt(10.0), rel=0.25)
 
 
 def test_an_instrument_that_was_never_fitted_is_left_out(folder: Path) -> None:
-    scene, solution, predicted = solved(folder, 0)
+    problem, solution, predicted = solved(folder, 0)
     alone = replace(
-        scene, case=replace(scene.case, runs=tuple(r for r in scene.case.runs if r.role != "holdout" or r.path.kind == "laser"))
+        problem, case=replace(problem.case, runs=tuple(r for r in problem.case.runs if r.role != "holdout" or r.path.kind == "laser"))
     )
     kinds = {r.path.kind for r in alone.case.of("holdout")}
-    other = {k: c for k, c in scene.colours.items() if k not in kinds}
+    other = {k: c for k, c in problem.colours.items() if k not in kinds}
     assert kinds == {"laser"}
     told, open_ = agreements(alone, solution, predicted)
     assert told != ()
@@ -105,38 +105,38 @@ def test_an_instrument_that_was_never_fitted_is_left_out(folder: Path) -> None:
 
 def test_an_instrument_whose_fitted_readings_all_went_into_the_unknowns_is_not_judged(folder: Path) -> None:
     """One reading is left, its noise is not known; taken for known perfectly, it would let a run disagree with p of nearly 0."""
-    scene, solution, predicted = solved(folder, 0)
-    use = scene.by_run(scene.use.copy())
-    lasers = [k for k, kind in enumerate(scene.kinds) if kind == "laser"]
+    problem, solution, predicted = solved(folder, 0)
+    use = problem.by_run(problem.use.copy())
+    lasers = [k for k, kind in enumerate(problem.kinds) if kind == "laser"]
     for k in lasers:
         use[k][:] = 0.0
     use[lasers[0]][0] = 1.0
-    off = {r.path.label: np.linspace(0.0, 0.05, r.path.n) ** 2 for r in scene.case.of("holdout") if r.path.kind == "laser"}
-    absorbed = replace(scene, use=np.concatenate(use), case=_off(scene.case, off))
+    off = {r.path.label: np.linspace(0.0, 0.05, r.path.n) ** 2 for r in problem.case.of("holdout") if r.path.kind == "laser"}
+    absorbed = replace(problem, use=np.concatenate(use), case=_off(problem.case, off))
     told, open_ = agreements(absorbed, solution, predicted)
     assert off
     assert {u.run for u in open_} == set(off)
     assert {u.why for u in open_} == {NO_NOISE}
-    assert {a.run for a in told} == {r.path.label for r in scene.case.of("holdout")} - set(off)
+    assert {a.run for a in told} == {r.path.label for r in problem.case.of("holdout")} - set(off)
 
 
 def test_a_run_with_too_few_readings_that_count_is_not_judged(folder: Path) -> None:
-    scene, solution, predicted = solved(folder, 0)
-    label = next(r.path.label for r in scene.case.of("holdout") if r.path.kind == "laser")
-    runs = tuple(replace(r, valid=np.arange(r.path.n) < 1) if r.path.label == label else r for r in scene.case.runs)
-    told, open_ = agreements(replace(scene, case=replace(scene.case, runs=runs)), solution, predicted)
+    problem, solution, predicted = solved(folder, 0)
+    label = next(r.path.label for r in problem.case.of("holdout") if r.path.kind == "laser")
+    runs = tuple(replace(r, valid=np.arange(r.path.n) < 1) if r.path.label == label else r for r in problem.case.runs)
+    told, open_ = agreements(replace(problem, case=replace(problem.case, runs=runs)), solution, predicted)
     assert open_ == (Unjudged(label, TOO_FEW),)
-    assert {a.run for a in told} == {r.path.label for r in scene.case.of("holdout")} - {label}  # its zero took the only reading
+    assert {a.run for a in told} == {r.path.label for r in problem.case.of("holdout")} - {label}  # its zero took the only reading
 
 
 def test_what_noise_was_assumed_does_not_matter(folder: Path) -> None:
     """Readings say how large it is, and the prediction's uncertainty goes with that once."""
-    scene, solution, predicted = solved(folder, 0)
-    colours = {kind: replace(c, sd_mm=2.0 * c.sd_mm) for kind, c in scene.colours.items()}
-    space = replace(scene.space, y=0.5 * scene.space.y, moment=0.5 * scene.space.moment)
-    first = agreements(scene, solution, predicted)[0]
+    problem, solution, predicted = solved(folder, 0)
+    colours = {kind: replace(c, sd_mm=2.0 * c.sd_mm) for kind, c in problem.colours.items()}
+    space = replace(problem.projection, y=0.5 * problem.projection.y, moment=0.5 * problem.projection.moment)
+    first = agreements(problem, solution, predicted)[0]
     second = agreements(
-        replace(scene, colours=colours, space=space), replace(solution, theta_covariance=4.0 * solution.theta_covariance), predicted
+        replace(problem, colours=colours, space=space), replace(solution, theta_covariance=4.0 * solution.theta_covariance), predicted
     )[0]
     assert [a.run for a in second] == [a.run for a in first]
     assert [a.p for a in second] == pytest.approx([a.p for a in first], rel=1e-3)
@@ -144,13 +144,13 @@ def test_what_noise_was_assumed_does_not_matter(folder: Path) -> None:
 
 
 def test_a_covariance_that_rounding_made_a_little_negative_is_judged_all_the_same(folder: Path) -> None:
-    scene, solution, predicted = solved(folder, 0)
+    problem, solution, predicted = solved(folder, 0)
     covariance = solution.theta_covariance.copy()
     values, vectors = np.linalg.eigh(covariance)
     covariance -= (values[0] + 1e-16) * np.outer(vectors[:, 0], vectors[:, 0])
-    told = agreements(scene, replace(solution, theta_covariance=covariance), predicted)[0]
+    told = agreements(problem, replace(solution, theta_covariance=covariance), predicted)[0]
     assert np.linalg.eigvalsh(covariance)[0] < -1e-24  # what a factorisation refuses
-    assert [a.p for a in told] == pytest.approx([a.p for a in agreements(scene, solution, predicted)[0]], rel=0.05)
+    assert [a.p for a in told] == pytest.approx([a.p for a in agreements(problem, solution, predicted)[0]], rel=0.05)
 
 
 @pytest.mark.parametrize(("columns", "rank"), [("circle", 3), ("helix", 4), ("whole turns", 1), ("none", 0)])

@@ -9,7 +9,7 @@ import pytest
 
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
-from abbe.models.discovery.whitened_problem import WhitenedProblem, scene_of, taken_out
+from abbe.models.discovery.whitened_problem import WhitenedProblem, taken_out, whiten
 from abbe.models.effects.catalogue import CATALOGUE
 from tests.models.discovery.test_discovery_search import campaign
 
@@ -19,9 +19,9 @@ PICKS = [p for p in starts_of(CATALOGUE) if p.effect.name in NAMES]
 
 
 @pytest.fixture(scope="module")
-def scene() -> WhitenedProblem:
+def problem() -> WhitenedProblem:
     case = campaign(backlash_um=3.0)
-    return scene_of(case, baseline_of(case))
+    return whiten(case, baseline_of(case))
 
 
 def same(a: Bank, b: Bank) -> None:
@@ -33,34 +33,34 @@ def same(a: Bank, b: Bank) -> None:
         assert np.array_equal(x, y)
 
 
-def test_gains_of_a_bank_are_those_of_each_pick_alone(scene: WhitenedProblem) -> None:
-    bank = bank_of(scene, PICKS)
+def test_gains_of_a_bank_are_those_of_each_pick_alone(problem: WhitenedProblem) -> None:
+    bank = bank_of(problem, PICKS)
     assert len(bank.parts) > 1
     assert {p.effect.name for p in bank.picks} == {"backlash", "cyclic_error", "lateral_play"}
-    for rows in (rows_for(scene, []), rows_for(scene, [PICKS[0]])):
-        gains = bank.gains(scene.space.y, rows)
-        alone = np.array([gain_of(scene, p, rows) for p in bank.picks])
+    for rows in (rows_for(problem, []), rows_for(problem, [PICKS[0]])):
+        gains = bank.gains(problem.projection.y, rows)
+        alone = np.array([gain_of(problem, p, rows) for p in bank.picks])
         assert gains == pytest.approx(alone, rel=1e-4, abs=1e-3)
-    assert gain_of(scene, PICKS[0], rows_for(scene, [])) > 100.0
+    assert gain_of(problem, PICKS[0], rows_for(problem, [])) > 100.0
 
 
-def test_what_another_bank_holds_is_not_made_again_and_is_the_same(scene: WhitenedProblem, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = replace(scene, banks=type(scene.banks)())
+def test_what_another_bank_holds_is_not_made_again_and_is_the_same(problem: WhitenedProblem, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = replace(problem, banks=type(problem.banks)())
     mixed = [*PICKS[7:60:3], *PICKS[:5], *(p for p in PICKS if p.effect.name == "dead_path")]
     fresh = bank_of(alone, mixed)
-    held = bank_of(scene, PICKS)
+    held = bank_of(problem, PICKS)
     monkeypatch.setattr(WhitenedProblem, "white", None)  # nothing is whitened a second time
-    found = bank_of(scene, mixed)
+    found = bank_of(problem, mixed)
     assert np.concatenate(found.parts) == pytest.approx(np.concatenate(fresh.parts), rel=1e-5, abs=1e-7)
     assert found.moment == pytest.approx(fresh.moment, rel=1e-9, abs=1e-9)
     assert [p.start for p in found.picks] == [p.start for p in fresh.picks]
     assert found.known == fresh.known
-    same(bank_of(scene, PICKS), held)
+    same(bank_of(problem, PICKS), held)
 
 
-def test_another_scene_starts_without_banks(scene: WhitenedProblem) -> None:
-    bank = bank_of(scene, PICKS[:3])
-    assert bank in scene.banks
-    assert not taken_out(scene).banks
+def test_another_scene_starts_without_banks(problem: WhitenedProblem) -> None:
+    bank = bank_of(problem, PICKS[:3])
+    assert bank in problem.banks
+    assert not taken_out(problem).banks
     del bank
-    assert not any(isinstance(b, Bank) and len(b.known) == 3 for b in scene.banks)  # nobody else keeps it
+    assert not any(isinstance(b, Bank) and len(b.known) == 3 for b in problem.banks)  # nobody else keeps it

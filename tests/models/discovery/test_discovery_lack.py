@@ -10,7 +10,7 @@ import pytest
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.experiment.candidates import offers
 from abbe.models.discovery.lack import floors, repeat_steps
-from abbe.models.discovery.whitened_problem import scene_of
+from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.discovery_words import verdict_of
 from abbe.service.runs.cases import case_of
@@ -71,10 +71,10 @@ def test_a_smooth_axis_with_the_same_repeats_misses_nothing() -> None:
 
 def test_the_noise_is_that_of_repeats_and_not_of_what_the_fit_leaves() -> None:
     case = axis_case(with_repeats(rough))
-    scene = scene_of(case, baseline_of(case))
+    problem = whiten(case, baseline_of(case))
     assert repeat_steps(case, "laser").size == 55  # of ten visits from both sides at three places, and the turning point
-    assert floors(scene)["laser"].sd_mm == pytest.approx(0.3e-3, rel=0.2)
-    assert scene.colours["laser"].sd_mm > 5.0 * floors(scene)["laser"].sd_mm
+    assert floors(problem)["laser"].sd_mm == pytest.approx(0.3e-3, rel=0.2)
+    assert problem.colours["laser"].sd_mm > 5.0 * floors(problem)["laser"].sd_mm
 
 
 def test_lost_motion_that_the_line_shows_is_proved_by_repeats_from_both_sides() -> None:

@@ -16,9 +16,9 @@ from abbe.models.discovery.candidates import rows_for
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
 from abbe.models.discovery.noise import Colour, unscaled
-from abbe.models.discovery.projection import SignalSpace
+from abbe.models.discovery.projection import SignalProjection
 from abbe.models.discovery.selection import Contest, joined, weighed
-from abbe.models.discovery.whitened_problem import scene_of
+from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path, driven, standing
 from abbe.models.machine import Machine
@@ -139,9 +139,9 @@ def test_lost_motion_is_named_with_its_size_and_the_gap_closes_on_runs_never_use
 def test_the_better_of_two_names_stands_once_both_may_bend() -> None:
     """A search that let servo mismatch in where the axis has lost motion gives the name back."""
     case, _ = of_backlash()
-    scene = scene_of(case, baseline_of(case))
-    contest = Contest.of(scene, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(scene, []), [], 12)}
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 12)}
     found, rivals = fairly(contest, weighed(contest, [by["servo_mismatch:X"]]))
     assert [f.pick.label for f in found] == ["backlash:X"]
     assert len(rivals) == 1
@@ -150,9 +150,9 @@ def test_the_better_of_two_names_stands_once_both_may_bend() -> None:
 
 def test_two_axes_that_lead_give_way_to_the_one_that_trails() -> None:
     case = campaign(late_ms=0.2)
-    scene = scene_of(case, baseline_of(case))
-    contest = Contest.of(scene, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(scene, []), [], 40)}
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
     lead = [by["servo_mismatch:X"], by["servo_mismatch:Z"]]
     assert [p.label for p in joined(contest, lead)] == ["servo_mismatch:Y"]
     other = [by["servo_mismatch:Y"], by["backlash:X"]]
@@ -244,7 +244,7 @@ def test_whitened_noise_has_unit_variance_and_no_memory() -> None:
 def test_what_is_left_of_readings_is_orthogonal_to_what_was_taken_out() -> None:
     rng = np.random.default_rng(5)
     columns, more, y = rng.normal(size=(80, 5)), rng.normal(size=(80, 2)), rng.normal(size=80)
-    space = SignalSpace.of(y, columns, columns.T @ columns, np.full(5, 1e6)).without(more, np.full(2, 1e6))
+    space = SignalProjection.of(y, columns, columns.T @ columns, np.full(5, 1e6)).without(more, np.full(2, 1e6))
     every = np.column_stack([columns, more])
     left = y - every @ np.linalg.lstsq(every, y, rcond=None)[0]
     assert space.residual == pytest.approx(left, abs=1e-8)

@@ -18,7 +18,7 @@ from abbe.models.effects.smooth import WITH_CONSTANT, WITH_LINE
 BY_NAME = {e.name: e for e in CATALOGUE}
 
 
-def scene_of(columns: dict[Any, Any]) -> Any:
+def problem_of(columns: dict[Any, Any]) -> Any:
     """A campaign that knows nothing but the columns of each signal."""
     return cast(Any, SimpleNamespace(raw=lambda signal, key, values: columns[signal].copy()))
 
@@ -50,16 +50,16 @@ def test_straightness_is_stated_with_its_line_and_says_how_unsure_that_is() -> N
     effect = BY_NAME["straightness"]
     pick = Pick(effect, "EYX")
     c = np.array([3.0, 0.0, 0.0, 4.0, 0.0])
-    strength, u = strength_of(scene_of({effect.signal: np.eye(8, 5)}), pick, c, np.zeros((5, 5)))
+    strength, u = strength_of(problem_of({effect.signal: np.eye(8, 5)}), pick, c, np.zeros((5, 5)))
     assert strength == pytest.approx(5.0 * WITH_LINE[0])
     assert u == pytest.approx(np.hypot(5.0 * WITH_LINE[1], true_to_form("straightness", "geometry") * strength))
 
 
 def test_uncertainty_of_a_strength_is_that_of_its_coefficient_and_of_its_form() -> None:
     effect = BY_NAME["backlash"]
-    scene = scene_of({effect.signal: np.ones((6, 1))})
+    problem = problem_of({effect.signal: np.ones((6, 1))})
     for sd in (0.0, 0.4):
-        strength, u = strength_of(scene, Pick(effect, "X"), np.array([4.0]), np.array([[sd**2]]))
+        strength, u = strength_of(problem, Pick(effect, "X"), np.array([4.0]), np.array([[sd**2]]))
         assert strength == pytest.approx(4.0)
         assert u == pytest.approx(np.hypot(sd, 4.0 * true_to_form("backlash", "drive")))
 
@@ -69,8 +69,8 @@ def test_only_a_form_that_carries_the_size_changes_the_strength() -> None:
     beside, modulated = (Form(name, lambda paths, key, values: []) for name in ("wind-up", "modulated"))
     columns = {effect.signal: np.ones((6, 1)), beside.signal: np.ones((6, 1)), modulated.signal: np.ones((6, 1))}
     c, cov = np.array([4.0, 1.0]), np.zeros((2, 2))
-    assert strength_of(scene_of(columns), Pick(effect, "X", forms=(beside,)), c, cov)[0] == pytest.approx(4.0)
-    assert strength_of(scene_of(columns), Pick(effect, "X", forms=(modulated,)), c, cov)[0] == pytest.approx(5.0)
+    assert strength_of(problem_of(columns), Pick(effect, "X", forms=(beside,)), c, cov)[0] == pytest.approx(4.0)
+    assert strength_of(problem_of(columns), Pick(effect, "X", forms=(modulated,)), c, cov)[0] == pytest.approx(5.0)
 
 
 def test_a_time_constant_is_less_sure_than_its_fit_and_a_pitch_is_not() -> None:
@@ -92,7 +92,7 @@ def test_what_a_sensor_followed_is_part_of_a_swing_and_what_is_constant_in_it_is
         by["offset and drift"].signal: np.column_stack([ones, t]),
     }
     pick = Pick(effect, "", {"period_s": 5000.0}, forms=(by["sensor"],))
-    strength, u = strength_of(scene_of(columns), pick, np.array([0.1, 0.0, 1.0]), np.zeros((3, 3)))
+    strength, u = strength_of(problem_of(columns), pick, np.array([0.1, 0.0, 1.0]), np.zeros((3, 3)))
     assert strength == pytest.approx(6.1, abs=1e-6)
     assert u > 0.3  # with the constant taken for a part of the swing the strength is another: that much is not known
     assert u < 6.0

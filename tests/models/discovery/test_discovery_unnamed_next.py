@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.experiment.candidates import offers
 from abbe.models.discovery.experiment.unnamed import propose_unnamed
 from abbe.models.discovery.generic.unnamed_structures import generic_rivals
@@ -25,7 +25,7 @@ def one_way() -> tuple[Path, ...]:
 
 
 def structure(label: str, **where: object) -> Structure:
-    return Structure(label, "", 50.0, Where(**where))  # type: ignore[arg-type]
+    return Structure(label, "", 50.0, Localization(**where))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.localization import SIGNIFICANT, locate
-from abbe.models.discovery.signal_localization import where_of_signal
+from abbe.models.discovery.signal_localization import localize_signal
 from tests.models.discovery.discovery_paths import campaign, noise
 
 PATHS = campaign()
@@ -54,7 +54,7 @@ def test_wave_on_the_clock() -> None:
 
 def test_signal_of_lasers_only() -> None:
     signal = tuple(np.ones(p.n) * (p.kind == "laser") for p in PATHS)
-    where = where_of_signal(PATHS, signal)
+    where = localize_signal(PATHS, signal)
     assert where.tests == ("laser_diagonal",)
     assert all(r.startswith("l") for r in where.runs)
 
@@ -62,7 +62,7 @@ def test_signal_of_lasers_only() -> None:
 def test_signal_in_one_place() -> None:
     centre = np.array([500.0, 250.0, 200.0])
     signal = tuple(np.exp(-0.5 * np.sum((p.at.q_mm - centre) ** 2, axis=1) / 20.0**2) for p in PATHS)
-    where = where_of_signal(PATHS, signal)
+    where = localize_signal(PATHS, signal)
     assert where.position_mm is not None
     assert np.linalg.norm(np.subtract(where.position_mm, centre)) < 15.0
     assert where.radius_mm is not None
@@ -70,7 +70,7 @@ def test_signal_in_one_place() -> None:
 
 
 def test_no_signal_lives_nowhere() -> None:
-    where = where_of_signal(PATHS, tuple(np.zeros(p.n) for p in PATHS))
+    where = localize_signal(PATHS, tuple(np.zeros(p.n) for p in PATHS))
     assert where.tests == ()
     assert where.time_s is None
     assert where.position_mm is None

@@ -22,7 +22,7 @@ from abbe.models.papers.kwon.forensics import (
     square_grid,
 )
 from abbe.models.papers.kwon.layout import layout, rank_of
-from abbe.models.papers.kwon.repeatability import repeatability, residual_figures
+from abbe.models.papers.kwon.repeatability import repeatability, residual_statistics
 from abbe.models.papers.kwon.surface import fit_surface
 from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors, term_name
 from abbe.service.papers.kwon_printed import RESTORED, TABLE1
@@ -288,18 +288,18 @@ def test_residuals_beyond_repeatability_are_seen() -> None:
     rng = np.random.default_rng(16)
     points = planes(Z)
     fine = fit_surface(points, 1e-3 * rng.normal(size=81))
-    assert residual_figures(fine.residual, fine.anova.df_res, 1e-3, 200).p > 0.01
+    assert residual_statistics(fine.residual, fine.anova.df_res, 1e-3, 200).p > 0.01
     wavy = fit_surface(points, 1e-3 * rng.normal(size=81) + 3e-3 * np.cos(6 * points[:, 0]))
-    bad = residual_figures(wavy.residual, wavy.anova.df_res, 1e-3, 200)
+    bad = residual_statistics(wavy.residual, wavy.anova.df_res, 1e-3, 200)
     assert bad.p < 1e-6
     assert bad.sd_mm == pytest.approx(wavy.anova.residual_sd)
     assert bad.ratio == pytest.approx((bad.sd_mm / 1e-3) ** 2)
     for wrong in (0.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="repeatability positive"):
-            residual_figures(fine.residual, 71, wrong, 200)
+            residual_statistics(fine.residual, 71, wrong, 200)
     for residual in (np.full(3, np.nan), np.empty(0), np.ones((2, 3))):
         with pytest.raises(ValueError, match="finite residuals"):
-            residual_figures(residual, 71, 1e-3, 200)
+            residual_statistics(residual, 71, 1e-3, 200)
 
 
 def test_bad_input() -> None:

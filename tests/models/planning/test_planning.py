@@ -128,7 +128,7 @@ def test_a_goal_is_reached_with_fewer_minutes_or_said_to_be_out_of_reach():
     assert hopeless.goal.minutes_needed is None
     assert hopeless.goal.limit_mm > 1e-5
     assert "temperature of the machine's scales" in hopeless.goal.limit_by
-    cold = replace(FEW, inputs=StatedInputs().of_the_data_alone())
+    cold = replace(FEW, inputs=StatedInputs().without_stated_inputs())
     perfect = plan_campaign(MACHINE, minutes=5.0, goal_mm=1e-5, tools=cold)
     assert "calibration" in perfect.goal.limit_by
     assert perfect.goal.limit_mm < hopeless.goal.limit_mm
@@ -156,7 +156,7 @@ def test_hemispheres_open_towards_the_spindle(tool, vertical, opens):
     m = replace(MACHINE, tool_mm=np.array(tool, dtype=float))
     towards = opening(m, vertical)
     assert towards.words == opens
-    assert bool(towards.doubt) == (not any(tool))
+    assert bool(towards.warning) == (not any(tool))
     for test in candidates(m, TOOLS, vertical):
         if isinstance(test, HelixTest):
             run = expected_run(m, test, TOOLS, values=40)
@@ -168,9 +168,9 @@ def test_hemispheres_open_towards_the_spindle(tool, vertical, opens):
 
 def test_a_plan_says_when_nobody_knows_where_the_spindle_is(plan):
     bare = replace(MACHINE, tool_mm=np.zeros(3))
-    assert "tool_mm" in plan_campaign(bare, minutes=5.0, tools=FEW).doubts[0]
-    assert plan.doubts == ()
-    assert "oblique" in opening(replace(MACHINE, tool_mm=np.array([80.0, 0.0, -100.0]))).doubt
+    assert "tool_mm" in plan_campaign(bare, minutes=5.0, tools=FEW).warnings[0]
+    assert plan.warnings == ()
+    assert "oblique" in opening(replace(MACHINE, tool_mm=np.array([80.0, 0.0, -100.0]))).warning
 
 
 def test_a_slow_machine_takes_longer():

@@ -19,12 +19,12 @@ from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.observability.rank import (
     Knowledge,
-    SeenInformation,
+    ObservedInformation,
     campaign_columns,
     compressed,
+    observed_information,
     perfect_setup,
     stated_knowledge,
-    what_is_seen,
 )
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import perpendicular, setup_unknowns
@@ -55,11 +55,11 @@ class Experiment:
         stated = replace(stated_knowledge(terms, self.runs, setup.names), shared=self.shared, lost_motion=False)
         return perfect_setup(stated, terms, setup, self.perfect)
 
-    def seen(self, degree: int, extra: dict[str, np.ndarray] | None = None) -> SeenInformation:
+    def seen(self, degree: int, extra: dict[str, np.ndarray] | None = None) -> ObservedInformation:
         terms, setup = smooth_terms(degree), setup_unknowns(self.runs, Priors())
         known = self.knowledge(terms, setup)
         known = replace(known, held={**known.held, **(extra or {})})
-        return what_is_seen(compressed(campaign_columns(self.machine, terms, self.runs, setup)), known)
+        return observed_information(compressed(campaign_columns(self.machine, terms, self.runs, setup)), known)
 
 
 def laser(label: str, path: np.ndarray, beam: np.ndarray | None = None) -> RunData:

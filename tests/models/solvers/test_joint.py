@@ -16,7 +16,7 @@ from abbe.models.solvers.observations import block_average, nominal_reading
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
 from abbe.models.verification import diagonal_figure, helix_figure
-from abbe.models.volumetric import field_figures, remove_rigid, rigid_design, volume_grid
+from abbe.models.volumetric import field_statistics, remove_rigid, rigid_design, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 
@@ -59,8 +59,8 @@ def test_nine_tables_come_close_to_the_best_nine_there_are(solved):
     d = truth.deviation(grid)
     cube = d.reshape(n, n, n, 3)
     main = sum(cube.mean(axis=tuple(b for b in range(3) if b != a), keepdims=True) for a in range(3)) - 2 * cube.mean(axis=(0, 1, 2))
-    best = field_figures(grid, (cube - main).reshape(-1, 3)).rms_mm
-    after = field_figures(grid, d + tables.correction_at(grid)).rms_mm
+    best = field_statistics(grid, (cube - main).reshape(-1, 3)).rms_mm
+    after = field_statistics(grid, d + tables.correction_at(grid)).rms_mm
     assert best <= after < best / 0.6
 
 

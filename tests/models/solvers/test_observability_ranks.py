@@ -8,7 +8,7 @@ import pytest
 
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.solvers.assessment import observability
-from abbe.models.solvers.observability.cures import CampaignLayout, count_seen, trials
+from abbe.models.solvers.observability.cures import CampaignLayout, count_observed, trials
 from abbe.models.solvers.observability.rank import Knowledge, campaign_columns, compressed
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors
@@ -158,7 +158,7 @@ def gain(experiment, degree, key):
     columns = compressed(campaign_columns(experiment.machine, terms, experiment.runs, setup))
     campaign = CampaignLayout(experiment.machine, terms, experiment.runs, columns, experiment.knowledge(terms, setup))
     found = trials(campaign, experiment.seen(degree))
-    return next(count_seen(t.seen) for t in found if t.addition.key == key)
+    return next(count_observed(t.seen) for t in found if t.addition.key == key)
 
 
 def test_a_bar_counts_as_calibrated_only_if_every_run_says_so():

@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.functions.motions import motion_names
 from abbe.models.geometry.bases import smooth_terms
-from abbe.models.solvers.observability.hidden import families, motion_words, part_words, sentence
+from abbe.models.solvers.observability.hidden import families, motion_text, part_text, sentence
 
 TERMS = smooth_terms(4)
 NAMES = [t.name for t in TERMS]
@@ -26,13 +26,13 @@ def said(*vectors):
 
 
 def test_every_motion_has_a_name_of_its_own():
-    words = [motion_words(m) for a in "XYZ" for m in motion_names(a)] + [motion_words(s) for s in ("C0Y", "B0Z", "A0Z")]
+    words = [motion_text(m) for a in "XYZ" for m in motion_names(a)] + [motion_text(s) for s in ("C0Y", "B0Z", "A0Z")]
     assert len(set(words)) == 21
-    assert motion_words("EAX") == "the roll of X (EAX)"
-    assert motion_words("EBY") == "the roll of Y (EBY)"
-    assert motion_words("ECZ") == "the roll of Z (ECZ)"
-    assert motion_words("EZX") == "the straightness of X in Z (EZX)"
-    assert motion_words("B0Z") == "the squareness of X and Z (B0Z)"
+    assert motion_text("EAX") == "the roll of X (EAX)"
+    assert motion_text("EBY") == "the roll of Y (EBY)"
+    assert motion_text("ECZ") == "the roll of Z (ECZ)"
+    assert motion_text("EZX") == "the straightness of X in Z (EZX)"
+    assert motion_text("B0Z") == "the squareness of X and Z (B0Z)"
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_every_motion_has_a_name_of_its_own():
     ],
 )
 def test_parts_of_a_motion(motion, orders, words):
-    assert part_words(motion, orders) == words
+    assert part_text(motion, orders) == words
 
 
 def test_a_motion_alone():

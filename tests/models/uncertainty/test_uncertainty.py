@@ -38,7 +38,7 @@ def solution(runs):
 
 def test_sources_of_the_data_add_up_to_the_covariance_of_the_solution(solution):
     """Noise and priors without remainder; with the widening for estimated sizes never below what the solver states, and hardly above."""
-    sources = error_sources(solution, StatedInputs().of_the_data_alone())
+    sources = error_sources(solution, StatedInputs().without_stated_inputs())
     r = response(solution)
     n = len(solution.terms)
     sd = np.sqrt(np.diag(r.covariance)[:n])
@@ -127,7 +127,7 @@ def test_bar_length_counts_where_nothing_else_gives_a_scale(truth):
 def test_bar_temperature_acts_as_a_longer_bar(solution):
     """alpha u_T R of each bar: the change of the estimate when every bar reading is longer by that."""
     r = response(solution)
-    inputs = replace(StatedInputs().of_the_data_alone(), u_bar_temperature_k=2.0)
+    inputs = replace(StatedInputs().without_stated_inputs(), u_bar_temperature_k=2.0)
     source = error_sources(solution, inputs).source("bar_temperature")
     longer = np.concatenate([np.full(run.deviation_mm.size, 2.0 * STEEL_PER_K * (run.radius_mm or 0.0)) for run in solution.data])
     root, n = solution.prior_root, len(solution.terms)
@@ -139,7 +139,7 @@ def test_bar_temperature_acts_as_a_longer_bar(solution):
 
 
 def test_repeatability_takes_its_share_out_of_the_readings_and_adds_to_a_single_approach(solution):
-    data = StatedInputs().of_the_data_alone()
+    data = StatedInputs().without_stated_inputs()
     total = predict_deviation(error_sources(solution, data), GRID)
     small = predict_deviation(error_sources(solution, replace(data, repeatability_mm=5e-5)), GRID)
     np.testing.assert_allclose(small.u_mm, total.u_mm, rtol=1e-9)
@@ -173,7 +173,7 @@ def test_order_that_was_left_out_is_allowed_for(truth, runs):
     missed = remove_rigid(GRID, truth.deviation(GRID)) - remove_rigid(GRID, s.deviation_mm(GRID))
     held = []
     for orders in (0, 6):
-        p = predict_deviation(error_sources(s, replace(StatedInputs().of_the_data_alone(), orders_above=orders)), GRID, frame=frame)
+        p = predict_deviation(error_sources(s, replace(StatedInputs().without_stated_inputs(), orders_above=orders)), GRID, frame=frame)
         held.append(float((np.abs(missed) < p.expanded_mm).mean()))
     assert held[1] > 0.93
     assert held[0] < held[1] - 0.1
@@ -182,7 +182,7 @@ def test_order_that_was_left_out_is_allowed_for(truth, runs):
 def test_omitted_orders_cost_what_a_solution_with_them_says(solution, runs):
     """Prior share of orders above: the joint solution of both, with the same sizes, has the same covariance of the prediction."""
     extra = 2
-    sources = error_sources(solution, replace(StatedInputs().of_the_data_alone(), orders_above=extra))
+    sources = error_sources(solution, replace(StatedInputs().without_stated_inputs(), orders_above=extra))
     r, n = response(solution), len(solution.terms)
     above = sources.terms[n:]
     b = np.concatenate([run_design(MACHINE, above, run, solution.setup)[:, : len(above)] for run in solution.data])

@@ -76,8 +76,8 @@ def test_limits_make_shorter_intervals_than_the_law_of_propagation_says(solution
 @pytest.mark.parametrize("repeatability_mm", [1e-4, 5e-4, 3e-3] if LONG else [1e-4, 3e-3])
 def test_repeatability_counts_once_however_large_it_is_stated(solution, repeatability_mm):
     """3 um stated for readings that scatter by less: the law of propagation and trials of the readings agree all the same."""
-    inputs = replace(StatedInputs().of_the_data_alone(), repeatability_mm=repeatability_mm)
-    stated, none = error_sources(solution, inputs), error_sources(solution, StatedInputs().of_the_data_alone())
+    inputs = replace(StatedInputs().without_stated_inputs(), repeatability_mm=repeatability_mm)
+    stated, none = error_sources(solution, inputs), error_sources(solution, StatedInputs().without_stated_inputs())
     u, without = (predict_deviation(s, POINTS, frame=FRAME).u_mm for s in (stated, none))
     np.testing.assert_allclose(u, without, rtol=1e-9)
     drawn = campaign_trials(stated, POINTS, frame=FRAME).linear()(np.random.default_rng(1), 20_000)
@@ -86,7 +86,7 @@ def test_repeatability_counts_once_however_large_it_is_stated(solution, repeatab
 
 def test_trials_of_a_point_do_not_depend_on_the_points_beside_it(solution):
     """What the estimated sizes add is cut at nothing point by point, as the law has it: 200 other points change nothing."""
-    sources = error_sources(solution, StatedInputs().of_the_data_alone())
+    sources = error_sources(solution, StatedInputs().without_stated_inputs())
     others = np.random.default_rng(3).uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (200, 3))
     alone, among = (
         campaign_trials(sources, p, frame=FRAME).linear()(np.random.default_rng(1), 300)[:, :18] for p in (POINTS, np.r_[POINTS, others])
@@ -134,7 +134,7 @@ def test_intervals_hold_the_truth_of_machines_that_the_solver_does_not_know():
             frame = volume_frame(case.machine)
             inside = np.random.default_rng(seed).uniform(0.05, 0.95, (100, 3))
             points = case.machine.stroke_mm[:, 0] + case.machine.length_mm * inside
-            sources = error_sources(solve_joint(case.machine, case.runs), StatedInputs().of_the_data_alone())
+            sources = error_sources(solve_joint(case.machine, case.runs), StatedInputs().without_stated_inputs())
             p = predict_deviation(sources, points, frame=frame)
             truth = case.truth.deviation_mm(np.concatenate([frame.reference_mm, points]))
             at = len(frame.reference_mm)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from abbe.models.discovery.answer import Significance, Where
+from abbe.models.discovery.answer import Localization, Significance
 from abbe.service.campaign_data.decimation import picked
 from abbe.service.demo.demo_hidden import HiddenDemo
 from abbe.service.demo.demo_hidden_words import hidden_json, judged, truth_lines
@@ -26,7 +26,7 @@ def effect(label, family="structure"):
 
 
 def demo(hidden, verdict, *labels):
-    where = Where(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
+    where = Localization(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
     finding = Finding(verdict=verdict, effects=tuple(effect(n) for n in labels), where=where)
     gap = GapUm(before_um=2.0, after_um=0.5, floor_um=0.5)
     return HiddenDemo(

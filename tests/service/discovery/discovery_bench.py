@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.discovery.answer import Agreement, Discovery, Gap, NamedEffect, NextTest, Significance, Verdict, Where
+from abbe.models.discovery.answer import Agreement, Discovery, Gap, Localization, NamedEffect, NextTest, Significance, Verdict
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.effect import Effect
 from abbe.service.domain.progress import ProgressSink
@@ -76,8 +76,8 @@ class Search:
         before = {r.path.label: reading(r) for r in judged}
         after = {r.path.label: reading(r, shift[r.path.label] * (self.holds or r.role == "identify")) for r in judged}
         rival = (("lateral_play:EYX", self.ahead),)
-        where = Where(tests=("ballbar_circle",), axes=("X",), position_mm=(310.0, 240.0, 100.0), radius_mm=30.0)
-        table = Where(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
+        where = Localization(tests=("ballbar_circle",), axes=("X",), position_mm=(310.0, 240.0, 100.0), radius_mm=30.0)
+        table = Localization(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
         named = NamedEffect("backlash", "X", size, 0.1, {}, np.array([size]), np.array([[0.01]]), 300.0, rival, where)
         return Discovery(
             verdict=self.verdict,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.service.campaign_data.campaign_folder import Campaign, ensure_stored, from_folder
 from abbe.service.discovery.discover_live import Added, added
 from abbe.service.discovery.experiment_recipes import next_plan
@@ -41,7 +41,7 @@ def repeats() -> CampaignPlan:
     """Three helices in one set-up, and a diagonal's in four others."""
     plan = next_plan(
         ["longer_session", "laser_diagonals"], machine_from_doc(MACHINE), [RUN], name=("next1", "n1"), max_feed_mm_min=6000.0,
-        about=Where(runs=("r07",)),
+        about=Localization(runs=("r07",)),
     ).plan  # fmt: skip
     assert plan is not None
     return plan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from abbe.models.discovery.answer import Where
+from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.unseen import LATE_S
 from abbe.service.discovery.discovery_words import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
@@ -57,8 +57,8 @@ def test_a_centre_without_room_for_a_hemisphere_gets_a_shorter_bar() -> None:
     assert plan.tests[0].setup["radius_mm"] == pytest.approx(45.0)
 
 
-@pytest.mark.parametrize("about", [None, Where(position_mm=(300.0, 250.0, 400.0), runs=("r07",))])
-def test_the_same_path_again_that_has_no_room_is_left_to_a_person(about: Where | None) -> None:
+@pytest.mark.parametrize("about", [None, Localization(position_mm=(300.0, 250.0, 400.0), runs=("r07",))])
+def test_the_same_path_again_that_has_no_room_is_left_to_a_person(about: Localization | None) -> None:
     high = HELIX | {"run_id": "r07", "setup": HELIX["setup"] | {"centre_mm": [300.0, 250.0, 380.0]}}
     for add in ("second_feed", "longer_session"):
         found = next_plan([add], machine_from_doc(MACHINE), [high], name=("x", "n1"), max_feed_mm_min=6000.0, about=about)
@@ -66,8 +66,8 @@ def test_the_same_path_again_that_has_no_room_is_left_to_a_person(about: Where |
         assert "Z would go to" in found.by_hand[0]
 
 
-@pytest.mark.parametrize("about", [None, Where(runs=("r07",))])
-def test_a_repeat_is_the_run_again_with_all_that_its_set_up_says(about: Where | None) -> None:
+@pytest.mark.parametrize("about", [None, Localization(runs=("r07",))])
+def test_a_repeat_is_the_run_again_with_all_that_its_set_up_says(about: Localization | None) -> None:
     machine = machine_from_doc(MACHINE)
     like = Helix(
         "a", "A", "identify", (300.0, 200.0, 220.0), 120.0, turns=3.5, law="angle", axis=1, feed_mm_min=900.0, direction=-1, rate_hz=50,
@@ -101,7 +101,7 @@ def test_moves_are_no_faster_than_the_machine_file_allows() -> None:
 def test_the_half_of_the_new_sphere_is_the_one_on_which_the_place_is_seen(seen: tuple[float, float], opens: int, away_mm: float) -> None:
     low = HELIX | {"run_id": "r07", "setup": HELIX["setup"] | {"centre_mm": [300.0, 250.0, 220.0]}}
     place = np.array([300.0, 250.0, 220.0]) + away_mm * np.array([seen[0], 0.0, seen[1]])
-    about = Where(position_mm=tuple(place.tolist()), runs=("r07",))
+    about = Localization(position_mm=tuple(place.tolist()), runs=("r07",))
     plan = next_plan(["second_radius"], machine_from_doc(MACHINE), [low], name=("x", "n1"), max_feed_mm_min=6000.0, about=about).plan
     assert plan is not None
     assert plan.tests[0].setup["opens"] == opens
@@ -112,7 +112,7 @@ def test_the_half_of_the_new_sphere_is_the_one_on_which_the_place_is_seen(seen: 
 def test_a_place_is_passed_by_a_denser_path_on_a_smaller_sphere() -> None:
     other = HELIX | {"run_id": "r07", "setup": HELIX["setup"] | {"setup_id": "B", "centre_mm": [200.0, 250.0, 100.0]}}
     place = np.array([200.0, 250.0, 100.0]) + 150.0 * np.array([-0.6, 0.0, 0.8])  # on the second one's sphere
-    about = Where(position_mm=tuple(place.tolist()), radius_mm=20.0, runs=("r07",))
+    about = Localization(position_mm=tuple(place.tolist()), radius_mm=20.0, runs=("r07",))
     plan = next_plan(
         ["second_radius"], machine_from_doc(MACHINE), [HELIX, other], name=("x", "n1"), max_feed_mm_min=6000.0, about=about
     ).plan
@@ -128,7 +128,12 @@ def test_a_place_is_passed_by_a_denser_path_on_a_smaller_sphere() -> None:
 def test_what_came_at_a_moment_is_waited_for_in_one_set_up() -> None:
     other = HELIX | {"run_id": "r07", "setup": HELIX["setup"] | {"setup_id": "B", "centre_mm": [320.0, 240.0, 100.0]}}
     plan = next_plan(
-        ["longer_session"], machine_from_doc(MACHINE), [HELIX, other], name=("x", "n1"), max_feed_mm_min=6000.0, about=Where(runs=("r07",))
+        ["longer_session"],
+        machine_from_doc(MACHINE),
+        [HELIX, other],
+        name=("x", "n1"),
+        max_feed_mm_min=6000.0,
+        about=Localization(runs=("r07",)),
     ).plan
     assert plan is not None
     assert [t.label for t in plan.tests] == ["n1-late1", "n1-late2", "n1-late3"]
@@ -146,5 +151,5 @@ def test_what_came_at_a_moment_is_waited_for_in_one_set_up() -> None:
 )
 def test_a_run_that_is_no_helix_and_a_bar_that_is_turned_are_left_to_a_person(add: str, run: str, why: str) -> None:
     runs = [HELIX | {"run_id": "r07"}, {"run_id": "r02", "test": "ballbar_circle"}]
-    found = next_plan([add], machine_from_doc(MACHINE), runs, name=("x", "n1"), max_feed_mm_min=6000.0, about=Where(runs=(run,)))
+    found = next_plan([add], machine_from_doc(MACHINE), runs, name=("x", "n1"), max_feed_mm_min=6000.0, about=Localization(runs=(run,)))
     assert found == NextPlan(None, (f"{add} ({why})",))
