@@ -15,13 +15,13 @@ from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Form, Values
 
 UNNAMED = "unnamed_"
-"""Names that begin so mean: something is missing, but it is nothing that the catalogue knows."""
+"""Prefix of the names of structures that the catalogue does not contain."""
 GENEROUS = 3.0
-"""Prior standard deviation of a strength over the top of its usual range."""
+"""Prior standard deviation of a strength, as a multiple of the top of its usual range."""
 SEEN = 1e-5
-"""A candidate of which less than this share of its square is left shows nothing."""
+"""A candidate is invisible when the projection leaves less than this share of its square."""
 MOST_CACHED = 16
-"""So many picks' columns are kept: a search comes back to those it has just used."""
+"""Picks whose columns are cached: a search returns to those it has just used."""
 Short = NDArray[np.float32]
 
 
@@ -63,7 +63,7 @@ class Pick:
 
 
 def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
-    """The coefficient at which the strength is `GENEROUS` times the top of what is usual, for any power law of the strength.
+    """The coefficient at which the strength is `GENEROUS` times the top of its usual range, for any power law of the strength.
 
     ``width``: how many columns the effect has along one run.
     """
@@ -80,7 +80,7 @@ def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
 
 
 def competing(effects: Sequence[Effect], includes: frozenset[str]) -> tuple[Effect, ...]:
-    """Effects of the mean that the present simulation does not hold already."""
+    """Mean effects that the present simulation does not contain."""
     return tuple(e for e in effects if e.kind == "mean" and not includes & set(e.absorbed_by))
 
 
@@ -96,16 +96,16 @@ def starts_of(effects: Sequence[Effect]) -> list[Pick]:
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """All candidates of a problem with what the present simulation leaves of them.
+    """All candidates of a problem, with the present simulation projected out.
 
     Attributes
     ----------
     picks : tuple of Pick, one per group.
-    known : every start that was asked for and its group; -1 where no run sees it.
-    first : array of int, where each group's columns begin; size : how many each has.
-    parts : arrays, shape (columns, n): whitened columns as rows, part after part, no group in two. Seven digits choose where a refinement
-        starts; they are half of what a search needs of memory.
-    own : array, shape (K,): square of each column before anything was taken out.
+    known : group of every requested start; -1 where no run sees it.
+    first : array of int, first column of each group; size : number of columns of each.
+    parts : arrays, shape (columns, n): whitened columns as rows, no group split between parts. Single precision suffices to choose where a
+        refinement starts; the parts are half of the memory of a search.
+    own : array, shape (K,): squared norm of each column before projection.
     gram : tuple of arrays (k, k), one per group: columns^T M columns. moment : array, shape (K,): columns^T M y.
     prior_sd : array, shape (K,). logs : array, shape (groups,): sum over a group's columns of the log of how many readings see them.
     """
@@ -122,7 +122,7 @@ class Bank:
     logs: F1
 
     def gains(self, y: F1, rows: F2) -> F1:
-        """Chi-square that each group takes away after ``rows`` (k, n) of earlier picks were taken out too, shape (groups,)."""
+        """Reduction of chi-square by each group after ``rows`` (k, n) of earlier picks were projected out too, shape (groups,)."""
         short = rows.astype(np.float32)
         also = np.concatenate([np.zeros((len(rows), 0)), *(short @ part.T for part in self.parts)], axis=1)
         moment = self.moment - also.T @ (rows @ y)
@@ -148,7 +148,7 @@ class Bank:
 
 @dataclass(frozen=True)
 class _Group:
-    """What a bank holds of one pick."""
+    """Data of one pick in a bank."""
 
     rows: Short
     own: F1
@@ -158,7 +158,7 @@ class _Group:
 
 
 def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
-    """Gains of groups of one size: moment^T (gram + prior^-2)^-1 moment; what is hardly visible counts as noise of the arithmetic."""
+    """Gains of groups of one size: moment^T (gram + prior^-2)^-1 moment; columns that are hardly visible count as rounding errors."""
     k = gram.shape[1]
     eye = np.eye(k)
     weight = prior_sd**-2.0 + SEEN * own + 1e-30
@@ -167,7 +167,7 @@ def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
-    """Columns of all candidates; those that no run sees are left out. What another bank of the problem still holds is not made again."""
+    """Columns of all candidates that some run sees; groups of the problem's other live banks are reused."""
     asked = [p.start for p in picks]
     held = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in held if list(b.known) == asked), None)
@@ -199,7 +199,7 @@ def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
 
 
 PART = 20
-"""So many candidates are whitened together: whitening takes several copies of what it is given."""
+"""Candidates whitened together; whitening makes several copies of its input."""
 
 
 def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
@@ -207,7 +207,7 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
     blocks = [(p, raw) for p, raw in ((p, p.raw(problem)) for p in picks) if raw.any()]
     if not blocks:
         return
-    raw = np.asfortranarray(np.concatenate([b.T for _, b in blocks]).T)  # a filter along the runs is fastest so
+    raw = np.asfortranarray(np.concatenate([b.T for _, b in blocks]).T)  # the layout in which filtering along the runs is fastest
     columns, projection = problem.white(raw), problem.projection
     seen = projection.seen(columns)
     moment = columns.T @ projection.y - seen.T @ projection.moment
@@ -224,9 +224,9 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
 
 
 def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
-    """Chi-square that one pick takes away after ``rows`` of others were taken out too.
+    """Reduction of chi-square by one pick after ``rows`` of others were projected out too.
 
-    With all digits: where the simulation leaves little of a column, seven of them put evidence of thousands off by several.
+    In double precision: where the projection leaves little of a column, single precision shifts an evidence of thousands by several.
     """
     projection = problem.projection
     columns = problem.white(pick.raw(problem))
@@ -238,7 +238,7 @@ def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
 
 
 def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
-    """Whitened columns of a pick and what the simulation leaves of them, kept for as long as the problem."""
+    """Whitened columns of a pick and their projection, from the problem's cache."""
     name = pick.start
     if name not in problem.column_cache:
         if len(problem.column_cache) >= MOST_CACHED:
@@ -249,7 +249,7 @@ def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
 
 
 def rows_for(problem: WhitenedProblem, picks: Sequence[Pick]) -> F2:
-    """Rows that take out several picks together, shape (k, n)."""
+    """Rows that project out several picks together, shape (k, n)."""
     if not picks:
         return np.zeros((0, problem.gap.size))
     parts = [whitened(problem, p) for p in picks]

@@ -1,4 +1,4 @@
-"""A campaign as the discovery takes it: runs with their paths, readings and roles; what the present simulation knows."""
+"""Input of a discovery: runs with paths, readings and roles, and the contents of the present simulation."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Case:
     Attributes
     ----------
     includes : frozenset of str
-        What the present simulation knows: ``rigid6`` or ``rigid21``, ``setup_centre_offset``, ``bar_length_error``, ``mirror_tilt``.
+        Contents of the present simulation: ``rigid6`` or ``rigid21``, ``setup_centre_offset``, ``bar_length_error``, ``mirror_tilt``.
     resolution_mm : smallest step of the readings of "bar" and "laser".
     """
 

@@ -149,7 +149,7 @@ def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], l
     changed = False
     for i in range(len(found)):
         rivals = _rivals(contest, found, i)
-        if rivals and rivals[0].less < -CLEAR:
+        if rivals and rivals[0].deficit < -CLEAR:
             picks = [f.pick for f in found]
             picks[i] = rivals[0].pick
             found, changed = weighed(contest, picks), True

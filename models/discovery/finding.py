@@ -302,16 +302,16 @@ def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int])
         read = predictions(problem, solution)
         return float(np.sqrt(np.nanmean(np.concatenate([left_over(r, read[r.path.label], seen) for r in judges]) ** 2)))
 
-    def less(i: int) -> SolvedModel:
+    def deficit(i: int) -> SolvedModel:
         return replace(solved, coefficients=tuple(np.zeros_like(c) if k == i else c for k, c in enumerate(solved.coefficients)))
 
     whole = rms(solved)
-    return {i: rms(less(i)) / whole if whole > 0.0 else None for i in which}
+    return {i: rms(deficit(i)) / whole if whole > 0.0 else None for i in which}
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
     """Rivals that the price rule does not exclude; more distant ones remain among their effect's alternatives."""
-    return tuple(dict.fromkeys(label for e in effects for label, less in e.alternatives if less < EXCLUDED / 2.0))
+    return tuple(dict.fromkeys(label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0))
 
 
 def _verdict(named: float, unnamed: float) -> Verdict:
@@ -354,7 +354,7 @@ def _named(problem: WhitenedProblem, found: Selection, solved: SolvedModel, i: i
     where = localize_signal(problem.paths, tuple(problem.by_run(pick.raw(problem) @ c)))
     return NamedEffect(
         pick.effect.name, pick.key, strength, u, shape, c, cov, 0.5 * found.score,
-        tuple((r.pick.label, 0.5 * r.less) for r in rivals), where, tuple(f.name for f in pick.forms),
+        tuple((r.pick.label, 0.5 * r.deficit) for r in rivals), where, tuple(f.name for f in pick.forms),
     )  # fmt: skip
 
 

@@ -1,9 +1,8 @@
-"""Lack of fit: whether what is left of the runs, once the search has found nothing, is no more than noise that was known beforehand.
+"""Lack of fit: whether residuals exceed independently known noise after the search has found nothing.
 
-The search finds shapes that it knows, and a noise that is estimated from what is left holds those it does not. So the noise is asked of
-repeats where there are any, and "nothing is missing" is said only of residuals that agree with it: all together, run by run, and against
-position, direction, time, feed and temperature (`abbe.models.discovery.localization.locate`); and of runs never fitted only if they agree,
-too.
+The search finds known shapes only, and noise estimated from the residuals includes the unknown ones. So the noise comes from repeats where
+there are any, and the verdict "nothing is missing" requires that residuals agree with it: all together, run by run, and against position,
+direction, time, feed and temperature (`abbe.models.discovery.localization.locate`). Holdout runs must agree, too.
 """
 
 from __future__ import annotations
@@ -23,30 +22,30 @@ from abbe.models.machine import AXES
 from abbe.models.probability import f_above
 
 TIMES = 1.5
-"""Residuals are more than noise from so many times its rms on."""
+"""Residuals exceed noise from this multiple of its rms."""
 CHANCE = 1e-3
-"""What is told of one run, one place or one direction is what chance gives in fewer campaigns than this."""
+"""Significance level of statements about one run, place or direction, per campaign."""
 FEWEST, REPEATS = 8, 20
-"""Readings of a run that is judged alone; repeats from which a noise is believed."""
+"""Least readings for judging a single run; least repeats for estimating noise."""
 NEAR_MM = 0.05
 """Positions closer than this are the same one, approached again."""
 ALONE = 0.999
-"""A laser looks along one axis if its beam's share of it is larger."""
+"""A laser measures along one axis if that component of its beam is larger."""
 KNOWN_FREEDOM = 1e6
 COMMON, PERIODIC = 0.8, 0.6
-"""Share of a gap's energy that both directions have in common, and of that which one period explains, to be told so."""
+"""Least share of a gap's energy that both directions have in common, and of that which one period explains, to be reported."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise of a reading of one instrument, mm, and the degrees of freedom that it is known with."""
+    """Noise of a reading of one instrument, mm, and its degrees of freedom."""
 
     sd_mm: float
     freedom: float
 
 
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
-    """Noise of each instrument: of its repeats, where they say clearly less than what the fit left; that may hold what is missing."""
+    """Noise of each instrument: from repeats if clearly smaller than the fit's residuals, which may contain missing effects."""
     out = {}
     for kind, colour in problem.colours.items():
         steps = repeat_steps(problem.case, kind)
@@ -58,9 +57,9 @@ def floors(problem: WhitenedProblem) -> dict[str, Floor]:
 
 
 def repeat_steps(case: Case, kind: str) -> F1:
-    """How a dwelling machine's readings differ from the one before in the same set-up, at the same place from the same side, mm.
+    """Differences of successive dwell readings at the same place, from the same side, in the same set-up, mm.
 
-    What drifts slowly takes little part in them; what the place, the direction or the set-up does, none.
+    Slow drift contributes little to them; place, direction and set-up contribute nothing.
     """
     visits: dict[object, list[tuple[float, float]]] = {}
     for run in case.runs:
@@ -78,12 +77,12 @@ def repeat_steps(case: Case, kind: str) -> F1:
 def lack_of_fit(
     problem: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
 ) -> Localization | None:
-    """Where a solution without effects leaves more than noise; None: nowhere.
+    """Where the residuals of a solution without effects exceed noise; None: nowhere.
 
     Parameters
     ----------
-    problem : fitted runs as the present simulation leaves them. left_mm : residual of every judged run, by label.
-    floor : of `floors`. agreement : of runs that were never fitted.
+    problem : the fitted runs. left_mm : residual of every judged run, by label.
+    floor : of `floors`. agreement : of holdout runs.
     """
     runs = problem.runs
     rest = [np.nan_to_num(left_mm[r.path.label]) / floor[r.path.kind].sd_mm for r in runs]
@@ -105,19 +104,19 @@ def lack_of_fit(
 
 
 def _times(rest: F1) -> float:
-    """Rms over that of the noise, of readings that count."""
+    """Rms of valid readings over that of the noise."""
     read = rest[rest != 0.0]
     return float(np.sqrt(np.mean(read**2))) if read.size else 0.0
 
 
 def _louder(rest: F1, floor: Floor, tried: int) -> bool:
-    """Whether one run's residuals are more than noise, by size and by chance over all runs."""
+    """Whether one run's residuals exceed noise in size and in significance over all runs."""
     count, times = np.count_nonzero(rest), _times(rest)
     return bool(count >= FEWEST and times > TIMES and tried * f_above(times**2, count, floor.freedom) < CHANCE)
 
 
 def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping[str, Floor]) -> Localization | None:
-    """What is left along the axis that all runs look along: how far it goes, which way, its period; None where there is no such axis."""
+    """Shape of the residuals along the one axis that all runs measure: span, direction, period; None without such an axis."""
     lines = [r for r in runs if r.path.test == "laser_linear" and np.abs(r.path.look[0]).max() > ALONE]
     axes = {int(np.argmax(np.abs(r.path.look[0]))) for r in lines}
     if not lines or len(axes) != 1 or len(lines) < len(runs):
@@ -144,7 +143,7 @@ def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping
 
 
 def _common(x: F1, y: F1, up: F1) -> tuple[F1, F1]:
-    """Place of every reading as a number, and what both directions have in common there, shape (n,) each."""
+    """Index of every reading's place, and the common part of both directions there, shape (n,) each."""
     place = np.round(x / NEAR_MM)
     both = np.zeros(len(y))
     for p in np.unique(place):
@@ -155,7 +154,7 @@ def _common(x: F1, y: F1, up: F1) -> tuple[F1, F1]:
 
 
 def _loudest(y: F1, up: F1) -> int:
-    """Direction in which more is left."""
+    """Direction with the larger residuals."""
     energy = {s: float(np.mean(y[up == s] ** 2)) for s in (-1, 1) if (up == s).any()}
     return max(energy, key=lambda s: energy[s])
 

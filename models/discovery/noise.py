@@ -1,4 +1,4 @@
-"""Noise of the instruments: white plus a slowly forgetting part, as fractions that all readings of one instrument share."""
+"""Noise of the instruments: a white part plus a part with memory, in proportions common to all readings of one instrument."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scipy import ndimage, signal
 from abbe.models.arrays import F1, F2
 
 SHARE, MEMORY = 0.1, 0.75
-"""Share of the variance that is remembered from reading to reading, and how much of it; what is assumed before the readings say (typical of
-ball-bars and interferometers in a workshop: long-run variance 1.6 times that of one reading, discovery.md 4)."""
+"""Share of the variance with memory, and its correlation from reading to reading, assumed before estimation (typical of ball-bars and
+interferometers in a workshop: long-run variance 1.6 times that of one reading, discovery.md 4)."""
 CLEARLY = 0.85
-"""Differences of neighbours are believed where they say less than this share of what the residuals say."""
+"""Differences of neighbours give the noise where it is less than this share of that of the residuals."""
 LONE = 7.0
-"""A reading farther from its neighbours than this many standard deviations is none."""
+"""A reading farther from its neighbours than this many standard deviations does not count."""
 
 
 @dataclass(frozen=True)

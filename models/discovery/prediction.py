@@ -85,7 +85,7 @@ def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:
 
 
 def _slopes(problem: WhitenedProblem, pick: Pick, coefficients: F1) -> F2:
-    """What the reading changes by with each non-linear parameter, by central differences, shape (n, parameters)."""
+    """Derivative of the reading with respect to each non-linear parameter, by central differences, shape (n, parameters)."""
     out = np.zeros((problem.gap.size, len(pick.effect.shape)))
     for j, q in enumerate(pick.effect.shape):
         value = pick.values[q.name]
@@ -135,7 +135,7 @@ def _width(signal: Signal, problem: WhitenedProblem, pick: Pick) -> int:
 
 
 def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
-    """Coefficients for columns over all runs from those over the identify runs: a column that no identify run sees has none."""
+    """Coefficients for columns over all runs; zero for columns that no identify run sees."""
     if columns[0].shape[1] == c.size:
         return c
     seen = np.any([np.abs(col).max(axis=0) > 0.0 for col, known in zip(columns, identified, strict=True) if known], axis=0)
@@ -145,7 +145,7 @@ def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
 
 
 def free_columns(run: CaseRun, seen: set[str]) -> F2:
-    """What a judged run may still set for itself: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
+    """Columns of a judged run's own unknowns: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
     p = run.path
     if p.kind == "laser":
         return np.ones((p.n, 1))
@@ -155,7 +155,7 @@ def free_columns(run: CaseRun, seen: set[str]) -> F2:
 
 
 def left_over(run: CaseRun, predicted_mm: F1, seen: set[str]) -> F1:
-    """Reading less prediction once the run has set what is its own, mm; flagged readings are NaN."""
+    """Reading minus prediction after fitting the run's own unknowns, mm; NaN for flagged readings."""
     assert run.deviation_mm is not None
     gap = np.where(run.valid, run.deviation_mm, 0.0) - np.where(run.valid, predicted_mm, 0.0)
     free = free_columns(run, seen) * run.valid[:, None]
@@ -181,7 +181,7 @@ def left_together(runs: Sequence[CaseRun], predicted_mm: Mapping[str, F1], seen:
 
 
 def _left_of_cup(group: list[CaseRun], predicted_mm: Mapping[str, F1]) -> dict[str, F1]:
-    """What runs about one cup leave once it stands where all of them together want it, and every bar is as long as its runs want."""
+    """Residuals of runs about one cup after fitting its position and the length of each bar."""
     bars = sorted({r.path.radius_mm for r in group})
     rows, gaps = [], []
     for run in group:

@@ -1,4 +1,4 @@
-"""Non-linear parameters of a candidate, refined between the starts of its grid before it is compared with others."""
+"""Refinement of a candidate's non-linear parameters between the starts of its grid, before it is compared with others."""
 
 from __future__ import annotations
 

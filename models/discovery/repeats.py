@@ -1,6 +1,6 @@
-"""Repeats of a positioning test: does one slow drift, common to all positions, explain why they differ?
+"""Repeats of a positioning test: does one slow drift, common to all positions, explain their differences?
 
-Positions approached again and again from the same sides differ by noise and by what moved meanwhile. A drift of the reading with time that
+Positions approached repeatedly from the same side differ by noise and by drift. A drift of the reading with time that
 is the same at all positions shows in the repeats alone, without any model of the axis. Noise with memory looks like drift, so the p-value
 is that of noise with the memory that the residuals have, by simulation, for the best of all forms that were tried.
 """
@@ -16,9 +16,9 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 
 P_LIMIT = 0.005
-"""A drift is claimed where noise gives as much in fewer than so many tests."""
+"""A drift is claimed below this p-value ..."""
 SHARE_LIMIT = 0.5
-"""... and where it explains at least half of the repeat variance: taking out less makes the repeatability better by less than 30 %."""
+"""... and from this share of the repeat variance on: removing less improves the repeatability by less than 30 %."""
 TAUS = (0.15, 0.3, 0.6, 1.2)
 """Time constants tried, as shares of the test's duration; shorter ones are over at once, longer ones are straight lines."""
 TRIALS = 2000
@@ -35,7 +35,7 @@ class RepeatDrift:
     ----------
     named : whether it is claimed (`P_LIMIT`, `SHARE_LIMIT`).
     share : part of the repeat variance that it explains, 0 to 1.
-    p : how often noise with the residuals' memory gives as much.
+    p : chance that noise with the residuals' memory gives as much.
     form, tau_s : "linear", or "exponential" with its time constant.
     change_mm, u_change_mm : from the first to the last reading, with its standard uncertainty.
     before_mm, after_mm : scatter of the repeats with and without it (standard deviation).
@@ -62,9 +62,9 @@ def repeat_drift(place: F1, t_s: F1, reading_mm: F1) -> RepeatDrift | None:
     Parameters
     ----------
     place : array, shape (n,)
-        Which position and side a reading belongs to: equal numbers are repeats of each other.
+        Number of each reading's position and side: equal numbers are repeats.
     t_s, reading_mm : array, shape (n,)
-        When, and the deviation read, mm.
+        Time, s, and deviation, mm, of each reading.
 
     Returns
     -------
@@ -128,16 +128,16 @@ def _shapes(x: F1) -> F2:
 
 
 def _simplest(gains: F1, dof: int) -> int:
-    """The straight line, unless an exponential leaves so much less that its second parameter is worth it (F at 1 %, about 7)."""
+    """Index of the straight line, unless an exponential is significantly better (F at 1 %, about 7)."""
     best = int(np.argmax(gains))
     left, straight = 1.0 - float(gains[best]), 1.0 - float(gains[0])
     return best if (straight - left) * max(dof - 1, 1) > 7.0 * left else 0
 
 
 def _memory(residual: F1, taken: F2) -> float:
-    """Memory of the noise whose residuals, after all that was fitted, look like these next to each other; two standard errors more.
+    """Memory of noise whose residuals after the fit have these neighbour correlations, plus two standard errors.
 
-    Taken as found, noise with a memory of 0.8 was called a drift in 3 of 100 tests, because the best form takes memory away with it.
+    Without the margin, noise with a memory of 0.8 was called a drift in 3 of 100 tests, because the best form absorbs memory.
     """
     n, ss = residual.size, float(residual @ residual)
     if ss <= 0.0:
@@ -154,7 +154,7 @@ def _memory(residual: F1, taken: F2) -> float:
 
 
 def _chance(gain: float, basis: F2, units: F2, memory: float) -> float:
-    """How often noise alone, with that memory, has a form that explains as much."""
+    """Chance that some form explains as much of noise with that memory."""
     rng = np.random.default_rng(20261121)
     n = basis.shape[0]
     root = linalg.cholesky(_correlation(n, memory), lower=True)

@@ -1,4 +1,4 @@
-"""What else a named effect could be: every other name in its place, refined, against the same readings (discovery.md 4.9)."""
+"""Rivals of a named effect: every other name in its place, refined, against the same readings (discovery.md 4.9)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ EXCLUDED = 12.0
 """A rival that explains less by this much chi-square, after its price, is excluded."""
 TRIED = 8
 KIN = 0.02
-"""Names that explain all but this share of the evidence are as good as the same: a curved form of the one is the other's."""
+"""Rivals that explain all but this share of the evidence are not excluded: a curved form of one resembles the other."""
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A name that could stand in another's place, and by how much chi-square (after price) it explains less."""
+    """A name that could replace another, and its lack of chi-square (after price)."""
 
     pick: Pick
-    less: float
+    deficit: float
     share: float
 
 
@@ -39,9 +39,9 @@ def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Riva
         pick, gain = refined(contest.problem, candidate.pick, rows)
         pick, gain, score = _formed(contest, pick, rows, gain)
         rival = Rival(pick, own.score - score, gain / own.gain)
-        if rival.less < EXCLUDED or rival.share > 1.0 - KIN:
+        if rival.deficit < EXCLUDED or rival.share > 1.0 - KIN:
             out.append(rival)
-    return sorted(out, key=lambda r: r.less)
+    return sorted(out, key=lambda r: r.deficit)
 
 
 def _nested(a: Pick, b: Pick) -> bool:
@@ -50,12 +50,12 @@ def _nested(a: Pick, b: Pick) -> bool:
 
 
 def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:
-    """A rival with the freedoms of form that it earns: the same fairness as for the name that won."""
+    """A rival with the freedoms of form that are worth their price, as for the chosen name."""
     score = gain - contest.price(pick)
     for form in pick.effect.forms:
         more = replace(pick, forms=(*pick.forms, form))
         with_form = gain_of(contest.problem, more, rows)
-        if with_form - gain < FORM_LEAST * gain:  # as for the name that won: less would be no matter of form
+        if with_form - gain < FORM_LEAST * gain:  # the same rule as for the chosen name
             continue
         if with_form - contest.price(more) > score:
             pick, gain, score = more, with_form, with_form - contest.price(more)

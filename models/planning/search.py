@@ -124,8 +124,8 @@ class Search:
                 continue
             b = linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
             s = linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
-            less = linalg.solve_triangular(s, b @ half, lower=True)
-            rates[test] = (now - self._judge(start - (less**2).sum(axis=0))) / cost**thrift
+            reduction = linalg.solve_triangular(s, b @ half, lower=True)
+            rates[test] = (now - self._judge(start - (reduction**2).sum(axis=0))) / cost**thrift
         return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
 
     def _at_cups(self, chosen: Chosen) -> list[Measurement]:

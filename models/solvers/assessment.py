@@ -1,4 +1,4 @@
-"""What a campaign tells about a machine and what it does not, before it is measured and after it is solved.
+"""What a campaign determines about a machine and what it does not, before it is measured and after it is solved.
 
 `observability` needs the runs' set-ups only (a planner's question), `observability_of` takes a solution. Both give rank and null space in
 words with a cause and a cure, what is known of every parameter and motion, and how well the deviation is known in the volume. Rank is of
@@ -92,7 +92,7 @@ class Observability:
 
     @property
     def rank(self) -> int:
-        """How many combinations of the coefficients the readings show."""
+        """Number of combinations of coefficients that the readings determine."""
         return self.seen.rank
 
     def at(self, axes_mm: F2) -> Volume:
@@ -100,7 +100,7 @@ class Observability:
         return volume_at(self.machine, self.model, self.knowing, axes_mm)
 
     def plane(self, fixed: int = 2, nodes: int = 15) -> Plane:
-        """The same over the plane in the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture: nodes x nodes points."""
+        """As `at`, over the plane in the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture: nodes x nodes points."""
         return plane_at(self.machine, self.model, self.knowing, fixed, nodes)
 
     def lines(self) -> tuple[str, ...]:
@@ -128,7 +128,7 @@ def observability(
     floor_mm: dict[str, float] | None = None,
     known: Knowledge | None = None,
 ) -> Observability:
-    """What runs could tell, from where they measure: no reading is looked at.
+    """What runs can determine, from where they measure; readings are not used.
 
     Parameters
     ----------
@@ -163,10 +163,10 @@ def observability(
 
 
 def observability_of(solution: JointSolution, known: Knowledge | None = None) -> Observability:
-    """What the runs of a solution told: as `observability`, with the solution's own estimates, covariance, priors and noise.
+    """What the runs of a solution determined: as `observability`, with the solution's own estimates, covariance, priors and noise.
 
-    Rank and null space count the terms up to the order that the solution chose; the orders above it, which the solver carries along so
-    that no interval is too narrow, count in every uncertainty and share.
+    Rank and null space count the terms up to the order that the solution chose; the orders above it, which keep intervals from being too
+    narrow, count in every uncertainty and share.
     """
     e, s = solution.estimate, solution
     noise = np.concatenate([np.full(r.residual_mm.size, r.expected_mm) for r in s.runs])

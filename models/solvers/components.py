@@ -17,12 +17,12 @@ from abbe.models.solvers.information import InformationSums
 from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
 NOISE_SD = 2.0
-"""Hyperprior of an instrument's log noise variance about what its repeats say: a factor of e in the standard deviation, weak."""
+"""Weak hyperprior of an instrument's log noise variance about that of its repeats: a factor of e in the standard deviation."""
 LEAST_ETA = -8.0
 """Least log noise variance over the expected one: a factor of 55 in the standard deviation, under the resolution of every instrument that
 is sold. Readings without any noise would drive it to minus infinity and the normal equations out of the digits of a double."""
 ROUGHER = 0.2
-"""Standard deviations of what is known of a motion's roughness by which it is taken rougher than most probable (`cautious`)."""
+"""Posterior standard deviations of a motion's roughness by which it is taken rougher than most probable (`cautious`)."""
 STEPS = 25
 TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
@@ -151,7 +151,7 @@ def estimate(sums: InformationSums, model: SizeModel, start: Components) -> Fitt
 
 
 def _positive(info: F2, least: float) -> F2:
-    """The same with no eigenvalue under ``least``: information plus hyperprior never has one but by rounding (readings without noise)."""
+    """The matrix with eigenvalues of at least ``least``; smaller ones come from rounding only (readings without noise)."""
     values, vectors = linalg.eigh(info)
     return info if values[0] >= least else np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
@@ -162,7 +162,7 @@ def _moved(c: Components, step: F1) -> Components:
 
 
 def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
-    """The same with the correlation length of the error motions, by climbing over `LENGTHS` from the model's own.
+    """As `estimate`, with the correlation length of the error motions, by climbing over `LENGTHS` from the model's own.
 
     ``sums`` about the unknowns in units of their typical size.
     """
@@ -184,14 +184,14 @@ def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tu
 
 
 def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Components]:
-    """Prior of the error motions as it may well be, where the most probable one would promise too much.
+    """Cautious prior of the error motions where the most probable one would promise too much.
 
-    Three remedies; where readings are plenty none of them changes anything.
+    It differs in three ways, none of which matters where readings are plenty.
 
-    - Every motion is a little rougher (`ROUGHER`) than most probable: it looks as rough as it is where it was
-      measured; beyond, near the ends of the stroke, it may be rougher, and what was measured does not speak against it.
-    - The variance of a motion is the mean of what it may be (of a log-normal: exp(psi + v/2)), not its most probable value. Two motions
-      that the readings hardly tell apart take from each other, and the most probable size of both is then too small.
+    - Every motion is a little rougher (`ROUGHER`) than most probable: near the ends of the stroke, where nothing was measured, it may be
+      rougher than elsewhere without contradicting the readings.
+    - The variance of a motion is its posterior mean (of a log-normal: exp(psi + v/2)), not its most probable value. For two motions that
+      the readings hardly separate, the most probable sizes are too small.
     - No shape is held closer to zero than `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("roughness ") for name in model.names])

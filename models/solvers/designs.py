@@ -1,4 +1,4 @@
-"""Rows that single experiments put into a least-squares problem, whatever the error functions are, and what such a problem can tell.
+"""Rows of single experiments in a least-squares problem, for any error functions, and what such a problem can determine.
 
 A `Field` gives the deviation per unit of every parameter; bar and laser rows are its projections (math.md 4.2, 5.4). Ranks follow the
 convention of math.md 4.6: columns of unit length, then the set-up unknowns projected out.
@@ -60,14 +60,14 @@ def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> DesignRows:
 
 
 def vector_rows(field: Field, points_mm: F2) -> DesignRows:
-    """The whole deviation vector at points (the upper bound of what any instrument can tell), no set-up unknowns."""
+    """The whole deviation vector at points (upper bound of what any instrument can determine), no set-up unknowns."""
     f = field(points_mm)
     flat = f.reshape(-1, f.shape[2])
     return DesignRows(flat, np.zeros((flat.shape[0], 0)))
 
 
 def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[F2, F2]:
-    """One design from several experiments: machine columns on top of each other, set-up columns wherever each part says.
+    """One design from several experiments: machine columns stacked, set-up columns placed as each part states.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from abbe.models.solvers.order import folds
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
 from abbe.models.solvers.residual_tests import inflation
 
-# Noise of an instrument as its own repeats tell it, before any model is fitted.
+# Noise of an instrument from its repeats, before any model is fitted.
 
 
 DEFAULT_SIGMA_MM = {"bar": 4e-4, "laser": 3e-4}

@@ -19,10 +19,10 @@ LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Combination:
-    """A direction of parameter space that the observations do not see.
+    """A direction of parameter space that leaves no trace in the observations.
 
-    ``weights`` relate the parameters in units of their typical size, largest first, small members too: without them the combination leaves
-    a trace. ``text`` says it in words, of the members that matter (`LEAST_SHARE`).
+    ``weights`` relate the parameters in units of their typical size, largest first, including small members: without them the combination
+    leaves a trace. ``text``: a sentence about the members that matter (`LEAST_SHARE`).
     """
 
     weights: tuple[tuple[str, float], ...]

@@ -95,10 +95,10 @@ def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...
         for k in range(len(KINDS)):
             at = (r.fold == f) & (r.kind == k)
             w, y = weight[at], r.y[at]
-            less = np.flatnonzero(at & (weight < 1.0))
-            if less.size:
-                out = r.a[less]
-                gram[k] -= (out * (1.0 - weight[less])[:, None]).T @ out
+            downweighted = np.flatnonzero(at & (weight < 1.0))
+            if downweighted.size:
+                out = r.a[downweighted]
+                gram[k] -= (out * (1.0 - weight[downweighted])[:, None]).T @ out
             moment.append((w * y) @ r.a[at])
             square.append(float(w @ y**2))
             count.append(float(w.sum()))

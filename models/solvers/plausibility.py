@@ -1,9 +1,9 @@
-"""Which run of a campaign cannot be what it says: another unit, another sign, swapped axes, another machine.
+"""Runs of a campaign that cannot be what they claim: wrong unit, wrong sign, swapped axes, another machine.
 
-All runs are looked at together, as one linear model with wide priors. For every run and every way in which a file goes wrong the evidence
-of the whole campaign is computed with that run corrected in that way, and with that run taken to have nothing to do with the others. What
-is best explains the readings; it counts only if it is better by far (`STRONG`). Source: marginal likelihood of a linear model with normal
-priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong", the limit here is far above it).
+All runs form one linear model with wide priors. For every run and every possible mistake, the evidence of the whole campaign is computed
+with that mistake undone, and with that run unrelated to the others. The best hypothesis counts only if it is better by far (`STRONG`).
+Source: marginal likelihood of a linear model with normal priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong", the limit here
+is far above it).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from abbe.models.solvers.priors import Priors, term_prior_sd
 
 SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
 OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
-"""A reading that the rest of its run misses by so many standard deviations does not count here; at most this share of a run."""
+"""A reading that the rest of its run misses by this many standard deviations does not count here; at most this share of a run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +37,13 @@ class Part:
 
     @property
     def information(self) -> F2:
-        """What the run says of the unknowns, shape (p, p), without their prior."""
+        """Information of the run on the unknowns, shape (p, p), without their prior."""
         return np.asarray(self.a.T @ self.a)
 
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """What some parts together say: Cholesky factor of the information with the prior, and its log evidence."""
+    """Posterior from some parts: Cholesky factor of the information with the prior, and log evidence."""
 
     factor: F2
     theta: F1
@@ -51,7 +51,7 @@ class Posterior:
 
 
 def together(parts: Sequence[Part]) -> Posterior:
-    """What some runs say together, and how probable their readings are."""
+    """Posterior from some runs together."""
     n = parts[0].a.shape[1]
     information = sum((p.information for p in parts), np.eye(n))
     lower = linalg.cholesky(information, lower=True)
@@ -63,7 +63,7 @@ def together(parts: Sequence[Part]) -> Posterior:
 
 
 def conditional(others: Posterior, variants: dict[str, Part]) -> dict[str, float]:
-    """Log evidence of each variant of a run given what the others say; variants with one design share its factorisation."""
+    """Log evidence of each variant of a run given the other runs; variants with one design share its factorisation."""
     out: dict[str, float] = {}
     known: list[tuple[F2, F2, F2]] = []
     for name, part in variants.items():
@@ -124,13 +124,13 @@ BLOCKS = 120
 STRONG, NAMED = 25.0, 5.0
 """Least gain of log evidence (natural) for which a run is suspected at all; by which a named cause has to be better than none."""
 FACTORS = {"um": 1e-3, "inch": 25.4, "sign": -1.0, "mm_as_um": 1e3, "mm_as_inch": 1.0 / 25.4}
-"""What the deviations of a run would have to be multiplied by, if they were written in another unit or with the other sign."""
+"""Factors that correct deviations written in another unit or with the other sign."""
 SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}
 ON_SPHERE_MM = 1.5
 GROSS, GROSS_MM = 4.0, 2e-3
-"""A run that merely does not fit is named if it misses the others' prediction by so many times what is expected, and by so much."""
+"""A run that fits with no mistake undone is named if it misses the others' prediction by this multiple of the expected rms, and by this."""
 SURE_SIGMA = 5.0
-"""A reading that all other readings of the campaign miss by so many standard deviations is an outlier, not a sign of a bad run."""
+"""A reading that all other readings of the campaign miss by this many standard deviations is an outlier, not a sign of a bad run."""
 OUTLIER_MM = 0.1
 """Width of the range in which an outlier may lie."""
 LARGE_MM = 0.3
@@ -151,7 +151,7 @@ class SuspectRun:
     misfit_mm, expected_mm : float
         Rms by which the other runs' prediction misses the run (its own set-up refitted), and what it should be.
     tied : tuple of str
-        Other runs that explain the contradiction as well: with two runs nobody can say which is wrong.
+        Other runs that explain the contradiction equally well: of two runs, either may be wrong.
     """
 
     run: str
@@ -196,7 +196,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
     Parameters
     ----------
     runs : sequence of RunData
-        One run alone contradicts nobody.
+        A single run contradicts none.
     limit : float
         Least gain of log evidence.
     """
@@ -218,7 +218,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
 
 
 def _cleaned(run: _Run, others: Posterior) -> _Run | None:
-    """The run without readings that the other runs show to be outliers, which few readings alone may not; None: there are no such."""
+    """The run without readings that the other runs show to be outliers; None: there are none."""
     part = run.as_is
     spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)
@@ -295,7 +295,7 @@ def _worst(runs: Sequence[_Run], limit: float) -> SuspectRun | None:
 
 
 def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
-    """A run taken to be wrong in the way that explains the campaign best."""
+    """A run with the mistake that explains the campaign best."""
     others = together(rest)
     best, cause = others.log_evidence + together([run.as_is]).log_evidence, "other"
     for name, log_p in conditional(others, run.undone).items():

@@ -115,8 +115,8 @@ class CampaignTrials:
             if s.name in (*READINGS, "repeatability"):
                 continue
             factor = (b @ s.factor).T
-            if s.less is not None:
-                factor = _clamped(factor, (b @ s.less).T)
+            if s.subtracted is not None:
+                factor = _clamped(factor, (b @ s.subtracted).T)
             out.append((s.name, factor))
         return out
 
@@ -140,13 +140,13 @@ class CampaignTrials:
         return out
 
 
-def _clamped(plus: F2, less: F2) -> F2:
+def _clamped(plus: F2, subtracted: F2) -> F2:
     """Factor (inputs, 3 m) of what the estimated sizes add: at every point not less than nothing, as the law of propagation has it.
 
     Every point takes its share of the same draws, so it stays in step with the others, and what it gets does not depend on them.
     """
     points = plus.reshape(len(plus), -1, 3).transpose(1, 2, 0)  # (m, 3, inputs)
-    minus = less.reshape(len(less), less.shape[1] // 3, 3).transpose(1, 2, 0)
+    minus = subtracted.reshape(len(subtracted), subtracted.shape[1] // 3, 3).transpose(1, 2, 0)
     whole = points @ np.swapaxes(points, 1, 2)
     kept = _powered(whole - minus @ np.swapaxes(minus, 1, 2), 0.5)
     return np.asarray((kept @ _powered(whole, -0.5) @ points).transpose(2, 0, 1).reshape(len(plus), -1))

@@ -212,8 +212,8 @@ def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFre
     variance = np.zeros((len(sources.sources), len(points), 3))
     for k, source in enumerate(sources.sources):
         share = propagated_covariance(d, source.factor) + source.scatter_mm**2 * np.eye(3)
-        if source.less is not None:
-            share = _not_negative(share - propagated_covariance(d, source.less))
+        if source.subtracted is not None:
+            share = _not_negative(share - propagated_covariance(d, source.subtracted))
         covariance += share
         variance[k] = np.einsum("mii->mi", share)
     return d @ sources.coefficients, covariance, variance

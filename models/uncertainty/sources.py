@@ -36,8 +36,8 @@ def variances(sources: ErrorSources, per_unit: F2) -> F1:
     total = np.zeros(len(per_unit))
     for s in sources.sources:
         share = np.sum((per_unit @ s.factor) ** 2, axis=1)
-        if s.less is not None:
-            share = np.maximum(share - np.sum((per_unit @ s.less) ** 2, axis=1), 0.0)
+        if s.subtracted is not None:
+            share = np.maximum(share - np.sum((per_unit @ s.subtracted) ** 2, axis=1), 0.0)
         total += share
     return total
 
@@ -52,9 +52,9 @@ def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
     for s in sources.sources:
         plus = small @ s.factor
         share = plus @ plus.T
-        if s.less is not None:
-            less = small @ s.less
-            root = _root(share - less @ less.T)
+        if s.subtracted is not None:
+            subtracted = small @ s.subtracted
+            root = _root(share - subtracted @ subtracted.T)
             share = root @ root.T
         total += share
     found = _root(total)
@@ -263,7 +263,7 @@ class Source:
     factor: F2
     dof: float = float("inf")
     scatter_mm: float = 0.0
-    less: F2 | None = None
+    subtracted: F2 | None = None
 
     @property
     def evaluation(self) -> Literal["A", "B"]:
@@ -317,8 +317,8 @@ def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -
     above = len(terms) - n
     parts = [replace(s, factor=_padded(s.factor[:n], above)) for s in found]
     parts.append(Source("model_order", extra))
-    plus, less = _widening(r, n)
-    wider = Source("estimated_sizes", _padded(plus, above), less=_padded(less, above))
+    plus, subtracted = _widening(r, n)
+    wider = Source("estimated_sizes", _padded(plus, above), subtracted=_padded(subtracted, above))
     coefficients = np.concatenate([solution.coefficients, np.zeros(above)])
     return ErrorSources(solution, inputs, terms, coefficients, (*_merged(parts), wider))
 

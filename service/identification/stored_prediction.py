@@ -23,8 +23,8 @@ def prediction_of(sources: ErrorSources) -> StoredPrediction:
     total = np.zeros((len(sources.terms), len(sources.terms)))
     for s in sources.sources:
         total += s.factor @ s.factor.T
-        if s.less is not None:
-            total -= s.less @ s.less.T
+        if s.subtracted is not None:
+            total -= s.subtracted @ s.subtracted.T
     lower = total[np.tril_indices(len(total))]
     data = base64.b64encode(lower.astype("<f8").tobytes()).decode()
     return StoredPrediction(

@@ -1,11 +1,10 @@
-"""What has changed in a machine since a solution: which of its error motions, by how much, judged by runs that did not choose it.
+"""Changes of a machine since a solution: which error motions, by how much, judged by runs that did not choose them.
 
-A known machine that drifts lacks no physical effect: its model is whole and its numbers are old. So the solution from before is held
-against new runs, with its own covariance, and error motions compete for what is left: six linear ones (scales, squareness) and the shape of
-each of the 21. One that makes the readings more likely by more than its price is taken in, and the others are asked again; one that those
-taken in later make needless goes (marginal likelihood of a linear normal model, as `abbe.models.solvers.components`; price: logarithm of
-the number of candidates). To prove it, one half of the set-ups chooses and the other judges, both ways round. Set-ups and lost motion are
-refitted throughout: a new cup is no change of the machine.
+A known machine that drifts lacks no physical effect: its model is complete, its numbers are old. So the old solution, with its covariance,
+is compared with new runs, and error motions compete for the residuals: six linear ones (scales, squareness) and the shape of each of the
+21. Selection is stepwise by the marginal likelihood of a linear normal model (as `abbe.models.solvers.components`) less the price, the
+logarithm of the number of candidates. For validation, one half of the set-ups chooses and the other judges, both ways round. Set-ups and
+lost motion are refitted throughout: a new cup is no change of the machine.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from abbe.models.solvers.priors import Priors
 from abbe.models.uncertainty.known_field import KnownField
 
 FEWEST_SETUPS = 2
-"""Set-ups of each half below which nothing can be judged."""
+"""Least set-ups of each half for cross-validation."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """One error motion that has changed.
+    """A changed error motion.
 
     Attributes
     ----------
@@ -35,13 +34,13 @@ class Change:
         ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for what is not linear in it (of an angle: all of it).
     value, u : float
         Change and standard uncertainty, all scales and squareness free beside it: rad (m/m) of a linear one; of a shape its rms over the
-        stroke, mm or rad. ``u`` holds what was not known of the machine before.
+        stroke, mm or rad. ``u`` includes the old solution's uncertainty.
     evidence : float
-        Gain in log evidence after its price, beside all others that were named.
+        Gain in log evidence after its price, beside all other named changes.
     rivals : tuple of (name, evidence less)
-        Others that explain nearly as much in its place: these runs cannot tell it from them.
+        Candidates that explain nearly as much in its place: these runs cannot distinguish them.
     halves : int
-        By how many of the two halves of the runs it was chosen without the other: 0 to 2.
+        Number of halves of the runs that chose it independently: 0 to 2.
     """
 
     name: str
@@ -54,12 +53,12 @@ class Change:
 
 @dataclass(frozen=True)
 class Changed:
-    """All that has changed.
+    """All changes found.
 
-    ``before_mm``, ``after_mm``, ``floor_mm``: rms of readings less the solution from before; less the changes, too, that the OTHER half
-    of the set-ups has chosen; and of noise. ``judged``: log of how much more likely each half is with what the other has chosen, the
-    smaller of the two. None: there are too few set-ups to judge. ``hidden``: how large each scale and squareness that was not named may
-    have changed all the same, rad; one that these runs do not see is not in it.
+    ``before_mm``: rms of readings minus the old solution. ``after_mm``: minus the changes, too, that the OTHER half of the set-ups chose.
+    ``floor_mm``: rms noise. ``judged``: log likelihood ratio of each half for the other's choice, the smaller of the two. None: too few
+    set-ups to judge. ``hidden``: bound on the change of each scale and squareness that was not named, rad, without those that these runs
+    do not see.
     """
 
     changes: tuple[Change, ...]
@@ -76,9 +75,9 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
     Parameters
     ----------
     known : KnownField
-        Solution from before, with its covariance.
+        The old solution, with its covariance.
     runs : tuple of RunData
-        Measured since, less what a table in force and known effects did, as those that were solved.
+        Runs measured since, corrected for the active table and known effects like the solved runs.
 
     Raises
     ------

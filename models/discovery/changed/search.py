@@ -1,4 +1,4 @@
-"""New runs of a machine that was solved before: candidates for what has changed, the choice among them, their sizes, and the judgement."""
+"""Search for changes of a solved machine in new runs: candidates, selection, sizes, and cross-validation."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from abbe.models.solvers.engine import CampaignFit, CampaignProblem
 from abbe.models.solvers.information import InformationSums
 from abbe.models.uncertainty.known_field import KnownField
 
-# How much more likely readings are if something has changed by an unknown amount: each candidate alone, all else integrated out.
+# Evidence of a change of unknown size: each candidate alone, all else integrated out.
 
 
 @dataclass(frozen=True)
 class AskedChange:
-    """A candidate: numbers of mean 0 and a standard deviation of ``sizes`` (which one is not known) along ``directions``, shape (p, q).
+    """A candidate: normal coefficients along ``directions``, shape (p, q), with mean 0 and one of ``sizes`` as standard deviation.
 
-    ``several``: a motion's shape, however many numbers that takes here; else one number with a meaning of its own.
+    ``several``: whether it is the shape of a motion; else a single coefficient (scale or squareness).
     """
 
     name: str
@@ -50,7 +50,7 @@ def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) ->
     gram, moment : arrays, shape (p, p) and (p,)
         Normal equations of the whitened readings, less what is expected without any change.
     base : array, shape (p, k)
-        Factor of the covariance of everything that is open without a change; it is integrated out.
+        Factor of the covariance of everything that is unknown without a change; it is integrated out.
     asked : sequence of AskedChange
 
     Returns
@@ -68,7 +68,7 @@ def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) ->
 
 
 def log_evidence(gram: F2, moment: F1, base: F2) -> float:
-    """Log of the marginal likelihood with everything along ``base`` open; constants that all bases share are left out."""
+    """Log marginal likelihood with everything along ``base`` unknown, less constants common to all bases."""
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
     low = linalg.cholesky(inside, lower=True)
@@ -103,7 +103,7 @@ POINTS = 41
 
 @dataclass(frozen=True)
 class TakenChange:
-    """A candidate that was chosen: with which size it stands beside the others, its gain after its price, and its near rivals."""
+    """A chosen candidate: its size beside the others, its gain after its price, and its near rivals."""
 
     asked: AskedChange
     size: float
@@ -113,7 +113,7 @@ class TakenChange:
 
 @dataclass(frozen=True)
 class Chosen:
-    """What some runs have chosen, and their normal equations less what the solution from before expects: (p, p) and (p,)."""
+    """Changes chosen from some runs, and the runs' normal equations relative to the old solution: (p, p) and (p,)."""
 
     taken: tuple[TakenChange, ...]
     gram: F2
@@ -122,7 +122,7 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class ChangeContext:
-    """The new runs, linearised about what they themselves say, and the machine from before. Unknowns in units of their typical size."""
+    """The new runs, linearised about their own fit, and the old solution. Unknowns in units of their typical size."""
 
     known: KnownField
     problem: CampaignProblem
@@ -134,7 +134,7 @@ class ChangeContext:
 
     @cached_property
     def _open(self) -> F2:
-        """Factor of what is open without any change, shape (p, p): the solution's own covariance, lost motion, set-ups."""
+        """Factor of the covariance without any change, shape (p, p): the old solution's, lost motion, set-ups."""
         typical, p, n = self.problem.sizes.typical, len(self.problem.names), self._n
         out = np.zeros((p, p))
         out[:n, :n] = self.known.root() / typical[:n, None]
@@ -143,7 +143,7 @@ class ChangeContext:
 
     @cached_property
     def candidates(self) -> tuple[AskedChange, ...]:
-        """All that may have changed, as far as the solution from before has terms for it."""
+        """All candidates for which the old solution has terms."""
         names = {t.motion if t.order == 0 else t.name for t in self.known.terms}
         linear = [m for m in LINEAR if (m if m[1] == "0" else f"{m}.1") in names]
         out = [AskedChange(m, self._scaled(self.known.linear({m: 1.0})), LINEAR_SIZES) for m in linear]
@@ -163,8 +163,8 @@ class ChangeContext:
     def choose(self, sums: InformationSums) -> Chosen:
         """Add the candidate with the largest gain until none gains enough; drop those that have become needless.
 
-        Greedy selection alone fails twice. A shape is so pliant that it may gain more at first than either of two linear changes which explain
-        all together. And of an equal growth of all axes each alone gains nothing, because a laser's wavelength explains it nearly as
+        Greedy selection alone fails twice. A flexible shape may gain more at first than either of two linear changes that together explain
+        everything. And if all axes grow equally, each alone gains nothing, because a laser's wavelength explains the growth nearly as
         well. So selection also starts from each linear candidate and from all of them; the choice that makes the readings most likely
         wins, the empty one included.
         """
@@ -180,7 +180,7 @@ class ChangeContext:
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
     def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
-        """Candidates that explain nearly as much in place of one that was chosen, beside all the others."""
+        """Candidates that explain nearly as much in place of a chosen one, beside all the others."""
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
         others = self._beside([t for t in chosen.taken if t is not taken])
@@ -209,7 +209,7 @@ class ChangeContext:
         return TakenChange(left[k], found[k].size, gain, ())
 
     def _needed(self, chosen: Chosen) -> Chosen:
-        """Every one with its gain and size beside all the others; the least needed goes first, until all are needed."""
+        """Gain and size of every choice beside all others; drops the least needed until all are needed."""
         taken = list(chosen.taken)
         while taken:
             for k, one in enumerate(taken):
@@ -226,11 +226,11 @@ class ChangeContext:
         return float(np.log(len(self.candidates)))
 
     def _beside(self, taken: Sequence[TakenChange]) -> F2:
-        """Factor of all that is open when these have changed, shape (p, k)."""
+        """Factor of the covariance when these have changed, shape (p, k)."""
         return np.column_stack([self._open, *(t.asked.directions * t.size for t in taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:
-        """The same with all scales and squareness free, too, without one candidate."""
+        """As `_beside`, with all scales and squareness free except candidate ``but``."""
         others = [t for t in chosen.taken if t.asked.name != but]
         names = {but, *(t.asked.name for t in others)}
         linear = [TakenChange(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
@@ -273,9 +273,9 @@ class ChangeContext:
         return np.asarray(term_values(self.known.terms, points, stroke) * mine)
 
     def hidden(self, chosen: Chosen) -> dict[str, float]:
-        """How large each scale and squareness that was not chosen may have changed all the same, rad: estimate and U (k = 2), without sign.
+        """Bound on the change of each scale and squareness that was not chosen, rad: |estimate| + U (k = 2), all linear ones free.
 
-        All linear ones are free. What these runs do not see, up to the largest size that is tried, is left out.
+        Changes that these runs do not see, up to the largest size that is tried, are left out.
         """
         names = {t.asked.name for t in chosen.taken}
         out = {}
@@ -297,13 +297,13 @@ class ChangeContext:
 
     @property
     def _whole(self) -> NDArray[np.bool_]:
-        """Readings that count."""
+        """Mask of valid readings."""
         return np.asarray(self.fit.weight > 0.5)
 
     def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float, float]:
-        """What each half says of the other's choice: rms of all readings without and with it, mm, set-ups refitted; gain in log likelihood.
+        """Each half judges the other's choice: rms of all readings without and with it, mm, set-ups refitted; gain in log likelihood.
 
-        The gain is the smaller one of the two halves, everything that is open without a change integrated out.
+        The gain is the smaller of the two halves, with everything that is unknown without a change integrated out.
         """
         old = self.known.coefficients
         before, after, count, gains = 0.0, 0.0, 0, []
@@ -317,7 +317,7 @@ class ChangeContext:
         return float(np.sqrt(before / count)), float(np.sqrt(after / count)), min(gains)
 
     def _likelier(self, mine: Chosen, change: F1) -> float:
-        """Log of how much more likely some runs are after a change of the coefficients that they did not choose."""
+        """Log likelihood ratio of some runs for a change of coefficients that other runs chose."""
         moved = self._scaled(change)[:, 0]
         shifted = mine.moment - mine.gram @ moved
         plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.moment, shifted))
@@ -337,5 +337,5 @@ class ChangeContext:
 
 
 def _is_shape(term: Term) -> bool:
-    """Whether a term is no scale and no squareness: those are asked apart."""
+    """Whether a term is neither scale nor squareness, which are candidates of their own."""
     return term.order > 0 and not (term.order == 1 and term.component == term.axis)

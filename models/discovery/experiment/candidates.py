@@ -1,4 +1,4 @@
-"""What could be measured next on this machine: the additions of run-format.md 5 that a campaign does not hold, as runs to be simulated."""
+"""Candidate experiments: the additions of run-format.md 5 that a campaign lacks, as runs to be simulated."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ READINGS = 120
 MARGIN = 0.05
 LONGER_TOOL_MM = 100.0
 ARM_MM = 100.0
-"""Two beams this far apart tell an angle."""
+"""Distance of the two beams of an angular measurement."""
 LATE_S = 3.0 * 3600.0
 GAP_S = 900.0
 FEED_MM_MIN = 1500.0
 SHORTEST_BAR_MM = 10.0
 """No ball-bar is shorter."""
 OTHER_FEED = 1.3
-"""Feeds that differ by a smaller factor are one feed: what grows with the feed then changes too little to be told from geometry."""
+"""Feeds that differ by a smaller factor count as one: feed-dependent effects then change too little to differ from geometry."""
 
 
 @dataclass(frozen=True)
 class ExperimentOffer:
-    """One addition: its runs; ``less``: runs whose readings are taken off (angular); minutes; why, for people."""
+    """One addition: its runs; ``subtracted``: runs whose readings are subtracted (angular); minutes; why, for people."""
 
     adds: str
     runs: tuple[CaseRun, ...]
     minutes: float
     why: str
-    less: tuple[CaseRun, ...] = ()
+    subtracted: tuple[CaseRun, ...] = ()
     knows_length: bool = False
 
     @property
     def special(self) -> bool:
-        """Whether it needs more than a ball-bar and a laser for straight lines."""
+        """Whether it needs more than a ball-bar and a linear laser."""
         return self.adds in ("angular_interferometer", "second_tool_length", "reference_length")
 
 
 def offers(case: Case) -> tuple[ExperimentOffer, ...]:
-    """Every addition that the identify runs do not hold already."""
+    """Every addition that the identify runs lack."""
     runs = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in runs if p.kind == "bar"], [p for p in runs if p.kind == "laser"]
     if not runs:
@@ -138,7 +138,7 @@ def _same_setup(path: Path, first: CaseRun) -> Path:
 
 
 def _fits(machine: Machine, centre_mm: F1, radius_mm: float) -> bool:
-    """Whether most of a hemisphere stays inside the strokes: the side that helices open to is not known here."""
+    """Whether most of a hemisphere stays inside the strokes, whichever side helices open to."""
     room = np.minimum(centre_mm - machine.stroke_mm[:, 0], machine.stroke_mm[:, 1] - centre_mm)
     return bool(np.sum(room >= radius_mm) >= 2)
 
@@ -246,7 +246,7 @@ def _angles(like: Path, start: float) -> ExperimentOffer:
             t += 1500.0
     runs = tuple(one)
     return ExperimentOffer(
-        "angular_interferometer", runs, 3 * LINE_MIN + _minutes(runs), "pitch and yaw of each axis by themselves", less=tuple(two)
+        "angular_interferometer", runs, 3 * LINE_MIN + _minutes(runs), "pitch and yaw of each axis by themselves", subtracted=tuple(two)
     )
 
 

@@ -1,8 +1,8 @@
-"""What to measure next: the addition that best separates the remaining suspects, by simulation (T-optimal design, Atkinson and Fedorov).
+"""Experiment design: the addition that best separates the remaining suspects, by simulation (T-optimal design, Atkinson and Fedorov).
 
-For every addition that the campaign does not hold, the suspect's own signal over old and new runs is fitted by each rival with everything
-that may change fitted anew: the rival's coefficients, the present simulation, the set-ups. What is left, in sigmas of the noise, is the
-expected separation. What separates most per minute is proposed, ball-bar and laser before optics and standards that few shops have.
+For every addition that the campaign lacks, each rival fits the suspect's signal over old and new runs with all unknowns free: the rival's
+coefficients, the present simulation, the set-ups. The residual, in sigmas of the noise, is the expected separation. The addition with the
+largest separation per minute is proposed, ball-bar and laser before optics and standards that few shops have.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path, Places
 
 THIN = 100
-"""Old runs count with so many readings each; a thinned reading stands for those left out."""
+"""Readings kept of each old run after decimation; each represents those left out."""
 ENOUGH = 5.0
-"""Separations above this many sigmas are as good as this one."""
+"""Separations above this many sigmas count as this one."""
 WORTH, LEAST = 2.0, 0.02
-"""Sigmas that make a test worth its time; what adds less than the second adds nothing."""
+"""Sigmas that make a test worth its time; an addition below the second adds nothing."""
 NOISE_MM = {"bar": 4e-4, "laser": 3e-4}
 LENGTH_MM = 3e-4
 SEPARATED = 4.0
@@ -43,7 +43,7 @@ class SuspectEffect:
     Attributes
     ----------
     coefficients : array, shape (k,)
-        As found; only of the leading suspect they are looked at. None: typical strength.
+        As found; used for the leading suspect only. None: typical strength.
     """
 
     effect: Effect
@@ -59,7 +59,7 @@ class SuspectEffect:
 
 @dataclass(frozen=True)
 class Prospect:
-    """What an addition would tell: separation of the leader from each rival, sigmas, in the order of the rivals; what is known already."""
+    """Expected separation of the leader from each rival with an addition, and without it, sigmas, in the order of the rivals."""
 
     offer: ExperimentOffer
     sigmas: F1
@@ -67,18 +67,18 @@ class Prospect:
 
     @property
     def gain(self) -> F1:
-        """Sigmas that it adds, by rival."""
+        """Added sigmas, by rival."""
         return np.asarray(self.sigmas - self.already)
 
     @property
     def plain(self) -> bool:
-        """Whether what is at hand anyway, ball-bar and laser, is enough: no other tool holder, standard or optics."""
+        """Whether ball-bar and laser suffice: no other tool holder, standard or optics."""
         open_ = self.already < SEPARATED
         return not self.offer.special and bool((self.sigmas[open_] >= SEPARATED).all() and open_.any())
 
     @property
     def per_minute(self) -> float:
-        """Gain in squared separation per minute, what is enough counted as enough."""
+        """Gain in squared separation per minute, each separation capped at `ENOUGH`."""
         gain = np.minimum(self.sigmas, ENOUGH) ** 2 - np.minimum(self.already, ENOUGH) ** 2
         return float(np.maximum(gain, 0.0).sum() / max(self.offer.minutes, 1.0))
 
@@ -86,18 +86,18 @@ class Prospect:
 def propose(
     case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
 ) -> NextTest | None:
-    """The addition that tells the leading suspect from its rivals best, per minute.
+    """The addition that best separates the leading suspect from its rivals, per minute.
 
     Parameters
     ----------
-    leader : the suspect that is named, with its coefficients.
-    rivals : what it may be instead.
+    leader : the named suspect, with its coefficients.
+    rivals : alternatives to it.
     noise_mm : of one reading of "bar" and "laser"; instruments that the campaign lacks get usual ones.
 
     Returns
     -------
     NextTest or None
-        None without rivals, or where nothing on offer tells anything. Where nothing adds two sigmas, what adds most, with what it adds.
+        None without rivals, or if no addition separates anything. If none adds two sigmas: the one that adds most.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:
@@ -114,13 +114,13 @@ def propose(
 def prospects(
     case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
 ) -> tuple[Prospect, ...]:
-    """All additions with what they would tell, best per minute first; parameters as `propose`."""
+    """All additions with their expected separations, best per minute first; parameters as `propose`."""
     found = offers(case)
     if not rivals or not found:
         return ()
     noise = {**NOISE_MM, **(noise_mm or {})}
     old = tuple(_thinned(r) for r in case.of("identify"))
-    new = tuple(r for o in found for r in (*o.runs, *o.less))
+    new = tuple(r for o in found for r in (*o.runs, *o.subtracted))
     every = replace(case, runs=tuple(r for r, _ in old) + new)
     table = _Columns.of(_with_setups(every), leader, rivals, tuple(r.path for r in every.runs))
     known = np.sum([table.gram(r, k, w / noise[r.path.kind] ** 2) for k, (r, w) in enumerate(old)], axis=0)
@@ -129,20 +129,20 @@ def prospects(
     for offer in found:
         gram = known.copy()
         for i, run in enumerate(offer.runs):
-            less = (offer.less[i], at + len(offer.runs) + i) if offer.less else None
-            gram += table.gram(run, at + i, 1.0 / noise[run.path.kind] ** 2, less)
-        at += len(offer.runs) + len(offer.less)
+            subtracted = (offer.subtracted[i], at + len(offer.runs) + i) if offer.subtracted else None
+            gram += table.gram(run, at + i, 1.0 / noise[run.path.kind] ** 2, subtracted)
+        at += len(offer.runs) + len(offer.subtracted)
         out.append(Prospect(offer, table.left(gram, knows_length=offer.knows_length), already))
     return tuple(sorted(out, key=lambda p: (not p.plain, -p.per_minute, p.offer.minutes, p.offer.adds)))
 
 
 def _with_setups(case: Case) -> Baseline:
-    """The present simulation with unknowns for every set-up; a new mounting always has a cup, a length and a tilt that nobody knows."""
+    """The present simulation with unknowns for every set-up; a new mounting always has an unknown cup, length and tilt."""
     return baseline_of(replace(case, includes=case.includes | {"setup_centre_offset", "bar_length_error", "mirror_tilt"}))
 
 
 def _thinned(run: CaseRun) -> tuple[CaseRun, float]:
-    """A run with fewer readings, and for how many each stands."""
+    """A run with fewer readings, and how many each represents."""
     step = max(run.path.n // THIN, 1)
     p, rows = run.path, slice(None, None, step)
     a = p.at
@@ -177,11 +177,11 @@ class _Columns:
         found = tuple(tuple(r.effect.signal(paths, r.key, r.values)) for r in rivals)
         return cls(base, tuple(np.asarray(s @ c) for s in own), found)
 
-    def gram(self, run: CaseRun, k: int, weight: float, less: tuple[CaseRun, int] | None = None) -> F2:
-        """Normal matrix of one run: unknowns of the simulation, rivals, leader; ``less``: a run whose readings are taken off, its place."""
+    def gram(self, run: CaseRun, k: int, weight: float, subtracted: tuple[CaseRun, int] | None = None) -> F2:
+        """Normal matrix of one run: simulation's unknowns, rivals, leader; ``subtracted``: a run whose readings are subtracted, its index."""
         columns = self._of_run(run, k)
-        if less is not None:
-            columns = columns - self._of_run(*less)
+        if subtracted is not None:
+            columns = columns - self._of_run(*subtracted)
         return np.asarray(columns.T @ columns * weight)
 
     def _of_run(self, run: CaseRun, k: int) -> F2:
@@ -189,7 +189,7 @@ class _Columns:
         return np.column_stack([jacobian, *(r[k] for r in self.rivals), self.leader[k]])
 
     def left(self, gram: F2, *, knows_length: bool = False) -> F1:
-        """Length of the leader's signal that neither a rival nor the simulation can imitate, sigmas, by rival."""
+        """Norm of the leader's signal that neither a rival nor the simulation can imitate, sigmas, by rival."""
         n, out = self.base.size, []
         sd = self.base.prior_sd * WIDE
         if knows_length:
@@ -208,7 +208,7 @@ class _Columns:
 
 
 def usual(suspect: SuspectEffect, columns: int) -> F1:
-    """Coefficients of the middle of what is usual, in the first column, for any power law of the strength."""
+    """Coefficients for the middle of the usual range, in the first column, for any power law of the strength."""
     effect = suspect.effect
     sizes = [abs(effect.strength(c * effect.per_unit * np.eye(columns)[0], suspect.values)) / effect.per_unit for c in (1.0, 4.0)]
     power = np.log(sizes[1] / sizes[0]) / np.log(4.0)

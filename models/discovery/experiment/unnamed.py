@@ -1,4 +1,4 @@
-"""What to measure next where something is missing that has no name: what would show whose it is, by the kind of structure it is."""
+"""Experiments for a structure without a name: the measurement that would show its cause, by the kind of structure."""
 
 from __future__ import annotations
 

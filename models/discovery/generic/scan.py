@@ -1,8 +1,8 @@
-"""Where a search for an unnamed structure starts: the few places, moments and periods at which what is left of the readings stands out.
+"""Starts of the search for unnamed structures: the few places, times and periods at which the residuals stand out.
 
-A step may be at any moment, a surge of any period: thousands of starts, too many to project each onto the complement of the present model.
-The product of a candidate's column with the residual needs no projection (the residual is projected already), only its length does; so a
-scan with approximate lengths finds the candidates' best starts, which then compete with their exact columns.
+A step may occur at any time, a surge have any period: thousands of starts, too many to project each onto the complement of the present
+model. The inner product of a candidate's column with the (already projected) residual needs no projection, only the column's norm does. So
+a scan with approximate norms finds the candidates' best starts, which then compete with their exact columns.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ PITCHES_MM = (6.0, 60.0)
 BURST_S = (0.35, 0.8, 1.8)
 BURST_HZ = (0.15, 8.0)
 CELL_MM = 14.0
-"""Distance of the bumps' centres that are tried."""
+"""Distance between the centres of tried bumps."""
 PLACES = 64
-"""So many of them are tried at once; each has hundreds of readings near it."""
+"""Centres tried at once; each has hundreds of readings near it."""
 
 
 @dataclass(frozen=True)
 class ScanResult:
-    """What is left of the readings of some runs: ``rest`` whitened, ``sigma_mm`` of one reading of each run."""
+    """Residuals of some runs: ``rest`` whitened, ``sigma_mm`` of one reading of each run."""
 
     paths: tuple[Path, ...]
     rest: tuple[F1, ...]
@@ -57,7 +57,7 @@ def best(score: F1, count: int, apart: int) -> list[int]:
 
 
 def step_moments(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Moments of a step per axis and, ``""``, in all directions at once: by set-up of a bar, by run of a laser, whose zero is new."""
+    """Times of a step per axis and, ``""``, in all directions at once: by set-up of a bar, by run of a laser, whose zero is new."""
     groups: dict[str, list[int]] = {}
     for k, p in enumerate(seen.paths):
         groups.setdefault(f"bar {p.setup}" if p.kind == "bar" else f"laser {p.label}", []).append(k)
@@ -103,7 +103,7 @@ def pitches(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
 
 
 def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F1, bin_size: float) -> tuple[F1, F2]:
-    """Frequencies, and the chi-square that a wave in ``x`` of every one of them takes out, shape (columns, frequencies).
+    """Frequencies, and the reduction of chi-square by a wave in ``x`` of each, shape (columns, frequencies).
 
     By a Fourier transform of readings that are binned in ``x``; lengths are those of an unprojected column.
     """
@@ -118,7 +118,7 @@ def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F
 
 
 def bursts(seen: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Moments, widths and frequencies of short swings in single bar runs: each the values of the best few combinations."""
+    """Times, widths and frequencies of short oscillations in single bar runs: the values of the best few combinations."""
     found: list[tuple[float, float, float, float]] = []
     for p, rest in zip(seen.paths, seen.rest, strict=True):
         if p.kind != "bar" or p.n < 20:
@@ -142,7 +142,7 @@ def bursts(seen: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float
 
 
 def bumps(seen: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
-    """Moments at which the path passes the places where a bump would take out most."""
+    """Times at which the path passes the places where a bump would explain most."""
     q = np.concatenate([p.at.q_mm for p in seen.paths])
     t, look, rest = seen.stacked()
     _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
@@ -158,7 +158,7 @@ def bumps(seen: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[f
 
 
 def _bump_gains(places: F2, tree: cKDTree, look: F2, rest: F1, widths_mm: tuple[float, ...]) -> F1:
-    """What a bump at each place takes out at most, of any of the widths, shape (places,)."""
+    """Largest reduction of chi-square by a bump of any width at each place, shape (places,)."""
     near = cKDTree(places).sparse_distance_matrix(tree, 2.5 * max(widths_mm), output_type="coo_matrix")
     total = np.zeros(len(places))
     for width in widths_mm:

@@ -1,4 +1,4 @@
-"""Signals of structures that have no name: what a reading looks like when something of this kind is there, whatever its cause."""
+"""Signals of structures without a name: readings by kind of structure, whatever its cause."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ UM = 1e-3
 """Columns are mm per micrometre."""
 SMOOTH_ORDERS = (2, 3, 4, 5, 6)
 ODD_ORDERS = (1, 2, 3)
-"""Without the constant: a jump to the side at every turn has a name, and a structure that holds it too would take its place."""
+"""Without the constant: a jump at every reversal has a name, and a structure that includes it would replace the name."""
 ARM_MM = 300.0
-"""Rotations of a slip are stated as what they move at this distance, so that all its columns are micrometres."""
+"""Rotations of a slip are stated as displacements at this distance, so that all its columns are in micrometres."""
 
 
 def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
@@ -25,7 +25,7 @@ def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """The same times the direction in which the axis last moved, orders 1 to 3."""
+    """A smooth function times the direction of the axis' last motion, orders 1 to 3."""
 
     def deviation(p: Path, at: Places) -> F3:
         return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(p, at, key[2], ODD_ORDERS))
@@ -48,7 +48,7 @@ def surge(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def step(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """All positions of one axis are off from ``t0_s`` on."""
+    """A constant offset of one axis from ``t0_s`` on."""
     return [p.read(lambda at: _along(key, (at.t_s >= values["t0_s"]).astype(np.float64)[:, None])) for p in paths]
 
 
@@ -65,7 +65,7 @@ def slip(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def settling(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """One axis wanders off from ``t0_s`` on and comes to rest, time constant ``tau_s``."""
+    """One axis drifts from ``t0_s`` on and settles with time constant ``tau_s``."""
 
     def gone(t_s: F1) -> F2:
         return np.asarray(-np.expm1(-np.maximum(t_s - values["t0_s"], 0.0) / values["tau_s"]))[:, None]
@@ -113,7 +113,7 @@ def _lobed(look: F2, polar: int, number: int) -> F2:
 
 
 def burst(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A ball-bar's reading swings for a moment: about ``t0_s``, for ``width_s`` (standard deviation), with ``frequency_hz``."""
+    """A ball-bar's reading oscillates with ``frequency_hz`` about ``t0_s``, under a Gaussian of standard deviation ``width_s``."""
     out = []
     for p in paths:
         since = p.at.t_s - values["t0_s"]

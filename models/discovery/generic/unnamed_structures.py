@@ -1,6 +1,6 @@
-"""Structures without a name: effects that mean "unknown". They compete with the catalogue in the same contest, and say where the gap lives.
+"""Structures without a name: effects that mean "unknown", compete with the catalogue in the same contest, and locate the gap.
 
-Without them four of five effects outside of the catalogue get a wrong name (discovery.md 2, variant C).
+Without them four of five effects outside the catalogue get a wrong name (discovery.md 2, variant C).
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ SOURCE = "effects.md 5; discovery.md 4, candidates"
 TOP = 6
 """Starts per label that a scan of the residuals keeps."""
 CLOCK_S = 30.0
-"""A moment is stated with this margin."""
+"""Margin of a stated time."""
 NO_TEST = "measure again: nothing in the catalogue looks like this"
 
 
 def is_unnamed(name: str) -> bool:
-    """Whether a name means that something is there which the catalogue does not explain."""
+    """Whether a name is that of a structure outside the catalogue."""
     return name.startswith(PREFIX)
 
 
@@ -45,8 +45,8 @@ def generic_rivals(
     Parameters
     ----------
     residuals : dict, optional
-        Whitened residuals of runs by label, shape (n,) each, zero at readings that do not count: what the present model leaves. With them a
-        scan finds the starts (call again when the model has grown); without them the starts are a coarse grid.
+        Whitened residuals of runs by label, shape (n,) each, zero at invalid readings. With them a scan finds the starts (call again when
+        the model has grown); without them the starts are a coarse grid.
     sigma_mm : dict, optional
         Noise of one reading of "bar" and "laser"; only needed with residuals.
 
@@ -67,7 +67,7 @@ def generic_rivals(
 
 
 def where_of(effect: Effect, key: str, values: Values, case: Case) -> Localization:
-    """Where an unnamed structure lives, from its parameters (time, place, period, lobes) and from where its columns are (tests, axes).
+    """Localization of an unnamed structure, from its parameters (time, place, period, lobes) and its columns (tests, axes).
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def _coarse(paths: tuple[Path, ...]) -> Starts:
 
 
 def _apart(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-    """One run of every different path: way back and other feeds pass the same places."""
+    """One run of every different path; the way back and other feeds pass the same places."""
     seen: dict[tuple[float, ...], Path] = {}
     for p in paths:
         seen.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)
@@ -175,7 +175,7 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
 
 
 def _resolved_s(paths: Sequence[Path]) -> float:
-    """Shortest period that the readings of the quickest run tell from a longer one: two intervals."""
+    """Shortest period that the readings of the quickest run resolve: two intervals."""
     steps = [float(np.median(np.diff(p.at.t_s))) for p in paths if p.n > 1]
     return 2.0 * min(steps, default=np.inf)
 

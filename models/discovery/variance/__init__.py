@@ -1,1 +1,1 @@
-"""Readings that scatter more than noise: where, when and with which rhythm."""
+"""Variance effects: where, when and at which frequency readings scatter more than noise."""

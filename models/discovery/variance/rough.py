@@ -1,4 +1,4 @@
-"""Roughness that is there at times only: while an axis creeps (stick-slip), or for some seconds of one run (interference)."""
+"""Intermittent roughness: while an axis creeps (stick-slip), or for some seconds of one run (interference)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from abbe.models.effects.path import Path
 
 GATES_MM_S = (0.7, 0.9, 1.15, 1.45, 1.8, 2.25, 2.8, 3.5, 4.4)
 REFINED = 2
-"""So many of the gates with the best score are fitted."""
+"""Gates with the best scores that are fitted."""
 LEAST_READINGS = 12.0
 """A gate that fewer readings pass proves nothing."""
 ALIKE = 1.94
-"""Squares of the second differences of white noise are alike from reading to reading: so much less do they count."""
+"""Divisor for squared second differences, which are correlated from reading to reading for white noise."""
 FEW = 3
-"""What so many readings gain does not count: a turn that the mean misses by a reading is no roughness."""
+"""The gain of this many readings does not count: a reversal that the mean misses by a reading is no roughness."""
 WINDOWS_S = (1.0, 2.0, 4.0)
 
 
@@ -35,11 +35,11 @@ class Roughness:
 
 
 def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> dict[int, Roughness]:
-    """The most likely speed of each axis below which the readings are rougher; axes that creep in no run are left out.
+    """Most likely stick-slip speed of each axis, below which the readings are rougher; without axes that creep in no run.
 
     A saw-tooth of half height h fades with speed as exp(-(v/v_c)^2) (Stribeck's curve) and has the variance h^2/3. Scatter along each axis
-    at any speed is allowed for (a vibration is not stick-slip), and what does not change from reading to reading does not count: it may be
-    left of the mean of a reversal.
+    at any speed is fitted too (a vibration is not stick-slip). Deviations that are constant from reading to reading do not count: they may
+    be residues of the mean at a reversal.
     """
     look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
     values = np.concatenate(rest)
@@ -62,7 +62,7 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
 
 
 def _readings(gate: F1) -> float:
-    """How many readings a gate lets through."""
+    """Effective number of readings in a gate."""
     return float(gate.sum() ** 2 / max(float(gate @ gate), 1e-300))
 
 
@@ -88,7 +88,7 @@ class _RoughnessFit:
         return cls(square, plain, _likelihood(square, plain, np.full(3, 0.02)))
 
     def score(self, gate: F1) -> float:
-        """What a gate gains about, without a fit."""
+        """Approximate gain of a gate, without a fit."""
         v = self.start[0] * (1.0 + self.plain @ self.start[1:])
         slope = 0.5 * float(np.sum((self.square / v - 1.0) * gate / v))
         return float(max(slope, 0.0) ** 2 / np.sum((gate / v) ** 2))

@@ -1,8 +1,8 @@
-"""Effects that are in the scatter of the readings, not in their mean: vibration, stick-slip, outliers of a laser, bursts of interference.
+"""Effects in the variance of the readings, not in their mean: vibration, stick-slip, outliers of a laser, bursts of interference.
 
-Each is tested on whitened residuals against scatter that is everywhere the same. The evidence is a log likelihood ratio less its price, on
-the scale of half a chi-square: above zero it is worth its name. Prices count what was tried (frequencies, axes, windows): noise alone
-passes in less than 3 of 1000 campaigns each.
+Each is tested on whitened residuals against uniform scatter. The evidence is a log likelihood ratio less its price, on the scale of half a
+chi-square; an effect is named when it is positive. Prices account for the number of trials (frequencies, axes, windows): noise alone passes
+in less than 3 of 1000 campaigns each.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from abbe.models.discovery.variance.spectrum import fast, line_of_axis
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
-# Readings that are off because of where the machine is, not because a beam was lost: those nearby are off as well.
+# Outliers caused by the machine's position, not by a lost beam: the readings nearby deviate as well.
 
 
 NEAR_MM, LOUD = 30.0, 3.0
-"""A reading so near tells of the same place; one counts up to so many standard deviations."""
+"""Readings within this distance are of the same place; each counts up to this many standard deviations."""
 
 
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
-    """How far the readings near those that are off go along with them, standard deviations, and the middle of the place, (3,) mm.
+    """Common deviation of the readings near the outliers, standard deviations, and the middle of the place, (3,) mm.
 
-    A lost beam is off once: readings nearby, and at the same place at another time, know nothing of it, so that the first is within 3.
+    A lost beam affects no readings nearby, nor at the same place at another time, so the first value is then within 3.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
     rest : array, shape (n,)
         Whitened residuals; exact zeros are no readings.
     off : array of bool, shape (n,)
-        Which of them are off.
+        Which of them are outliers.
     """
     total = count = most = 0.0
     held, middle = np.clip(rest, -LOUD, LOUD), np.zeros(3)
@@ -56,21 +56,21 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
     return (total / np.sqrt(count) if count else 0.0), np.asarray(middle)
 
 
-# Few readings that are off: a mixture of noise and of something wider against noise alone.
+# A few outliers: a mixture of noise and a wider distribution against noise alone.
 
 
 RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
 SIZES = np.geomspace(1.5, 60.0, 24)
-"""How far a reading that is off is off typically, in sigmas, to either side."""
+"""Typical sizes of outliers, in sigmas, to either side."""
 SPREAD = 0.4
-"""How much that differs from one to the next (standard deviation, share of it)."""
+"""Relative standard deviation of the outliers' size."""
 SCALES = np.linspace(0.75, 1.1, 15)
 """Noise of the good readings over the rms of all: free, or a wrong noise would look like outliers."""
 
 
 @dataclass(frozen=True)
 class Contaminated:
-    """Gain in log likelihood, share of readings that are off, by how much typically (sigmas) and its uncertainty."""
+    """Gain in log likelihood, share of outliers, their typical size (sigmas) and its uncertainty."""
 
     gain: float
     rate: float
@@ -109,22 +109,22 @@ UM = 1e3
 NAME_PRICE = 7.0
 """Paid on top of the number of things tried, as natural logarithm: noise alone gains this with a probability of about exp(-7)."""
 OFF, PLACE_Z = 3.5, 4.0
-"""Standard deviations from which on a reading is off, and from which on those near it prove that it is the place and not the beam (of 13
-campaigns with lost beams none above 1.2, of three with a bump none below 4.2)."""
+"""Standard deviations from which a reading is an outlier, and from which those near it prove that the place is the cause, not the beam (of
+13 campaigns with lost beams none above 1.2, of three with a bump none below 4.2)."""
 LEAST_LASER = 60
-"""Fewer laser readings say nothing about 1 in 100."""
+"""Least laser readings for estimating a rate of 1 in 100."""
 
 
 @dataclass(frozen=True)
 class VarianceFinding:
-    """One effect of the scatter.
+    """One variance effect.
 
     Attributes
     ----------
     name, key : of the catalogue, or ``unnamed_burst`` (a moment of one run) or ``unnamed_place`` (readings of a laser near one place).
     strength, u_strength : amplitude or typical size, um, with its standard uncertainty.
     parameters : ``frequency_hz``; ``v_c`` (mm/s); ``rate``, share of readings that are off; or ``t0_s`` and ``width_s``.
-    evidence : log likelihood ratio less price; above zero it is worth a name.
+    evidence : log likelihood ratio less price; named when positive.
     """
 
     name: str
@@ -149,19 +149,19 @@ def extra_variance(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """Effects of the scatter that are worth a name, by evidence; at most one of vibration and stick-slip per axis.
+    """Variance effects with positive evidence, highest first; at most one of vibration and stick-slip per axis.
 
     Parameters
     ----------
     paths : runs.
     whitened : one array (n,) per run
-        Whitened residuals after everything known of the mean was taken out; unit variance for noise alone. Outliers must still be in them;
-        exact zeros count as no reading.
+        Whitened residuals after removal of everything known of the mean; unit variance for noise alone. They must include outliers; exact
+        zeros count as no reading.
     sigma_mm : noise of one reading of each run.
     leverage : one array (n,) per run, optional
-        Share of each reading's noise that the fit took with it.
+        Share of each reading's noise that the fit absorbed.
     colours : noise by "bar" and "laser", optional
-        With what the residuals were whitened; taken as white without.
+        Noise with which the residuals were whitened; default: white.
 
     Returns
     -------
@@ -181,12 +181,12 @@ def extra_variance(
 
 DRIVES = ("stick_slip", "vibration")
 OVERSHADOWS = 3.0
-"""Roughness of one axis shows a little along the others, a line a little at low speed: what is this much weaker is explained. The price:
-beside a vibration, a second one of less than about 0.6 of its size has no name."""
+"""Roughness of one axis shows a little along the others, a spectral line a little at low speed: a finding weaker by this factor counts as
+explained. As a consequence, a second vibration of less than about 0.6 of the first's size is not named."""
 
 
 def _overshadows(strong: VarianceFinding, weak: VarianceFinding) -> bool:
-    """Whether a finding along an axis is explained by a stronger one along it, or by a much stronger one along another."""
+    """Whether ``strong`` explains ``weak``: it is stronger along the same axis, or much stronger along another."""
     return strong.name in DRIVES and (strong.key == weak.key or strong.evidence > OVERSHADOWS * weak.evidence)
 
 
@@ -198,7 +198,7 @@ def candidates(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """All effects of the scatter with their evidence, worth a name or not; parameters as `extra_variance`."""
+    """All variance effects with their evidence, also negative; parameters as `extra_variance`."""
     even = _studentised(whitened, leverage)
     bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
     out: list[VarianceFinding] = []
@@ -233,7 +233,7 @@ def _vibration(
     where = Localization(where.tests, (AXES[axis],), where.directions, where.runs, period_s=1.0 / line.frequency_hz, depends_on=("time",))
     size, u, v = line.amplitude_mm * UM, line.u_mm * UM, _creep(axis, paths)
     if v is not None and line.p_harmonics < SAW_P:
-        # at one creeping speed a saw-tooth in position is one in time; how much of it that speed leaves is not known
+        # at a single creeping speed a saw-tooth in position is one in time, and its fading with speed is unknown
         size *= 0.5 * np.pi * np.e
         return [VarianceFinding("stick_slip", AXES[axis], size, size, {"v_c": v}, evidence, where)]
     return [VarianceFinding("vibration", AXES[axis], size, u, {"frequency_hz": line.frequency_hz}, evidence, where)]

@@ -1,4 +1,4 @@
-"""A line in the spectrum of all runs at one physical frequency, folded differently by every rate of sampling, with a phase per run."""
+"""A spectral line of all runs at one physical frequency, aliased differently by every sampling rate, with a phase per run."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from abbe.models.probability import chi2_above
 HERTZ = (2.0, 75.0)
 PADDING = 4
 LOW_CYCLES, PER_TURN = 6.0, 2.0
-"""Folded frequencies with fewer cycles per run, and per turn of the bar, belong to what is left of the mean."""
+"""Aliased frequencies with fewer cycles per run, and per turn of the bar, belong to the residues of the mean."""
 LOBES_PER_TURN = 12.0
-"""Up to so many cycles per turn of the bar a line may be a form of the balls or of the machine instead: such runs do not prove a line."""
+"""Up to this many cycles per turn of the bar a line may be form of the balls or the machine: such runs do not prove a line."""
 REGULAR = 0.02
 """Sampling counts as regular when its steps differ by less than this share."""
 TOP = 24
@@ -27,7 +27,7 @@ TOP = 24
 class SpectralLine:
     """Gain in log likelihood (of the runs that prove it), how many frequencies were tried, frequency, amplitude with its uncertainty.
 
-    ``p_harmonics``: how often noise gives as much at twice to four times the frequency; a saw-tooth has them, a vibration has not.
+    ``p_harmonics``: p-value of the power at twice to four times the frequency, which a saw-tooth has and a vibration has not.
     """
 
     gain: float
@@ -62,8 +62,8 @@ def line_of_axis(
 
     Parameters
     ----------
-    rest : whitened residuals by run, shape (n,) each, without what is slow (`fast`).
-    colour : of the noise that they were whitened with: a line is weakened or raised by it.
+    rest : whitened residuals by run, shape (n,) each, high-passed (`fast`).
+    colour : of the noise that they were whitened with, which weakens or raises a line.
     """
     spectra = [s for p, r, m in zip(paths, rest, sigma_mm, strict=True) if (s := _spectrum(axis, p, r, m, colour)) is not None]
     if not spectra:
@@ -112,7 +112,7 @@ def _spectrum(axis: int, path: Path, rest: F1, sigma_mm: float, colour: Colour |
 
 
 def fast(path: Path, rest: F1) -> F1:
-    """Residuals of a run without what changes slowly: its leakage would raise every other frequency."""
+    """High-passed residuals of a run: leakage of slow changes would raise every other frequency."""
     n = rest.size
     x = np.arange(n) / max(n, 1)
     turns = 2.0 * np.pi * np.outer(x, np.arange(1, min(int(_low_cycles(path)), n // 6) + 1))

@@ -1,4 +1,4 @@
-"""What would make hidden combinations visible: every usual addition to a campaign is tried out
+"""Cures for hidden combinations: every usual addition to a campaign is tried out
 (`abbe.models.solvers.observability.cures`).
 
 Nothing is looked up: the rank with each addition is computed on the campaign at hand, so the advice fits this machine and these runs.
@@ -33,7 +33,7 @@ from abbe.models.solvers.observe import SetupUnknowns, setup_unknowns, with_tool
 from abbe.models.solvers.observe_setup import SAME_PLACE_MM, straight_line_of
 from abbe.models.solvers.priors import Priors
 
-# What a campaign holds already, so that a cause is a fact about these runs and a cure is something that is not there yet.
+# Contents of a campaign: a cause states a fact about its runs, and a cure proposes something that it lacks.
 
 
 ALONG = 1e-3
@@ -43,7 +43,7 @@ STEP_ORDERS = ("XYZ", "ZYX", *("".join(p) for p in permutations("XYZ") if p not 
 
 @dataclass(frozen=True)
 class Present:
-    """Runs of a campaign by what they are.
+    """Runs of a campaign by kind.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ def _stepped(run: RunData) -> list[tuple[str, str]]:
 
 
 def place_text(axis: int, place_mm: F1) -> str:
-    """Where a line along an axis stands: "Y = 40 mm, Z = 30 mm"."""
+    """Place of a line along an axis: "Y = 40 mm, Z = 30 mm"."""
     return ", ".join(f"{AXES[k]} = {place_mm[k]:.0f} mm" for k in range(3) if k != axis)
 
 
@@ -134,7 +134,7 @@ def on_opposite_edges(machine: Machine, axis: int, places: tuple[F1, ...]) -> bo
 
 LONGER_MM = 100.0
 ASIDE_MM = (100.0, 50.0)
-"""Virtual tools: that much longer; that far off the spindle's axis (math.md 4.6)."""
+"""Virtual tools: additional length, and distance from the spindle's axis (math.md 4.6)."""
 READINGS, RUNS = 130, 10
 """Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
 SHORTEST_BAR_MM = 10.0
@@ -145,7 +145,7 @@ MARGIN = 0.1
 
 @dataclass(frozen=True)
 class Addition:
-    """One thing that could be done: why something is hidden without it, what to do, and what it would be in numbers.
+    """One possible addition: the cause that it removes, the cure as text, and its virtual runs or knowledge.
 
     ``ending``: how "cannot be told apart" goes on without it.
     """
@@ -174,7 +174,7 @@ def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, nam
 
 
 def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
-    """What need not be measured on the machine."""
+    """Additions that need no measurement on the machine."""
     out = []
     if lengths := tuple(n for n in names if n.startswith("bar_length_") and n not in known.held):
         some = any(n.startswith("bar_length_") for n in known.held)
@@ -321,7 +321,7 @@ SHOWN = 1e-7
 
 @dataclass(frozen=True)
 class CampaignLayout:
-    """What was, or is to be, measured: nominal machine, model terms, runs, their compressed columns, and what is known of the set-up."""
+    """A measured or planned campaign: nominal machine, model terms, runs, their compressed columns, and knowledge of the set-up."""
 
     machine: Machine
     terms: tuple[Term, ...]
@@ -343,7 +343,7 @@ class CureTrial:
 
 
 def count_observed(seen: F2) -> int:
-    """How many hidden combinations a design, shape (rows, k), shows; what was hidden shows less than 1e-9 there (unit columns)."""
+    """Number of hidden combinations that a design, shape (rows, k), shows; hidden ones show less than 1e-9 (unit columns)."""
     s = singular_values(seen) if seen.size else np.zeros(0)
     return int((s > SHOWN).sum())
 
@@ -395,7 +395,7 @@ def _shown(campaign: CampaignLayout, addition: Addition, hidden: Play) -> F2:
 
 
 def _known_with(campaign: CampaignLayout, runs: tuple[RunData, ...], setup: SetupUnknowns, new: CampaignColumns) -> Knowledge:
-    """Unknowns that the addition brings are known or free by the same rules as the old ones, which stay what they were."""
+    """Knowledge with the addition's new unknowns, by the same rules as the old ones, which do not change."""
     known, before = campaign.known, set(campaign.columns.setup_names)
     stated = stated_knowledge(campaign.terms, runs, setup.names).held
     held = {n: v for n, v in stated.items() if n not in before} | {n: v for n, v in known.held.items() if n in new.setup_names}

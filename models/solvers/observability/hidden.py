@@ -1,4 +1,4 @@
-"""The null space of a campaign told to a metrologist: what, why, what it may do to a workpiece, and what would show it."""
+"""The null space of a campaign in a metrologist's terms: combinations, causes, effect on a workpiece, and cures."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from abbe.models.solvers.observability.volume import frame_free_design, inner_bo
 from abbe.models.solvers.observe import with_tool
 
 LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
-"""Combinations of up to so many motions are looked for by trying all sets, first among orders up to LOW (a slope of an angle times the
-travel of its own axis is of order 2), then among all; what is left over are mixtures."""
+"""Largest sets of motions that are all tried for hidden combinations: among all orders, and among orders up to LOW (a slope of an angle
+times the travel of its own axis is of order 2), which come first. The remaining combinations are mixtures."""
 INSIDE = 1e-9
 """A set of motions holds a hidden combination if its share of the null space misses 1 by less than this (squared leak)."""
 ENTRY = 1e-6
@@ -71,7 +71,7 @@ def part_text(motion: str, orders: Iterable[int]) -> str:
 
 
 def sentence(terms: tuple[Term, ...], family: Family, ending: str = "") -> str:
-    """What cannot be told apart, and how much of one looks like how much of the other where that is one number."""
+    """Sentence about the motions that cannot be distinguished, with their ratio where it is one number."""
     parts = [part_text(m, _orders(terms, family, m)) for m in family.motions]
     if len(parts) == 1:
         return f"{_upper(parts[0])} leaves no trace{ending}"
@@ -117,7 +117,7 @@ def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None 
     factor : array, shape (p,)
         Coefficient = factor times unit-column value: the families' vectors are in the coefficients' own units.
     found : array, shape (p, m), optional
-        Orthonormal combinations already told; only what is independent of them is told again.
+        Orthonormal combinations already reported; only combinations independent of them are returned.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None 
 
 
 def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, told: F2, count: int) -> tuple[list[tuple[tuple[str, ...], F2]], F2]:
-    """Hidden combinations of sets of up to ``largest`` motions, smallest sets first, that were not told yet, and all that is told then."""
+    """New hidden combinations of sets of up to ``largest`` motions, smallest sets first, and all reported combinations then."""
     active = {m: at for m, at in rows.items() if np.trace(shadow[np.ix_(at, at)]) > INSIDE}
     out: list[tuple[tuple[str, ...], F2]] = []
     for size in range(1, largest + 1):
@@ -153,7 +153,7 @@ def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, told: F2, coun
 
 
 def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], factor: F1) -> list[Family]:
-    """One family per set of motions: what is hidden of their slopes and what is hidden of their shapes belongs together."""
+    """One family per set of motions, joining hidden combinations of their slopes and of their shapes."""
     by_motions: dict[tuple[str, ...], list[F2]] = {}
     for motions, vectors in found:
         by_motions.setdefault(motions, []).append(vectors)
@@ -189,7 +189,7 @@ def _unit_length(vectors: F2) -> F2:
 
 
 def _independent(vectors: F2, told: F2) -> tuple[F2, F2]:
-    """Those of the vectors that add something to what was told, and everything told so far, orthonormal."""
+    """The vectors independent of those already reported, and all reported so far, orthonormal."""
     new = []
     for v in vectors.T:
         rest = _beside(v[:, None], told)
@@ -225,17 +225,17 @@ class HiddenGroup:
     ----------
     motions : tuple of str
     count : int
-        How many independent combinations.
+        Number of independent combinations.
     weights : tuple of (name, value)
         The first combination at the size that a typical machine may have: coefficients in mm and rad.
     vectors : array, shape (p, count)
         All of them, coefficients' own units.
     harmless : bool
-        Moves the tool nowhere in the volume with the tools used (but will with another).
+        Whether it moves the tool nowhere in the volume with the tools used (with another tool it does).
     effect_mm : float
         Otherwise: what a typical machine may hide there, rms length at the worst point, rigid motion removed, mm.
     cause, cures, text
-        Why; what would show all of it (one of these is enough); everything in one sentence or two.
+        Cause; additions each of which would show all of it; one or two sentences for people.
     """
 
     motions: tuple[str, ...]
@@ -259,7 +259,7 @@ class Advice:
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Sentence for people."""
         return f"{self.cure[:1].upper()}{self.cure[1:]} would raise the rank to {self.rank} of {self.of}."
 
 
@@ -280,7 +280,7 @@ def picture(campaign: CampaignLayout, seen: ObservedInformation, prior_sd: F1) -
     tried = trials(campaign, seen)
     harmful = families(terms, seen.null_space, seen.factor, found=silent)
     groups = [_group(terms, f, seen, tried, _effect(f, field, seen.factor, prior_sd), prior_sd) for f in harmful]
-    other_tools = [t for t in tried if t.addition.key in TOOLS]  # what moves no tool in use is a matter of the tool alone
+    other_tools = [t for t in tried if t.addition.key in TOOLS]  # combinations that move no tool in use depend on the tool alone
     groups += [_group(terms, f, seen, other_tools, 0.0, prior_sd) for f in families(terms, silent, seen.factor)]
     steps = best_sequence(tried, seen.null_space.shape[1])
     advice = tuple(Advice(a.cure, seen.rank + shown, len(terms)) for a, shown in steps)
@@ -333,7 +333,7 @@ def _effect(family: Family, field: F2, factor: F1, prior_sd: F1) -> float:
 
 
 def _typical(family: Family, prior_sd: F1) -> F2:
-    """Square root of what the priors leave for these combinations alone: columns of one standard deviation each, own units."""
+    """Factor of the prior covariance restricted to these combinations: columns of one standard deviation each, own units."""
     scaled = family.vectors / prior_sd[:, None]
     q, _ = linalg.qr(scaled, mode="economic", check_finite=False)
     return np.asarray(q * prior_sd[:, None])

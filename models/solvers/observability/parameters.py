@@ -1,6 +1,6 @@
-"""What is known of every single parameter and of every error motion, and which motions may be written into a table of their own.
+"""Knowledge of every single parameter and error motion, and which motions may be written into a table of their own.
 
-A parameter that takes part in a hidden combination has no value of its own, however small its uncertainty looks: the prior alone holds it.
+A parameter in a hidden combination has no value of its own, however small its uncertainty: only the prior determines it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NOTHING = 1e-7
 
 @dataclass(frozen=True)
 class Play:
-    """What leaves no trace in the campaign: hidden combinations together with the changes of free unknowns that cancel them.
+    """Hidden combinations of the campaign, together with the changes of free unknowns that cancel them.
 
     Attributes
     ----------
@@ -186,8 +186,8 @@ def _reason(hidden: tuple[str, ...], share: float, status: Status) -> str:
 def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -> tuple[str, ...]:
     """Error motions that may be written into tables of their own: numbers that rest on readings.
 
-    Rule: none of its coefficients takes part in a hidden combination, and the readings carry at least 90 % of what is known of it (with
-    ``weak``: 10 %). What a hidden combination may add to the machine then changes no reading and no table. A motion that is left out may
-    still be corrected together with others where only their sum counts: in a grid of the volume for the tool that was measured with.
+    Rule: none of its coefficients is in a hidden combination, and the readings carry at least 90 % of its information (with ``weak``:
+    10 %). A hidden combination then changes neither readings nor tables. Other motions may still be corrected where only their sum counts:
+    in a grid of the volume for the tool that was measured with.
     """
     return tuple(m.name for m in found if m.status == "observed" or (weak and m.status == "weak"))

@@ -1,8 +1,8 @@
-"""What the runs of a campaign show of the machine: rank, effective rank and hidden combinations of the error motions' coefficients.
+"""Observed information of a campaign: rank, effective rank and hidden combinations of the error motions' coefficients.
 
 Convention of math.md 4.6: columns of unit length, everything unknown about the set-up projected out, singular values counted down to 1e-9
-(rank) and 1e-3 (effective rank) of the largest. Priors do not count: a typical size is no measurement. What counts beside the readings is
-what somebody measured or certified about the set-up (`Knowledge`): a calibrated bar, a laser whose drift the maker states.
+(rank) and 1e-3 (effective rank) of the largest. Priors do not count: a typical size is no measurement. Measured or certified knowledge of
+the set-up (`Knowledge`) counts like readings: a calibrated bar, a laser whose drift the maker states.
 
 The rank does not depend on the functions in which error motions are written, the effective rank does: Legendre polynomials are nearly
 independent of each other on the readings and keep more of it than powers of the position, of which math.md states its figures
@@ -28,7 +28,7 @@ from abbe.models.solvers.observe import SetupUnknowns, run_design
 from abbe.models.solvers.observe_setup import NEAR_BEAM, STRAIGHT_MM, bar_length_name, straight_line_of
 
 BAR_TRAVEL_MM = 1.0
-"""Measuring range of a usual ball-bar to either side: farther from its nominal length no position was meant to be."""
+"""Measuring range of a usual ball-bar to either side: all intended positions lie within it of the nominal length."""
 
 
 def as_meant(run: RunData) -> RunData:
