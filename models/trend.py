@@ -1,4 +1,4 @@
-"""Whether a series of figures drifts, since when, and when it reaches its limit, as far as the figures and their uncertainties can tell.
+"""Trend of a series of figures: drift, its beginning, and the day on which the limit is reached.
 
 The figures come at any times, each with its own standard uncertainty, of which only the proportions are believed: mean and scale are
 learned from the series itself. A figure is compared with the mean of all before it, and its deviation, a Student variable, is turned into
@@ -26,20 +26,20 @@ EWMA_WEIGHT = 0.2
 EWMA_L = 2.962
 """Width of the EWMA's limits: one false alarm in 500 checks on average (Lucas and Saccucci 1990)."""
 MIN_CHECKS = 8
-"""With fewer nothing is said about drift."""
+"""Least checks for a statement about drift."""
 MIN_FIT = 6
-"""With fewer nothing is said about the limit."""
+"""Least checks for a statement about the limit."""
 SIGNIFICANCE = 0.01
-"""A slope that chance gives this often is not used to look ahead."""
+"""Significance level of a slope that is extrapolated."""
 Z_MAX = 8.0
 MOST_CHECKS = 400
-"""Older checks say nothing about the days ahead."""
+"""Most recent checks used for a forecast; older ones do not bear on the days ahead."""
 MOST_KNOTS = 200
 FARTHEST = 20.0
-"""Nothing is said beyond so many times the length of the series."""
+"""Longest forecast, in lengths of the series."""
 JUMP_SIGMAS = 5.0
 JUMP_SHARE = 0.25
-"""A jump is more than so many standard uncertainties, and more than this share of the limit: the spread of few checks is not known."""
+"""Least jump in standard uncertainties, and as a share of the limit, because the spread of few checks is not known."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +197,9 @@ def mean_of(values: F1, u: F1) -> tuple[float, float]:
 
 
 def jumps(change: float, u_change: float, limit: float) -> bool:
-    """Whether a figure grew by more than its uncertainty explains, where fewer than `MIN_CHECKS` have not yet shown their spread.
+    """Whether a figure grew by more than its uncertainty explains; for fewer than `MIN_CHECKS` checks, whose spread is unknown.
 
-    The stated uncertainties are believed here, which the chart does not need; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for what they
-    do not hold.
+    Unlike the chart, this uses the stated uncertainties as they are; `JUMP_SIGMAS` and `JUMP_SHARE` allow for components missing in them.
     """
     return change > JUMP_SIGMAS * u_change and change > JUMP_SHARE * limit
 
@@ -223,11 +222,11 @@ def _against_before(values: F1, u: F1, z: F1, since: int, found: int) -> F1:
 
 
 def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.95) -> Forecast:
-    """When the figure reaches its limit if it goes on as it does: it stood still, and from some day on it rises evenly.
+    """When the figure reaches its limit if its trend continues: constant at first, and rising evenly from some day on.
 
     Weighted least squares over level, slope and the day of the onset (which may lie before the first check: a straight line); scale
     from the residuals. The interval holds every day at which the limit may be reached without the fit becoming significantly worse
-    (likelihood ratio, F with 1 and n - 3 degrees of freedom). What no interval holds is that the machine goes on like this.
+    (likelihood ratio, F with 1 and n - 3 degrees of freedom). It does not cover a change of the machine's behaviour.
     """
     n = len(values)
     if limit is None:
@@ -290,7 +289,7 @@ class _Sums:
         return np.asarray(self.yy - self.level() * self.y - self.slope() * self.yr, dtype=np.float64)
 
     def squares_if(self, reached: F1) -> F1:
-        """The least that is left if the limit is reached at each of these days, whatever the knot."""
+        """Least sum of squares if the limit is reached on each of these days, over all knots."""
         s = 1.0 / (reached[:, None] - self.knots[None, :])
         level2 = (self.y - s * self.yr) ** 2 / (self.w - 2 * s * self.r + s**2 * self.rr)
         return np.asarray((self.yy - level2).min(axis=1), dtype=np.float64)

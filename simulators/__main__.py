@@ -17,7 +17,7 @@ from abbe.simulators.scenario import Scenario, ScenarioError
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """Reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}\n")
@@ -69,7 +69,7 @@ def _serve(argv: Sequence[str]) -> int:
 
 
 def _overridden(scenario: Scenario, options: argparse.Namespace) -> Scenario:
-    """Scenario with the command line's choices put in."""
+    """Scenario with the options of the command line applied."""
     changes: dict[str, Any] = {}
     for name in ("seed", "speed"):
         if getattr(options, name) is not None:

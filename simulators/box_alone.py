@@ -27,9 +27,9 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--link", type=Path, required=True, help="stable path of the serial line")
     parser.add_argument("--ledger", type=Path, required=True, help="file for the fate of every sample, written at every STOP")
     parser.add_argument("--speed", type=float, default=1.0, help="device seconds per second: 20 at 1000 Hz is 20 kHz")
-    parser.add_argument("--spoil-every", type=int, default=0, help="flip a bit in every so manieth sample")
-    parser.add_argument("--buffer-kib", type=int, default=BUFFER_BYTES // 1024, help="what the box keeps for a host who is late")
-    parser.add_argument("--samples", type=int, default=0, help="stop by itself after so many samples of a stream")
+    parser.add_argument("--spoil-every", type=int, default=0, help="flip a bit in every n-th sample")
+    parser.add_argument("--buffer-kib", type=int, default=BUFFER_BYTES // 1024, help="buffer of the box for a slow host")
+    parser.add_argument("--samples", type=int, default=0, help="stop a stream after this many samples")
     return asyncio.run(_serve(parser.parse_args(argv)))
 
 

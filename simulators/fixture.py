@@ -1,4 +1,4 @@
-"""The remote fixture (docs/protocols/fixture.md): whoever mounts bar and mirror, asked by JSON lines over TCP."""
+"""The remote fixture (docs/protocols/fixture.md): mounts bar and mirror on request, by JSON lines over TCP."""
 
 import asyncio
 import json
@@ -17,7 +17,7 @@ MAX_RADIUS_MM = 2000.0
 
 
 class FixtureError(ValueError):
-    """A request that cannot be done; the message goes back to whoever asked."""
+    """An impossible request; the client gets the message."""
 
 
 class Box(Protocol):
@@ -28,7 +28,7 @@ class Box(Protocol):
         ...
 
     def commands(self) -> list[Command]:
-        """What the controller was told so far."""
+        """All commands to the controller so far."""
         ...
 
     def table_accesses(self) -> list[TableAccess]:
@@ -115,7 +115,7 @@ class Fixture:
             return {"id": number, "ok": False, "error": str(exc)}
         return {"id": request.get("id"), "ok": True, "time_us": round(self._world.time_s * 1e6), **extra}
 
-    # ---- what everybody may ask ----------------------------------------------------------------------------------
+    # ---- requests for everybody ----------------------------------------------------------------------------------
 
     async def _identify(self, request: Answer) -> Answer:
         return {"name": "Abbe simulator"}
@@ -158,7 +158,7 @@ class Fixture:
         return {}
 
     def _standing(self) -> Any:
-        """Tool position; nobody reaches into a moving machine."""
+        """Tool position; refused while the machine moves."""
         if self._world.controller.moving:
             raise FixtureError("the machine is moving")
         return self._world.tool_position()
@@ -192,7 +192,7 @@ class Fixture:
         return {}
 
     async def _reset(self, request: Answer) -> Answer:
-        """The person at the panel: everything released, alarm reset, drives on."""
+        """The operator at the panel: everything released, alarm reset, drives on."""
         controller = self._world.controller
         controller.set_estop(pressed=False)
         controller.set_door(is_open=False)

@@ -8,7 +8,7 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusSerialServer, ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-logging.getLogger("pymodbus").setLevel(logging.ERROR)  # a taken port is told by an exception, not by a line of its own
+logging.getLogger("pymodbus").setLevel(logging.ERROR)  # a taken port raises an exception; pymodbus would log it as well
 
 _READ = (3, 4)
 _WRITE = (6, 16)

@@ -56,7 +56,7 @@ class PseudoSerial:
             del self._out[:written]
 
     def close(self) -> None:
-        """Hang up: whoever has the terminal open reads its end."""
+        """Hang up: readers of the terminal get its end."""
         self._loop.remove_reader(self._master)
         os.close(self._master)
         os.close(self._slave)

@@ -91,7 +91,7 @@ class PortConfig:
 
 @dataclass(frozen=True, slots=True)
 class HiddenConfig:
-    """One effect that nobody is told about (simulators/hidden); no name: none.
+    """One undisclosed effect (simulators/hidden); no name: none.
 
     ``key``: axis, component or plane; ``parameters``: ``strength`` in the unit of the exchange files and what else the effect needs;
     ``wild``: seed of how it departs from the textbook, 0: not at all.

@@ -133,7 +133,7 @@ class Site:
         return self._port.url
 
     def commands(self) -> list[Command]:
-        """What the controller was told so far."""
+        """All commands to the controller so far."""
         return self.registers.log
 
     def table_accesses(self) -> list[TableAccess]:

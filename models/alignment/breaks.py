@@ -1,4 +1,4 @@
-"""Where a clock was set or a device started anew: samples before and after must never be joined."""
+"""Steps of a clock and restarts of a device: samples before and after must never be joined."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from abbe.models.arrays import F1
 BLOCKS = 40
 LEAST_IN_BLOCK = 10
 SURE = 10.0
-"""A jump counts from so many times what the least delays of blocks scatter by."""
+"""Least step, as a multiple of the scatter of the blocks' least delays."""
 LEAST_STEP_S = 1e-3
 SIDE = 4
-"""Blocks on either side of a step at least: fewer late ones at an end are a spike."""
+"""Least blocks on either side of a step: fewer late ones at an end are a spike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Break:
 
 
 def breaks(device_s: F1, arrived_s: F1) -> tuple[Break, ...]:
-    """All places where a stream of stamps and arrivals cannot be of one clock that runs evenly, in order.
+    """All places where stamps and arrivals contradict a single, evenly running clock, in order.
 
     A restart: device time falls. A step: the least delays jump to another level and stay there; a spike, however long, comes back.
     """
@@ -53,7 +53,7 @@ def _steps(x: F1, y: F1, shift: int) -> list[Break]:
     if abs(split.jump) < max(SURE * split.noise, LEAST_STEP_S):
         return []
     around = int(edges[split.at - 1]), int(edges[min(split.at + 1, count)])
-    index = _where(y - level - split.slope * (x - middle), around, split)
+    index = _first_after(y - level - split.slope * (x - middle), around, split)
     here = Break(shift + index, "step", split.jump)
     return [*_steps(x[:index], y[:index], shift), here, *_steps(x[index:], y[index:], shift + index)]
 
@@ -82,7 +82,7 @@ def _lowest(x: F1, y: F1) -> int:
 
 
 def _best_split(x: F1, y: F1) -> _Split:
-    """Where two levels with one slope fit best. All by medians: blocks in which everything came late are none of them."""
+    """Best split into two levels with one slope, by medians, which ignore blocks that arrived late as a whole."""
     best, least = _Split(0, 0.0, 0.0, 1.0, 0.0), np.inf
     first, second = np.triu_indices(x.size, 1)
     slopes = (y[second] - y[first]) / (x[second] - x[first])
@@ -96,7 +96,7 @@ def _best_split(x: F1, y: F1) -> _Split:
     return best
 
 
-def _where(rest: F1, around: tuple[int, int], split: _Split) -> int:
+def _first_after(rest: F1, around: tuple[int, int], split: _Split) -> int:
     """The pair at which the level changes, among those of the blocks about it."""
     a, b = around
     hit = np.flatnonzero(rest[a:b] < 0.5 * (split.before + split.after))

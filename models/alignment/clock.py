@@ -1,4 +1,4 @@
-"""Device time to host time by a robust fit with drift. Arrival times are never taken for sample times: they only say when at the latest."""
+"""Device time to host time by a robust fit with drift. Arrival times are never taken for sample times, only for upper bounds of them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from abbe.models.arrays import F1
 BLOCKS = 200
 LOWEST = 24
 MANY = 100
-"""How the delays thin out towards the least possible one is estimated from so many of the least; from the fewer where there are few."""
+"""Number of least delays from which the power of their distribution near the least possible delay is estimated; fewer for few points."""
 
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Of the line under delays whose number grows like a power of the delay, over the 24th least delay, by the estimated power.
+    """Constants of the line under delays with a power-law distribution, in units of the 24th least delay, by the estimated power.
 
-    ``bias``: how far it lies too high in the middle; ``half`` and ``tilt``: half the width of 95.45 % of its error there, and of its rise
-    from end to end. Counted on 40 000 and 60 000 clouds with powers 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
+    ``bias``: of the line in the middle, upwards; ``half`` and ``tilt``: half the 95.45 % width of its error there, and of its rise from end
+    to end. Counted on 40 000 and 60 000 clouds with powers 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
     """
 
     shape: tuple[float, ...]
@@ -63,8 +63,7 @@ class Envelope:
 
 
 def lower_envelope(x: F1, y: F1) -> Envelope:
-    """The line below all points with the least sum of distances to them (an edge of the lower convex hull), corrected for what it lies
-    high.
+    """The line below all points with the least sum of distances to them (an edge of the lower convex hull), corrected for its bias.
 
     Parameters
     ----------
@@ -74,7 +73,7 @@ def lower_envelope(x: F1, y: F1) -> Envelope:
     Raises
     ------
     ValueError
-        Fewer points, x not rising, or numbers that are none.
+        Fewer points, x not rising, or values that are not finite.
     """
     if x.size < 2 * LOWEST + 2 or x.shape != y.shape:
         raise ValueError(f"envelope: {x.size} points, at least {2 * LOWEST + 2} are needed")
@@ -189,14 +188,14 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
     Parameters
     ----------
     device_s, arrived_s : array, shape (n,)
-        Device time of a sample (of one that arrived together with others, the newest says most), and monotonic host time of its arrival.
+        Device time of a sample (the newest of those that arrived together), and monotonic host time of its arrival.
         50 pairs or more, of one segment: no reboot, no step in between (`abbe.models.alignment.breaks`).
     least_delay_s, u_delay_s : float
-        Shortest delay that the link has by itself, and its standard uncertainty: no arrival tells it.
+        Shortest delay of the link itself, and its standard uncertainty; the arrivals do not show it.
     grid_s : float
-        Where an adapter collects bytes for a time that keeps step with the samples, delays come on a grid of this width (the greatest
-        common divisor of both periods): the arrivals alone do not tell a drift that is slow against it. Uncertainties are not below what it
-        leaves open (0.6 of it over the span; for the offset an even chance between none and all of it).
+        If an adapter collects bytes in step with the samples, delays lie on a grid of this width (the greatest common divisor of both
+        periods), and the arrivals do not show a slow drift. Uncertainties include the grid (0.6 of it over the span; for the offset a
+        uniform distribution from 0 to the grid).
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Where a program that somebody else started stood still, and which of the planned readings each standstill is."""
+"""Standstills of a program that Abbe did not start, and their assignment to the planned readings."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 from abbe.models.arrays import F1
 
 GAP = 7.0
-"""What it costs to leave a place or a standstill without a partner: minus the logarithm of how often that happens (one in a thousand)."""
+"""Cost of a place or a standstill without a partner: minus the logarithm of its probability (one in a thousand)."""
 SURE = 3.0
-"""Another explanation that costs less than this much more is as good."""
+"""An assignment whose cost exceeds the least by no more than this counts as equally good."""
 NEAR, LARGEST_MM = 0.75, 2.0
-"""From one place to the next the deviation may change by this share of the distance to the nearest other place that is approached from the
-same side (farther, the standstill is another place), at most by so much."""
+"""Largest change of the deviation from one place to the next: share of the distance to the nearest other place approached from the same
+side, and absolute limit."""
 SAME = 0.25
-"""Standstills that differ by less than this share of the same distance are at one place."""
+"""Standstills that differ by less than this share of that distance are at one place."""
 BASE_MM, PER_MM, TURN_MM = 1e-3, 3e-5, 1e-2
-"""By so much the deviation usually changes from place to place: anyhow, for each millimetre between them, and where the side changes."""
+"""Usual change of the deviation from place to place: constant part, part per millimetre between them, part where the side changes."""
 ZERO_MM, ZERO_PER_MM = 2e-2, 5e-5
-"""So far off the first place may lie, for an instrument that was zeroed at target 0."""
+"""Largest deviation of the first place, for an instrument that was zeroed at target 0: constant part and part per millimetre."""
 INFINITE = np.inf
 I1 = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """``pairs``: number of the place to number of the standstill; ``cost``; ``rival``: a standstill and the two places that it may be, if
-    two explanations are as good."""
+    """``pairs``: number of the place to number of the standstill; ``cost``; ``rival``: a standstill and its two possible places, if two
+    assignments are equally good."""
 
     cost: float
     pairs: dict[int, int]
@@ -38,7 +38,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Pairs that are possible, ordered by standstill: place, standstill, deviation, and by how much it may have changed."""
+    """Possible pairs, ordered by standstill: place, standstill, deviation, and its largest change."""
 
     place: I1
     stand: I1
@@ -52,15 +52,15 @@ def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: flo
     Parameters
     ----------
     levels, levels_side : array, shape (m,)
-        Readings of the standstills, and from which side each was approached: +1 from smaller readings, -1 from larger, 0 nobody knows.
+        Readings of the standstills, and the side of approach: +1 from smaller readings, -1 from larger, 0 unknown.
     targets : array, shape (n,)
         Places, mm.
     offset : float
-        Of the readings against the places; known (``zeroed``) or tried.
+        Offset of the readings from the places; known (``zeroed``) or tried.
     noise : float
         Standard deviation of a level.
     rivals : bool
-        Whether to look for an explanation that is as good.
+        Whether to look for an equally good assignment.
     """
     n, m = targets.size, levels.size
     sides = np.concatenate([[0.0], np.sign(np.diff(targets))])
@@ -85,7 +85,7 @@ def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: flo
 
 
 def places_reach(targets: F1, sides: F1) -> F1:
-    """How far the deviation of each place may be off that of the one before it, (n,) mm."""
+    """Largest change of the deviation from the previous place to each place, (n,) mm."""
     away = np.abs(targets[:, None] - targets[None, :])
     other = (away > 1e-6) & ((sides[:, None] * sides[None, :]) >= 0.0)
     nearest = np.where(other, away, np.inf).min(axis=1)
@@ -123,14 +123,14 @@ def _chain(some: _Candidates, alone: F1, about: tuple[F1, F1, float], *, mirrore
         step = cost[:p] + GAP * (places + stands - 2) + np.log1p((change / scale) ** 2)
         step = np.where((places > 0) & (stands > 0) & (change <= limit), step, INFINITE)
         best = int(np.argmin(step))
-        # from the end, ``alone`` is what a chain costs that begins here; a longer one may cost less
+        # from the end, ``alone`` is the cost of a chain that begins here; a longer one may cost less
         if step[best] < cost[p]:
             cost[p], back[p] = step[best], best
     return cost, back
 
 
 def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], about: tuple[F1, F1, F1]) -> tuple[int, int, int] | None:
-    """A standstill that another explanation, as good as the best, takes for another place; or a place that it sees elsewhere."""
+    """A standstill that an equally good assignment gives another place, or a place that it gives another standstill."""
     targets, levels, reach = about
     taken = {s: k for k, s in pairs.items()}
     for p in np.flatnonzero(through < cost + SURE):
@@ -143,7 +143,7 @@ def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], a
     return None
 
 
-# Where a stream stands still, and from which side it came there.
+# Standstills of a stream, and their sides of approach.
 
 
 CLEAR = 6.0
@@ -151,7 +151,7 @@ CLEAR = 6.0
 RESOLVED = 1e-6
 LEAST_SAMPLES = 4
 OVERSHOOT, OVERSHOOT_MM = 0.3, 0.1
-"""A controller overshoots by less than this share of a move, and by less than so much."""
+"""Largest overshoot of a controller: share of a move, and absolute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +174,7 @@ def noise_of(y: F1) -> float:
 def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Standstill, ...]:
     """All standstills of a stream, in order.
 
-    Two neighbouring samples are of one standstill if they differ by less than noise can.
-    Single samples that stick out do not end a standstill; after one, the level is the same.
+    Two neighbouring samples belong to one standstill if noise explains their difference. Single outliers do not end a standstill.
 
     Parameters
     ----------
@@ -212,9 +211,9 @@ def _runs(still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[tuple[
 
 
 def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
-    """From which side each standstill was approached: +1 from smaller readings, -1 from larger, 0 where nothing tells.
+    """Side of approach of each standstill: +1 from smaller readings, -1 from larger, 0 unknown.
 
-    The last sample before it that lies well off says so; what a controller overshoots by is less than that.
+    The last earlier sample that differs by more than an overshoot decides.
     """
     out, least = np.zeros(len(found)), CLEAR * noise_of(y)
     for s in range(1, len(found)):
@@ -228,18 +227,17 @@ def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
 
 
 TOLERANCE = 0.3
-"""Where nothing moves, a reading that changes by less than this share of the smallest planned move is no move."""
+"""A change of the reading without motion is a jump from this share of the smallest planned move on."""
 LONG, SHORT = 1.8, 0.4
-"""A standstill longer or shorter than planned by these factors is said."""
+"""A standstill longer or shorter than planned by these factors is reported."""
 JUMP_SAMPLES = 2
 MATCHED = 0.5
-"""Of the targets at least this share must be found: fewer, and the stream is of another program."""
+"""Least share of the targets to be found: with fewer, the stream belongs to another program."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedDwell:
-    """One planned standstill: where (mm along what is read), for how long, and how many readings the plan takes there one after the
-    other."""
+    """One planned standstill: target (mm along the measured direction), duration, and number of readings taken there."""
 
     target: float
     seconds: float
@@ -259,10 +257,10 @@ class DwellReading:
 
 @dataclass(frozen=True, slots=True)
 class Dwells:
-    """What was found of a plan. ``readings``: in the plan's order, None where the standstill is missing.
+    """Standstills found of a plan. ``readings``: in the plan's order, None where the standstill is missing.
 
-    ``missing``: numbers (from 0) of planned standstills that nobody saw; ``extra``: standstills that nobody planned, each with the number
-    of the planned one before it (-1: before the first); ``odd``: planned standstills that were much longer or shorter than planned.
+    ``missing``: numbers (from 0) of planned standstills not found; ``extra``: unplanned standstills, each with the number of the planned
+    one before it (-1: before the first); ``odd``: planned standstills that were much longer or shorter than planned.
     ``noise``: standard deviation of one sample, from the samples themselves.
     """
 
@@ -274,10 +272,10 @@ class Dwells:
 
 
 def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
-    """Match the standstills of a stream to the planned ones, in order; what has no partner is named, never shifted.
+    """Match the standstills of a stream to the planned ones, in order; those without a partner are reported, never shifted.
 
-    ``zero``: what the instrument shows at target 0, if it was zeroed there. If nobody knows, the offset between plan and stream is found
-    together with the match; where two offsets explain the stream about as well, nothing is guessed.
+    ``zero``: the instrument's reading at target 0, if it was zeroed there. None: the offset between plan and stream is found together with
+    the match; if two offsets explain the stream about equally well, the match is refused.
 
     Parameters
     ----------
@@ -286,7 +284,7 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
     planned : tuple of PlannedDwell
         In order; neighbours stand at different places.
     settle_s : float
-        The first part of each standstill, in which the axes settle and nothing is read.
+        The first part of each standstill, in which the axes settle and no readings are taken.
 
     Raises
     ------
@@ -315,17 +313,17 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
         stand = found[pairs[k]] if k in pairs else None
         if stand is not None and k == 0:  # the axes have long settled: its last seconds are those before the program moves
             stand = replace(stand, start_s=max(stand.start_s, stand.end_s - plan.seconds))
-        elif stand is not None and (k == len(planned) - 1 or lasted[k] > LONG):  # later it may have been gone and come back
+        elif stand is not None and (k == len(planned) - 1 or lasted[k] > LONG):  # later it may have left and come back
             stand = replace(stand, end_s=min(stand.end_s, stand.start_s + plan.seconds))
         readings += [None] * plan.readings if stand is None else _readings(t_s, y, stand, plan, (settle_s, noise))
-    ends = (0, len(planned) - 1)  # before the first and after the last the machine stands as long as it likes
+    ends = (0, len(planned) - 1)  # the duration before the first and after the last is free
     odd = tuple(k for k in pairs if lasted[k] < SHORT or (lasted[k] > LONG and k not in ends))
     missing = tuple(k for k in range(len(planned)) if k not in pairs)
     return Dwells(tuple(readings), missing, _extra(found, pairs), odd, noise)
 
 
 def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
-    """Two standstills with nothing between them are one, in which the reading jumped: counts were lost, everything after is off."""
+    """Refuse two standstills without motion between them: the reading jumped, counts were lost, all later readings are wrong."""
     for before, after in pairwise(found):
         by = after.level - before.level
         if after.first - before.last <= JUMP_SAMPLES and abs(by) < tolerance:
@@ -334,8 +332,8 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
 
 
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
-    """Whether a place is planned twice, with a turn between, and of the three only one standstill was seen: a turn that short shows in no
-    sample, so nobody knows on which way the machine stood there."""
+    """Whether a place is planned twice, with a turn between, and only one of the three standstills was found: a turn that short shows in
+    no sample, so the standstill may belong to either pass."""
     if k in (0, targets.size - 1):
         return False
     for far in (k - 2, k + 2):
@@ -345,7 +343,7 @@ def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
 
 
 def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: F1) -> None:
-    """A step with nothing between two standstills is a short planned move, or lost counts."""
+    """Refuse steps without samples between two standstills, unless a short move was planned there."""
     taken = {s: k for k, s in pairs.items()}
     for s, (before, after) in enumerate(pairwise(found)):
         by = after.level - before.level
@@ -375,7 +373,7 @@ def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[
 
 
 def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
-    """Planned number to number of the standstill; refuses where two explanations are as good.
+    """Planned number to number of the standstill; refuses if two assignments are equally good.
 
     Without a zero, offsets are tried from the first and last few of both.
     """
@@ -384,7 +382,7 @@ def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float |
         return {}
     u_level = noise / np.sqrt(LEAST_SAMPLES)
     if zero is not None:
-        return _told(match(levels, side, targets, offset=zero, noise=u_level, zeroed=True), found)
+        return _unambiguous(match(levels, side, targets, offset=zero, noise=u_level, zeroed=True), found)
     few = min(6, levels.size), min(6, targets.size)
     tries = [levels[i] - targets[k] for i in range(few[0]) for k in range(few[1])]
     tries += [levels[-1 - i] - targets[-1 - k] for i in range(few[0]) for k in range(few[1])]
@@ -398,11 +396,11 @@ def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float |
     whole = len(best.pairs) >= MATCHED * targets.size
     if whole and any(one.cost < best.cost + SURE and _shifted(one.pairs, best.pairs) for one in matches):
         raise ValueError("dwells: the stream fits the plan in two ways; zero the instrument at the first target, then the place is known")
-    return _told(best, found) if whole else best.pairs
+    return _unambiguous(best, found) if whole else best.pairs
 
 
-def _told(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
-    """The pairs, if no other explanation is as good."""
+def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
+    """The pairs, if no other assignment is equally good."""
     if best.rival is None:
         return best.pairs
     stand, ours, other = best.rival
@@ -412,7 +410,7 @@ def _told(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
 
 
 def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
-    """Whether most standstills that both matches know are taken for other targets."""
+    """Whether two matches give most of their common standstills different targets."""
     first, second = ({s: k for k, s in pairs.items()} for pairs in (one, other))
     both = first.keys() & second.keys()
     return 2 * sum(first[s] != second[s] for s in both) > len(both)
@@ -432,7 +430,7 @@ def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[
 
 
 def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
-    """Mean without what sticks out, and its uncertainty from the scatter there, at least that of the whole stream's noise."""
+    """Mean without outliers, and its uncertainty from the local scatter, at least that of the whole stream's noise."""
     keep = np.abs(y - np.median(y)) <= CLEAR * max(noise, 1.4826 * float(np.median(np.abs(y - np.median(y)))))
     kept = y[keep]
     scatter = max(noise, float(np.std(kept, ddof=1)) if kept.size > 1 else 0.0)
@@ -446,7 +444,7 @@ def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
 
 
 def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
-    """What of the program was not as planned, one line each; standstills count from 1."""
+    """Differences from the plan for people, one line each; standstills count from 1."""
     lines = [f"standstill {k + 1} of {len(planned)} (at {planned[k].target:.3f} mm) is missing" for k in found.missing]
     for after, stand in found.extra:
         where = "before the first" if after < 0 else f"after standstill {after + 1}"

@@ -1,4 +1,4 @@
-"""How much later than the machine a signal is: the time by which what is expected has to be shifted to lie on what was read."""
+"""Lag of a signal behind the machine: the time by which the expected signal is shifted to match the readings."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class Lag:
 
 
 def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | None = None, search_s: float = 0.5) -> Lag:
-    """Lag of a signal behind what is expected of it, by least squares: signal(t) = expected(t - lag) + columns @ unknowns.
+    """Lag of a signal behind the expected one, by least squares: signal(t) = expected(t - lag) + columns @ unknowns.
 
-    A coarse search finds the minimum (the peak of the cross-correlation), Gauss-Newton makes it exact. The uncertainty counts neighbouring
-    residuals as related as they are (Newey-West), so that drift and vibration do not make it look small.
+    A coarse search finds the minimum (the peak of the cross-correlation), Gauss-Newton refines it. The uncertainty includes the
+    autocorrelation of the residuals (Newey-West), so that drift and vibration do not make it too small.
 
     Parameters
     ----------
     t_s, signal : array, shape (n,)
     expected_s, expected : array, shape (m,)
-        What the signal would be without a lag, straight in between.
+        The signal without a lag, linearly interpolated.
     columns : array, shape (n, k), optional
-        What else may be in the signal; default: a constant.
+        Further components of the signal; default: a constant.
     search_s : float
         Largest lag either way.
 
@@ -74,7 +74,7 @@ def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | 
 
 
 def _newey_west(score: F1) -> float:
-    """Standard deviation of the sum of a score whose neighbours are related."""
+    """Standard deviation of the sum of an autocorrelated score (Newey-West)."""
     n = score.size
     reach = min(n // 4, int(4 * (n / 100.0) ** (2.0 / 9.0)) + 20)
     total = float(score @ score)
@@ -94,9 +94,9 @@ def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, s
     out, back : array, shape (n,)
         Readings of the way out, and of the way back at the same places.
     columns : array, shape (n, k), optional
-        What else makes the ways differ (lost motion: the bar's direction times the change of sign of each axis); a constant is always free.
+        Other differences of the ways (lost motion: the bar's direction times the change of sign of each axis); a constant is always free.
     smooth_s : float
-        Over so long the pattern is taken for a cubic when its slope is estimated: noise in the slope would hide the lag.
+        Window of the cubic from which the pattern's slope is estimated: noise in the slope would hide the lag.
     """
     step = float(np.median(np.diff(t_s)))
     width = max(2, round(smooth_s / step / 2)) * 2 + 1

@@ -1,7 +1,7 @@
-"""What each kind of table can do for this machine: the errors of distances that are left, with their uncertainty, side by side.
+"""Achievable accuracy of each kind of table on this machine: residual errors of distances with their uncertainty.
 
-All kinds are made from the same identified deviation; the part of it that is unknown (`PredictedDistances.unknown_mm`) is in every row.
-Judged over the inner 80 % of the strokes, first order, rigid motion not seen by distances.
+All kinds are made from the same identified deviation; its unknown part (`PredictedDistances.unknown_mm`) is in every row. The errors are
+those over the inner 80 % of the strokes, to first order; distances do not contain rigid motion.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 # Tables for controllers that take less than nine: positioning alone, cross tables beside it, squareness as a parameter.
 #
-# Nothing is counted twice: what one part holds is not in the others, and all parts together correct what the nine tables correct (but for a
-# rotation of the frame, which squareness parameters cannot hold and which moves no distance).
+# No correction is in two parts, and all parts together correct the same as the nine tables (but for a rotation of the frame, which
+# squareness parameters cannot express and which changes no distance).
 
 
 def positioning_only(tables: NineTables) -> NineTables:
@@ -40,19 +40,19 @@ def positioning_only(tables: NineTables) -> NineTables:
 
 
 def cross_only(tables: NineTables) -> NineTables:
-    """The six cross tables of nine, own-axis tables zero: to be used beside `positioning_only`, which holds the scale already."""
+    """The six cross tables of nine, own-axis tables zero: to be used beside `positioning_only`, which contains the scale."""
     return _kept(tables, lambda a: np.arange(3) != a)
 
 
 @dataclass(frozen=True, eq=False)
 class SquarenessTables:
-    """Squareness as three parameters (C0Y, B0Z, A0Z, rad, with u), and tables that hold none of it.
+    """Squareness as three parameters (C0Y, B0Z, A0Z, rad, with u), and tables without squareness.
 
     The parameters are the squareness of these tables, which count the body diagonals as much as the volume: not the mean squareness over
     the volume (`abbe.models.compensation.summary.mean_linear`), from which it can differ by more than its uncertainty.
 
-    ``tables``: own-axis tables as before; cross tables without slope, so straightness alone. What their slopes held beyond squareness was a
-    rotation of the frame: it is left out. ``start_mm``: position of each axis at which the parameters correct nothing.
+    ``tables``: own-axis tables as before; cross tables without slope, so straightness alone. The rest of their slopes was a rotation of the
+    frame and is left out. ``start_mm``: position of each axis at which the parameters correct nothing.
     """
 
     parameters: tuple[MeanParameter, ...]
@@ -60,7 +60,7 @@ class SquarenessTables:
     start_mm: F1
 
     def squareness_at(self, axes_mm: F2) -> F2:
-        """What the parameters alone add at commanded positions, shape (n, 3), mm: +C0Y y to X, −B0Z z to X, +A0Z z to Y."""
+        """Correction by the parameters alone at commanded positions, shape (n, 3), mm: +C0Y y to X, −B0Z z to X, +A0Z z to Y."""
         out = np.zeros((axes_mm.shape[0], 3))
         for parameter, (_, first, second, sign) in zip(self.parameters, SQUARENESS, strict=True):
             out[:, first] -= sign * parameter.value * (axes_mm[:, second] - self.start_mm[second])
@@ -116,11 +116,11 @@ class Achievable:
     Attributes
     ----------
     kind : str
-        In the user's words.
+        Name for the user.
     entries : int
-        Numbers that the controller has to hold.
+        Number of values in the controller.
     distances : PredictedDistances
-        What is left with the table as stored, rounding included.
+        Residual errors with the table as stored, rounding included.
     rounding_mm : float
         Rms share of the distance errors that comes from rounding to the controller's unit alone; 0 without a unit.
     """
@@ -169,14 +169,14 @@ def grid_row(
     pairs: Pairs | None = None,
     sources: ErrorSources | None = None,
 ) -> Achievable:
-    """What a 3-D grid of so many nodes per axis leaves; other parameters as `achievable`."""
+    """Residual errors with a 3-D grid of ``nodes`` per axis; other parameters as `achievable`."""
     judge = _ResidualJudge(solution, pairs or random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
     return judge.grid(nodes, compensable)
 
 
 @dataclass(frozen=True, eq=False)
 class _ResidualJudge:
-    """What all kinds of table are judged with: the same pairs, the same sources of uncertainty, the same rounding."""
+    """Common basis for all kinds of table: pairs, sources of uncertainty, rounding."""
 
     solution: JointSolution
     pairs: Pairs
@@ -184,7 +184,7 @@ class _ResidualJudge:
     lsb_mm: float
 
     def row(self, kind: str, entries: int, stored: Correction | None = None, exact: Correction | None = None) -> Achievable:
-        """A kind of table by what the controller adds, and what it would add without rounding."""
+        """Row of a kind of table from its correction as stored, and without rounding."""
         rounding = 0.0
         if stored is not None and exact is not None:
             added = correction_error_mm(stored, self.pairs) - correction_error_mm(exact, self.pairs)
@@ -222,7 +222,7 @@ class _ResidualJudge:
         return out
 
     def grid(self, nodes: int, compensable: Mask | None) -> Achievable:
-        """A grid of so many nodes per axis."""
+        """A grid of ``nodes`` per axis."""
         table = grid_table(self.solution, (nodes,) * 3, compensable=compensable, sources=self.sources)
         stored = quantise_grid(table, self.lsb_mm) if self.lsb_mm > 0 else table
         return self.row(f"grid {nodes} x {nodes} x {nodes}", 3 * nodes**3, stored.correction_at, table.correction_at)

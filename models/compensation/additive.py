@@ -1,8 +1,8 @@
 """The best sum of three functions, one of each axis, for a deviation field: over the volume and along its body diagonals.
 
-The mean over the other two axes (the main effect) is the least-squares answer over the volume alone. What angles do at a distance that
-depends on two axes at once is left over, and much of it lies where people look first: along the body diagonals (ISO 230-6). So the four
-diagonals together count as much as the whole volume (tests/models/compensation/test_tables.py says what that gives and what it costs).
+The mean over the other two axes (the main effect) is the least-squares answer over the volume alone. The effect of angles at a distance
+that depends on two axes at once remains, and much of it lies along the body diagonals, which ISO 230-6 tests. So the four diagonals
+together weigh as much as the whole volume (tests/models/compensation/test_tables.py states gain and cost).
 """
 
 from __future__ import annotations

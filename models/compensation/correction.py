@@ -1,4 +1,4 @@
-"""What every kind of table is in the end: commanded positions to what is added to them."""
+"""Correction function, common to all kinds of table: commanded positions to corrections."""
 
 from __future__ import annotations
 

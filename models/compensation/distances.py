@@ -1,6 +1,6 @@
-"""What a user of the machine sees of its errors: errors of distances between two points of a part. No rigid motion is in them.
+"""Errors of distances between two points of a part: the machine's errors as its user sees them, without rigid motion.
 
-A table is judged by them: before and after, with the field known only as well as all its sources of uncertainty say.
+They measure a table, before and after, with the whole uncertainty of the field.
 """
 
 from __future__ import annotations
@@ -79,8 +79,7 @@ class PredictedDistances:
 
     Means over draws of the field from all sources of its uncertainty (noise, set-ups, typical sizes, orders above the chosen one,
     wavelength, temperatures; `abbe.models.uncertainty.sources`), corrected as stated; the uncertainty is the scatter of the draws.
-    ``known_mm``: rms of the part that is known and that the table leaves; ``unknown_mm``: of the part that no table can take out, because
-    nobody knows it.
+    ``known_mm``: rms of the known part that the table leaves; ``unknown_mm``: of the unknown part, which no table can remove.
     """
 
     rms_mm: float
@@ -143,7 +142,7 @@ def predict_distances(
 
 
 def _summed(known: F1, drawn: F2, unknown_mm: float) -> PredictedDistances:
-    """Figures of the known error (n,) with each of the draws (n, draws) of the unknown one on top."""
+    """Statistics of the known error (n,) plus each of the draws (n, draws) of the unknown one."""
     size = np.abs(known[:, None] + drawn)
     rms, q95, largest = np.sqrt(np.mean(size**2, axis=0)), np.quantile(size, 0.95, axis=0), size.max(axis=0)
     return PredictedDistances(

@@ -1,7 +1,7 @@
-"""3-D grid of corrections with trilinear interpolation: the table that takes out what angles do at a distance.
+"""3-D grid of corrections with trilinear interpolation: the table that also corrects the effect of angles at a distance.
 
-Frame: the best-fit rigid motion over the grid is left out of the corrections, because it moves no distance between two points of a part;
-then one constant is added so that the reference node is not moved at all (a controller's reference point must stay where it is).
+Frame: the best-fit rigid motion over the grid is left out of the corrections, because it changes no distance between two points of a part;
+then one constant is added so that the reference node does not move (a controller's reference point must stay where it is).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 from abbe.models.volumetric import rigid_design
 
-# Where a deviation is known worse than it is large, nothing is compensated; what then happens at the border.
+# Nodes whose deviation is smaller than its uncertainty are not compensated; this section treats the border to the others.
 #
 # The rule. All nodes that are not compensated hold one and the same correction: no distance between two of them changes. The compensated
 # nodes hold minus the deviation, in the frame (rigid motion) that makes the errors of the distances across the border least. Between a
@@ -33,11 +33,11 @@ from abbe.models.volumetric import rigid_design
 #
 # The promise. By the identified field, the sum of squares of the errors of distances (fixed pairs over the whole volume) is never larger
 # than without any correction. The unknown part of the field is the same with and without: so it holds for the expected error too. Where the
-# rule could not keep the promise - a mask that cuts a smooth error into pieces can do that - nothing at all is compensated.
+# rule cannot keep the promise, as with a mask that cuts a smooth error into pieces, nothing is compensated.
 
 
 SMALL_CORRECTIONS = 1e-2
-"""Weight of "corrections are small" against "distances are right": it decides only the frame of a mask of a few nodes."""
+"""Weight of small corrections against correct distances: it decides only the frame of a mask of a few nodes."""
 
 
 def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.bool_]) -> tuple[F4, NDArray[np.bool_]]:
@@ -200,7 +200,7 @@ def compensable_nodes(
     """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.mask`), shape ``counts``.
 
     All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
-    Nor is a node compensated where what leaves no trace in any reading may be larger than the deviation (`abbe.models.uncertainty.mask`).
+    A node is not compensated either where the part that no reading shows may exceed the deviation (`abbe.models.uncertainty.mask`).
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)

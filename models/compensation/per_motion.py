@@ -1,13 +1,13 @@
-"""Tables of single error motions, for controls that hold up to 21 of them and work out the deviation by their own kinematic model.
+"""Tables of single error motions, for controls that store up to 21 of them and compute the deviation by their own kinematic model.
 
-One campaign with one tool does not see every motion by itself: turning and shifting a carriage look alike at one tool length (math.md 4.6).
-A motion that the data do not tell apart is not written under its name. Two ways are left, and the caller chooses by naming the motions:
+One campaign with one tool does not determine every single motion: turning and shifting a carriage look alike at one tool length (math.md
+4.6). A motion that the data do not separate from others is not written under its name. The caller chooses by naming the motions:
 
-- only motions that are observable by themselves (`observable_alone`, the default): true for every tool, but what is only known together
-  with a hidden motion, or is mostly an assumption, stays uncorrected;
-- `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Right at this tool length only, and so labelled.
+- only motions that are observable by themselves (`observable_alone`, the default): valid for every tool, but motions that are known only
+  together with a hidden one, or are mostly an assumption, stay uncorrected;
+- `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Valid at this tool length only, and so labelled.
 
-In the first case every motion has its own estimate; in the second those that are written take over what the others did at this tool.
+In the first case every motion has its own estimate; in the second the written motions also carry the effect of the others at this tool.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from abbe.models.volumetric import rigid_design, volume_grid
 NODES = 7
 RANK_TOLERANCE = 1e-7
 TOWARDS_ESTIMATE = 1e-6
-"""Weight with which a motion keeps its own estimate, against reproducing the deviation: it decides only what the deviation leaves open."""
+"""Weight of a motion's own estimate against reproducing the deviation: it decides only combinations that the deviation leaves open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +83,14 @@ def motion_tables(
     any_tool: bool = True,
     sources: ErrorSources | None = None,
 ) -> MotionTables:
-    """Tables of the named motions only; what is not written stands in ``left_out``.
+    """Tables of the named motions only; the others are listed in ``left_out``.
 
     Parameters
     ----------
     counts : (int, int, int)
         Grid points of X, Y, Z.
     motions : set of str, optional
-        What may be written: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``. Default: all that are observable by themselves.
+        Motions to write: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``. Default: all that are observable by themselves.
     any_tool : bool
         True: each motion has its own estimate, and only what is observable by itself may be written. False, for `enough_for_the_field`:
         values that reproduce the identified deviation with the machine's own tool best, all others being zero.
@@ -100,7 +100,7 @@ def motion_tables(
     Raises
     ------
     ValueError
-        A name that is no motion of the solution, none at all, or (``any_tool``) one that the data do not tell apart from others.
+        A name that is no motion of the solution, no name at all, or (``any_tool``) a motion that the data do not separate from others.
     """
     known = {t.motion for t in solution.terms}
     motions = _writable(solution, known, motions, any_tool)
@@ -156,7 +156,7 @@ def _entries(sources: ErrorSources, name: str, grids: tuple[F1, F1, F1], keep: l
 def observable_alone(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:
     """Motions that the report on this solution calls observed (with ``weak``: or weak), by the same rule (`observable_motions`).
 
-    None of their coefficients takes part in a hidden combination, and the readings carry at least 90 % (10 %) of what is known of them.
+    None of their coefficients is in a hidden combination, and the readings carry at least 90 % (10 %) of their information.
     """
     return frozenset(observable_motions(motions_of(solution), weak=weak))
 

@@ -1,8 +1,8 @@
-"""Which way a table moves the machine: proved by measuring what a small known step in it does.
+"""Sign proof of a control: sign, axis and unit of its corrections, proved by measuring the effect of a small known step.
 
-Sign, axis and unit of a correction are conventions of a control; a table that is read back byte for byte says nothing about them. So before
-the first real table a step is written into the table of one axis, and a ball-bar that stays hung in reads the same places before and
-after. The tool's shift S changes every reading by u . S, u being the direction from cup to spindle: three numbers from many readings.
+Sign, axis and unit of a correction are conventions of a control; reading a table back byte for byte does not show them. So before the first
+real table a step is written into the table of one axis, and a ball-bar that stays mounted reads the same places before and after. The
+tool's shift S changes every reading by u . S, u being the direction from cup to spindle: three numbers from many readings.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 
 FLOOR_MM, SHARE = 0.002, 0.2
-"""A response may be off by the larger of these two: absolutely, and as a share of the step (reliability.md 3.2, PROBE)."""
+"""Tolerance of a response, the larger of the two: absolute, and as a share of the step (reliability.md 3.2, PROBE)."""
 KNOWN_RATIOS = ((1000.0, "µm taken for mm"), (25.4, "mm taken for inch"), (1e-3, "mm taken for µm"), (1 / 25.4, "inch taken for mm"))
 
 
@@ -48,7 +48,7 @@ def step_tables(base: NineTables, axis: int, step_mm: float, low_mm: float, high
 
 @dataclass(frozen=True)
 class Shift:
-    """How far the tool was moved, shape (3,), mm, and its covariance, shape (3, 3), mm^2."""
+    """Displacement of the tool, shape (3,), mm, and its covariance, shape (3, 3), mm^2."""
 
     shift_mm: F1
     covariance_mm2: F2
@@ -76,7 +76,7 @@ def bar_shift(directions: F2, before_mm: F1, with_step_mm: F1, after_mm: F1, u_m
     Raises
     ------
     ValueError
-        The places do not tell three components and a change of the bar's length apart.
+        The places do not separate three components and a change of the bar's length.
     """
     change = with_step_mm - (1.0 - share) * before_mm - share * after_mm
     known = np.column_stack([directions, np.ones(len(directions))])
@@ -85,7 +85,7 @@ def bar_shift(directions: F2, before_mm: F1, with_step_mm: F1, after_mm: F1, u_m
     found, *_ = np.linalg.lstsq(known, change, rcond=None)
     left, free = change - known @ found, len(change) - 4
     scatter = float(left @ left) / free if free > 0 else 0.0
-    # A quarter of what they disagree by, either way, is drift that was not at a constant rate: of the length, and of the cup.
+    # A quarter of their difference counts as drift that was not at a constant rate, of the length and of the cup.
     drifted, *_ = np.linalg.lstsq(known, after_mm - before_mm, rcond=None)
     covariance = max(1.5 * u_mm**2, scatter) * np.linalg.inv(known.T @ known) + np.diag((0.25 * drifted) ** 2 / 3.0)
     return Shift(np.asarray(found[:3], dtype=np.float64), covariance[:3, :3])
@@ -93,7 +93,7 @@ def bar_shift(directions: F2, before_mm: F1, with_step_mm: F1, after_mm: F1, u_m
 
 @dataclass(frozen=True)
 class SignProof:
-    """What three steps did.
+    """Result of three steps.
 
     ``response``: shape (3, 3), component i of the shift per step written for axis a; ``u``: its standard uncertainty. ``faults``: one
     sentence for each axis that does not do what was written; empty when sign, axis and unit are proved.
@@ -111,9 +111,9 @@ class SignProof:
 
 
 def sign_proof(step_mm: float, shifts: tuple[Shift, Shift, Shift]) -> SignProof:
-    """Judge the shifts that a step written for X, for Y and for Z gave. A positive correction must move its own axis in its positive sense.
+    """Judge the shifts by a step for X, Y and Z. A positive correction must move its own axis in the positive direction.
 
-    An axis whose response is not known to half of what is allowed is a fault as well: nothing was proved.
+    A response whose uncertainty exceeds half the tolerance is a fault as well: nothing was proved.
     """
     response = np.column_stack([s.shift_mm for s in shifts]) / step_mm
     u = np.column_stack([s.u_mm for s in shifts]) / step_mm
@@ -132,13 +132,13 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
     main = int(np.argmax(np.abs(moved)))
     if abs(moved[main]) <= allowed:
         return f"{name}: the step has no effect: is compensation switched on, and the axis referenced?"
-    said = [] if main == axis else [f"it moves {AXES[main]}"]
-    said += ["the sign is turned over"] if moved[main] < 0.0 else []
+    faults = [] if main == axis else [f"it moves {AXES[main]}"]
+    faults += ["the sign is turned over"] if moved[main] < 0.0 else []
     size = abs(float(moved[main]))
     if abs(size - 1.0) > allowed:
         why = next((f": {text}" for ratio, text in KNOWN_RATIOS if abs(size / ratio - 1.0) < SHARE), "")
-        said.append(f"it moves by {size:.3g} times the step{why}")
+        faults.append(f"it moves by {size:.3g} times the step{why}")
     other = np.delete(moved, main)
     if np.abs(other).max() > allowed:
-        said.append("other axes move with it")
-    return f"{name}: {', '.join(said)}"
+        faults.append("other axes move with it")
+    return f"{name}: {', '.join(faults)}"

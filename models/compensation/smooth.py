@@ -1,4 +1,4 @@
-"""The smooth part of nine tables: what a solver of smooth error motions can find again of a correction that is in force."""
+"""The smooth part of nine tables: the part of an active correction that a solver of smooth error motions can recover."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from abbe.models.arrays import F1, F2
 from abbe.models.compensation.tables import NineTables
 
 WITHIN_MM = 5e-4
-"""A table that no polynomial of these orders meets within this at every position is of another kind: pitch errors, or made by hand."""
+"""Largest difference of a smooth table from its polynomial at any position; others are pitch errors, or made by hand."""
 ORDERS = range(2, 13)
 
 
 def smooth_of(tables: NineTables) -> Callable[[F2], F2] | None:
     """Polynomials through nine tables: corrections at commanded positions (n, 3), mm, shape (n, 3); None where there are none such.
 
-    Of each table the lowest order of 2 to 12 that meets it within 0.5 µm at its positions. What is left out is what interpolation,
-    rounding and cut ends have added to it: no error of a machine looks like that, and a solver takes it for motions of high order.
+    Each table gets the lowest order of 2 to 12 that fits it within 0.5 µm at its positions. The residual comes from interpolation, rounding
+    and cut ends, which no error of a machine resembles and a solver would take for motions of high order.
     """
     found = [[_meets(tables.position_mm[a], tables.correction_mm[a][:, i]) for i in range(3)] for a in range(3)]
     if any(one is None for row in found for one in row):

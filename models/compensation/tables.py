@@ -1,7 +1,7 @@
 """Nine one-axis tables: correction of each axis as a function of each axis, on the controller's grid.
 
-The best nine tables for a deviation field are its best sum of functions of one axis (`abbe.models.compensation.additive`). What angles do
-at a distance that depends on two axes at once is left over; a 3-D grid (`abbe.models.compensation.grid`) takes it.
+The best nine tables for a deviation field are its best sum of functions of one axis (`abbe.models.compensation.additive`). The effect of
+angles at a distance that depends on two axes at once remains; a 3-D grid (`abbe.models.compensation.grid`) corrects it.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class Predicted:
 
 
 def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int = 9, sources: ErrorSources | None = None) -> Predicted:
-    """What the identified model says the machine will do without and with these tables, and how well it knows (`model_uncertainty_mm`)."""
+    """Predicted errors of the machine without and with these tables, and the model's uncertainty (`model_uncertainty_mm`)."""
     machine = solution.machine
     grid = volume_grid(machine.stroke_mm, nodes)
     field = solution.deviation_mm(grid)

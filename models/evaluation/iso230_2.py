@@ -108,8 +108,8 @@ class Positioning:
         if m < needed:
             out.append(f"{m} positions over {travel:.0f} mm; ISO 230-2 asks for {needed} or more")
         if self.lowest < CYCLES:
-            said = "one cycle" if self.lowest == 1 else f"{self.lowest} cycles"
-            out.append(f"{said}; ISO 230-2 asks for {CYCLES}" + ("; without repeats there is no R and no A" if self.lowest == 1 else ""))
+            count = "one cycle" if self.lowest == 1 else f"{self.lowest} cycles"
+            out.append(f"{count}; ISO 230-2 asks for {CYCLES}" + ("; without repeats there is no R and no A" if self.lowest == 1 else ""))
         return tuple(out)
 
 

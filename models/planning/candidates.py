@@ -1,4 +1,4 @@
-"""Everything that could be measured on a machine without hitting anything: helices, edge lines, body diagonals.
+"""All collision-free measurements on a machine: helices, edge lines, body diagonals.
 
 Collision-free means: the whole path lies inside the strokes less a clearance; hemispheres open towards the spindle, so that it never comes
 beyond the cup (`opening`); laser paths stay inside the strokes.
@@ -23,7 +23,7 @@ EDGES = (0.1, 0.5, 0.9)
 """Relative places of laser lines across the two other axes."""
 ORDERS = tuple("".join(p) for p in permutations("XYZ"))
 SHORTEST_TOOL_MM = 1.0
-"""A shorter tool does not say where the spindle is."""
+"""A shorter tool does not show the side of the spindle."""
 OBLIQUE = 0.5
 """Second longest component of a tool over its longest, from which on the spindle's direction is doubtful."""
 
@@ -37,7 +37,7 @@ class Opening:
     warning: str = ""
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """For example +Z."""
         return f"{'+' if self.side > 0 else '-'}{AXES[self.axis]}"
 
@@ -45,19 +45,19 @@ class Opening:
 def opening(machine: Machine, vertical: int = 2) -> Opening:
     """Side on which the spindle is, seen from the cup: against the tool, which reaches from the spindle to the ball.
 
-    A machine whose tool is not known gets the upper side of its vertical axis: right where the spindle is vertical.
+    Without a known tool: the upper side of the vertical axis, which is right for a vertical spindle.
     """
     longest = int(np.argmax(np.abs(machine.tool_mm)))
     sizes = np.sort(np.abs(machine.tool_mm))
     if sizes[2] < SHORTEST_TOOL_MM:
-        said = f"hemispheres open along +{AXES[vertical]}, the vertical axis: without tool_mm nothing says where the spindle is"
-        return Opening(vertical, 1, f"{said}; if it is horizontal, state tool_mm in the machine file, else it may meet the cup")
+        reason = f"hemispheres open along +{AXES[vertical]}, the vertical axis: without tool_mm nothing says where the spindle is"
+        return Opening(vertical, 1, f"{reason}; if it is horizontal, state tool_mm in the machine file, else it may meet the cup")
     found = Opening(longest, -1 if machine.tool_mm[longest] > 0 else 1)
     if sizes[1] < OBLIQUE * sizes[2]:
         return found
     tool = ", ".join(f"{v:g}" for v in machine.tool_mm)
     warning = (
-        f"hemispheres open along {found.words}, against the longest part of tool_mm ({tool}): it is oblique, look where the spindle goes"
+        f"hemispheres open along {found.text}, against the longest part of tool_mm ({tool}): it is oblique, look where the spindle goes"
     )
     return Opening(found.axis, found.side, warning)
 
@@ -68,7 +68,7 @@ def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple
     Parameters
     ----------
     vertical : int
-        Index of the vertical axis: hemispheres open along it where the tool does not say where the spindle is (`opening`).
+        Index of the vertical axis: hemispheres open along it if the tool does not show the side of the spindle (`opening`).
 
     Raises
     ------

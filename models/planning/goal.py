@@ -1,4 +1,4 @@
-"""A wanted uncertainty: how few minutes reach it, or why none do."""
+"""A wanted uncertainty: the minutes that reach it, or the reason why none do."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from abbe.models.planning.search import Chosen, Search
 COVERAGE = 2.0
 """U = 2 u."""
 LONGEST_MIN = 480.0
-"""Nobody plans more than a day's work: beyond it the answer is the limit."""
+"""Longest plan, one day's work: beyond it the answer is the limit."""
 _FOREVER = 1e6
 _KNOWN = 1e12
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What became of a wanted expanded uncertainty.
+    """Result for a wanted expanded uncertainty.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Goal:
         U that every measurement the planner knows, repeated without end, and the temperature of the scales would leave: no plan comes
         below it.
     limit_by : str
-        What makes the limit, in words.
+        Main contribution to the limit, as text.
     """
 
     wanted_mm: float

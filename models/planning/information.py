@@ -1,4 +1,4 @@
-"""What one mounting tells about the machine: an information matrix over the unknowns that all mountings share.
+"""Information of one mounting on the machine: a matrix over the unknowns that all mountings share.
 
 Shared are the smooth terms, the lost motion, the length of every bar, their temperature and the laser's wavelength; cup, mirror tilts, zero
 and drift belong to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its
@@ -126,8 +126,8 @@ def field_rows(what: PlanningProblem, share: float, nodes: int) -> F2:
 def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
     """Variance that scales of unknown temperature leave at each node of ``rows`` (`field_rows`), rigid motion free, shape (nodes,), mm^2.
 
-    As in the budget of a solution (`abbe.models.uncertainty.sources`): each axis by itself too long by expansion times temperature. No
-    reading tells, because it is about the days after the campaign.
+    As in the budget of a solution (`abbe.models.uncertainty.sources`): each axis is independently too long by expansion times temperature.
+    No reading shows this, because it concerns the days after the campaign.
     """
     slope = what.tools.inputs.u_scale_temperature_k * what.tools.inputs.scale_expansion_per_k
     out = np.zeros(rows.shape[0])

@@ -1,6 +1,6 @@
-"""The measurements a plan chooses from, as a few numbers each: where it is set up, which positions it takes, what it would record.
+"""Measurements a plan chooses from: set-up, positions and expected record of each.
 
-The sequences of the service move the same positions (a test holds them together); here they are only what the solver's design needs.
+The service's sequences move to the same positions (a test keeps both in step); here they are reduced to the needs of the solver's design.
 """
 
 from __future__ import annotations

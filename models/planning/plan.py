@@ -23,13 +23,13 @@ from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 
-# What a planned campaign cannot tell, in words, before anything is measured.
+# Sentences about the blind spots of a planned campaign, before anything is measured.
 
 
 def not_observable(what: PlanningProblem, runs: Iterable[RunData]) -> tuple[str, ...]:
-    """Sentences about what the runs of a plan leave open, with cause and cure, in the words of the solver's own report.
+    """Sentences about the hidden combinations of a plan's runs, with cause and cure, as in the solver's own report.
 
-    First what would stay hidden in the work with this tool, then what only another tool would show, then what to add.
+    First combinations hidden with this tool, then those that only another tool would show, then advised additions.
     """
     tools = what.tools
     found = observability(
@@ -102,11 +102,11 @@ class Plan:
     u_temperature_mm : float
         What the temperature of the scales does at its worst node: part of every figure above, and nothing measured takes it away.
     open_questions : tuple of str
-        What stays not observable, in words.
+        Sentences about what is not observable.
     goal : Goal or None
-        What became of the wanted uncertainty, if one was given.
+        Result for the wanted uncertainty, if one was given.
     warnings : tuple of str
-        What the operator has to look at before anything moves.
+        Points that the operator must check before anything moves.
     """
 
     machine: Machine
@@ -145,7 +145,7 @@ def plan_campaign(
     vertical: int = 2,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Plan:
-    """Choose the measurements that tell most about the deviation over the inner 80 % of the volume in the minutes there are.
+    """Choose the measurements that are most informative about the deviation over the inner 80 % of the volume, in the available minutes.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def plan_campaign(
     goal_mm : float, optional
         Wanted expanded uncertainty U = 2 u (mm) at the worst node: a plan that reaches it ends with the step that does.
     vertical : int
-        Index of the vertical axis: hemispheres open along it where the tool does not say where the spindle is.
+        Index of the vertical axis: hemispheres open along it if the tool does not show the side of the spindle.
     progress : callable
         Called with the share that is done, 0 to 1.
 

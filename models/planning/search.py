@@ -1,4 +1,4 @@
-"""Which measurements, in the minutes there are: greedy by gain per minute, then exchange passes.
+"""Choice of measurements for the available minutes: greedy by gain per minute, then exchange passes.
 
 The criterion is I-optimal: the variance of the predicted, rigid-motion-free deviation over the inner volume, as a power mean over the
 nodes that leans on the worst node (power 1 would be the plain mean, an infinite power the worst node alone). What no choice of
@@ -24,9 +24,9 @@ POWER = 4.0
 """Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
 SEARCH_NODES = 4
 THRIFTS = (1.0, 0.5, 0.0)
-"""Exponents of the minutes by which gains are compared: by gain per minute the cheap comes first, by gain alone the large."""
+"""Exponents of the minutes in gain / minutes^thrift: 1 prefers cheap measurements, 0 large gains."""
 LOOK_AT_ALL = 4
-"""Every so many additions all candidates are looked at again, else only the best third of the last look."""
+"""Additions between two evaluations of all candidates; in between only the best third of the last one is evaluated."""
 
 Chosen = dict[str, tuple[Measurement, ...]]
 """Mounting to its tests, in the order in which they were chosen."""

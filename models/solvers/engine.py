@@ -141,7 +141,7 @@ class CampaignFit:
     weight: F1
     size: F1
     residual_mm: F1
-    thinning: F1
+    decimation: F1
     parts: tuple[InformationSums, ...]
 
 
@@ -169,7 +169,7 @@ def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], 
     return CampaignProblem(machine, runs, terms, setup, names, sizes, noise, sigma, readings)
 
 
-def settle(problem: CampaignProblem, say: Progress) -> CampaignFit:
+def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
     """Iterate weights, components and the exact model until nothing moves."""
     r = problem.readings
     gram, measured, sizes = grams(r), problem.measured, problem.sizes
@@ -194,7 +194,7 @@ def settle(problem: CampaignProblem, say: Progress) -> CampaignFit:
         new = _weights(size / _spread(problem, whole, c, sizes) if dirty and step >= GENTLE else size, limit, gentle=step < GENTLE)
         moved, changed = float(np.abs(r.a @ (x - before)).max()), float(np.abs(new - weight).max())
         weight = new
-        say(f"round {step + 1}: readings move by {moved:.2g} sigma, {int((weight < 1).sum())} readings count less")
+        report(f"round {step + 1}: readings move by {moved:.2g} sigma, {int((weight < 1).sum())} readings count less")
         if step >= 2 and moved < SETTLED and changed < SETTLED:
             break
     return _finish(replace(problem, sizes=sizes), x, weight, c, gram)
@@ -228,8 +228,8 @@ def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Gr
     z = residual / problem.sigma + r.a @ x
     parts = sums(PlannedReadings(r.a, z, r.run, r.fold, r.kind), gram, weight)
     size = residual / problem.sigma / np.exp(0.5 * c.eta)[r.kind] / _spread(problem, total(parts), c, problem.sizes)
-    thinning = _thinning(problem, size, weight)
-    parts = tuple(s.thinned(thinning) for s in parts)
+    decimation = _thinning(problem, size, weight)
+    parts = tuple(s.decimated(decimation) for s in parts)
     whole = total(parts)
     sizes = problem.sizes
     found = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c)
@@ -239,7 +239,7 @@ def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Gr
     cov = root @ p.cov @ root.T
     theta = root @ p.x
     left = problem.measured - problem.predicted(theta)
-    return CampaignFit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, thinning, parts)
+    return CampaignFit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, decimation, parts)
 
 
 def _thinning(problem: CampaignProblem, size: F1, weight: F1) -> F1:

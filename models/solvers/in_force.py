@@ -1,8 +1,8 @@
-"""What a table in force did to the readings of a run, and what of that no table could take back: the lost motion's part of it.
+"""Influence of the active table on the readings of a run, less the part that lost motion absorbs.
 
-A table moves the drives away from the command. Where its corrections change while an axis is told to rest, the drive moves by a micrometre
-or two, turns round where no command does, and stays within the lost motion: the axis does not follow, or only partly. For a solver that is
-told of commands alone that is an error of a few micrometres which no smooth error motion explains.
+A table moves the drives away from the command. Where its corrections change while an axis is commanded to rest, the drive moves by a
+micrometre or two, reverses where no command does, and stays within the lost motion: the axis does not follow, or only partly. To a solver
+that sees commands alone this is an error of a few micrometres which no smooth error motion explains.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ LEAD_IN_MM = 1.0
 
 @dataclass(frozen=True)
 class AppliedTables:
-    """A table that was in force while runs were measured.
+    """A table that was active while runs were measured.
 
     Attributes
     ----------
     correction : callable
-        What it added at commanded positions (n, 3), mm, shape (n, 3).
+        Commanded positions (n, 3), mm, to added corrections (n, 3), mm.
     lost_mm : array, shape (3,), or None
-        Lost motion of X, Y, Z as well as it is known. None: nothing is known of it; every axis is taken to have followed.
+        Known lost motion of X, Y, Z. None: unknown; every axis is assumed to have followed.
     """
 
     correction: Callable[[F2], F2]
     lost_mm: F1 | None = None
 
     def bar_mm(self, axes_mm: F2, centre_mm: F1) -> F1:
-        """What it added to the readings of a ball-bar at successive commands about a cup that the spindle put down, shape (n,), mm.
+        """Contribution to the readings of a ball-bar at successive commands about a cup set with the spindle, shape (n,), mm.
 
-        From which side the axes came to the cup is part of its offset and not counted.
+        The side from which the axes approached the cup is part of its offset and does not count.
         """
         away = axes_mm - centre_mm
         look = away / np.linalg.norm(away, axis=1, keepdims=True)
         return np.asarray(np.sum(look * (self.moved_mm(axes_mm) - self.correction(centre_mm[None])), axis=1))
 
     def laser_mm(self, axes_mm: F2, beam: F1) -> F1:
-        """What it added to the readings of a laser at successive commands, zeroed at the first, shape (n,), mm."""
+        """Contribution to the readings of a laser at successive commands, zeroed at the first, shape (n,), mm."""
         moved = self.moved_mm(axes_mm)
         return np.asarray((moved - moved[0]) @ beam)
 
     def moved_mm(self, axes_mm: F2) -> F2:
-        """How much farther the axes stood because of it, at successive commands, shape (n, 3), mm.
+        """Displacement of the axes by the table at successive commands, shape (n, 3), mm.
 
-        Its correction, less what the lost motion kept of it: against an axis that stands on the side from which it was commanded last.
+        The correction less the part that lost motion absorbs, relative to an axis on the side from which it was commanded last.
         """
         added = self.correction(axes_mm)
         if self.lost_mm is None:
@@ -62,7 +62,9 @@ class AppliedTables:
         moved = added.copy()
         for a in np.flatnonzero(self.lost_mm > 0.0):
             half = 0.5 * float(self.lost_mm[a])
-            start = float(before[a]) if sign[0, a] else float(driven[0, a])  # an axis that is never told to move came from nowhere known
+            start = (
+                float(before[a]) if sign[0, a] else float(driven[0, a])
+            )  # the approach of an axis that is never commanded to move is unknown
             moved[:, a] -= half * (_play(driven[:, a], start, half) - sign[:, a])
         return moved
 

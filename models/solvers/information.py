@@ -1,6 +1,6 @@
-"""A campaign compressed to what its readings say of the unknowns: normal equations per fold and instrument.
+"""A campaign compressed to normal equations of the unknowns, per fold and instrument.
 
-Everything after this lives in the space of the unknowns (a few hundred), however many readings there are.
+All later work is in the space of the unknowns (a few hundred), however many readings there are.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from abbe.models.arrays import F1, F2, F3
 
 I1 = NDArray[np.int64]
 KINDS = ("bar", "laser")
-"""Instruments whose noise is estimated apart."""
+"""Instruments whose noise is estimated separately."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class PlannedReadings:
     a : array, shape (n, p)
         Design; every row divided by its expected noise, every column multiplied by the unknown's reference size.
     y : array, shape (n,)
-        Readings minus what the expansion point says, divided by their expected noise.
+        Readings minus the prediction at the expansion point, divided by their expected noise.
     run, fold, kind : arrays of int, shape (n,)
         Which run, which fold (set-ups that are held out together) and which of `KINDS` each row is of.
     """
@@ -48,11 +48,11 @@ class InformationSums:
     count: F1
 
     def minus(self, other: InformationSums) -> InformationSums:
-        """What is left without a part of the readings."""
+        """The sums without a part of the readings."""
         return InformationSums(self.gram - other.gram, self.moment - other.moment, self.square - other.square, self.count - other.count)
 
     def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> InformationSums:
-        """The same about other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
+        """The sums for other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
         gram = self.gram.copy()
         for at in blocks:
             gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
@@ -60,8 +60,8 @@ class InformationSums:
             gram[:, at, :] = root[np.ix_(at, at)].T @ gram[:, at, :]
         return InformationSums(gram, self.moment @ root, self.square, self.count)
 
-    def thinned(self, factor: F1) -> InformationSums:
-        """As if there were fewer independent readings by ``factor``, shape (k,): alike neighbours tell the same thing twice."""
+    def decimated(self, factor: F1) -> InformationSums:
+        """The sums with fewer effective readings by ``factor``, shape (k,), because neighbours are correlated."""
         f: F1 = 1.0 / factor
         return InformationSums(self.gram * f[:, None, None], self.moment * f[:, None], self.square * f, self.count * f)
 

@@ -60,7 +60,7 @@ class JointSolution:
     prior_sd : array, shape (p,)
         Prior standard deviation of every unknown of ``estimate``, with the sizes estimated from these data.
     information : array, shape (p, p)
-        What the readings alone say of the unknowns (A^T W A, no prior), in the unknowns' own units.
+        Information of the readings alone (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
         Of the terms up to ``order`` only, by the rule of the whole report (`abbe.models.solvers.observability.rank.stated_knowledge`); its
         ``involved`` also names lost motion and free set-up unknowns that the readings leave open.
@@ -72,7 +72,7 @@ class JointSolution:
         Highest Legendre order that held-out runs support (or the caller's). ``terms`` may go higher: the rest is nuisance, so that no
         interval is too narrow because the basis was cut.
     noise_mm, noise_repeats_mm : dict by kind
-        Standard deviation of one raw reading, as estimated with the solution and as repeats alone tell it (None: nothing was repeated).
+        Standard deviation of one raw reading, estimated with the solution and from repeats alone (None: nothing was repeated).
     outliers : readings that count less, largest first.
     residual_tests : tests of the whitened residuals per run.
     model : "rigid6" or "rigid21"
@@ -165,20 +165,20 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     """
     if not runs:
         raise ValueError("joint solution: no runs")
-    say = progress or _silent
+    report = progress or _silent
     noise = expected_noise(runs, sigma_mm, floor_mm)
     terms = _six() if model == "rigid6" else smooth_terms(order or HIGHEST_ORDER)
     problem = build(machine, terms, runs, priors or Priors(), noise)
-    fit = settle(problem, say)
+    fit = settle(problem, report)
     if model == "rigid6":
         return _solution(problem, fit, "rigid6", 1, None)
     choice = choose(fit.parts, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
     if model == "auto" and choice.chosen == RIGID6:
-        say("held-out runs ask for no more than scales and squareness")
+        report("held-out runs ask for no more than scales and squareness")
         six = build(machine, _six(), runs, priors or Priors(), noise)
-        return _solution(six, settle(six, say), "rigid6", 1, choice)
+        return _solution(six, settle(six, report), "rigid6", 1, choice)
     chosen = order or max(choice.chosen, 1)
-    say(f"order {chosen}" + ("" if order else " chosen by held-out runs"))
+    report(f"order {chosen}" + ("" if order else " chosen by held-out runs"))
     return _solution(problem, fit, "rigid21", chosen, None if order else choice)
 
 
@@ -229,7 +229,7 @@ def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:
 
 
 def _rank(problem: CampaignProblem, order: int) -> Identifiability:
-    """What the runs see of the terms up to ``order``, by the rule of the report: lost motion, and what nobody states of a set-up, is free.
+    """Rank analysis of the terms up to ``order``, by the rule of the report: lost motion and unstated set-up unknowns are free.
 
     The orders above are held by their prior. Combinations are in units of typical sizes.
     """

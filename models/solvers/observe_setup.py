@@ -59,7 +59,7 @@ def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine |
     Parameters
     ----------
     machine : Machine, optional
-        Whose tool a run means that states none. Without it such a run is taken to have the tool of its set-up.
+        Machine whose tool applies to runs that state none. None: such a run has the tool of its set-up.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How many Legendre orders the readings carry: chosen by runs that were held out, not by hand."""
+"""Number of Legendre orders that the readings support, chosen by held-out runs."""
 
 from __future__ import annotations
 

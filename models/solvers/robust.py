@@ -1,4 +1,4 @@
-"""Outliers: readings that no honest noise explains count less, or nothing, and are listed."""
+"""Outliers: readings that noise does not explain are down-weighted or rejected, and listed."""
 
 from __future__ import annotations
 

@@ -141,9 +141,9 @@ class CampaignTrials:
 
 
 def _clamped(plus: F2, subtracted: F2) -> F2:
-    """Factor (inputs, 3 m) of what the estimated sizes add: at every point not less than nothing, as the law of propagation has it.
+    """Factor (inputs, 3 m) of the contribution of the estimated sizes, non-negative at every point as in the law of propagation.
 
-    Every point takes its share of the same draws, so it stays in step with the others, and what it gets does not depend on them.
+    All points use the same draws and stay correlated, and the contribution at a point does not depend on the other points.
     """
     points = plus.reshape(len(plus), -1, 3).transpose(1, 2, 0)  # (m, 3, inputs)
     minus = subtracted.reshape(len(subtracted), subtracted.shape[1] // 3, 3).transpose(1, 2, 0)

@@ -1,7 +1,7 @@
 """Deviation per unit of each coefficient, as the machine's own frame sees it or with the best-fit rigid motion taken out.
 
 Where the workpiece lies and how it is turned is no property of the machine: two error maps are compared only after the best-fit rigid
-motion over one volume is taken out of both (math.md 3). The same has to be done to their uncertainty, or it counts what nobody asks for.
+motion over one volume is removed from both (math.md 3). It must be removed from their uncertainty too, which otherwise includes the frame.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What an uncertainty budget has to be told beside the campaign's data: stated inputs with documented defaults, each an ASSUMPTION.
+"""Stated inputs of an uncertainty budget beside the campaign's data, with documented defaults, each an ASSUMPTION.
 
-The solution of a campaign knows the noise of its readings and the priors of its set-ups. It does not know the laser's wavelength, the
-temperatures, or what a machine does that a smooth model cannot follow: those stand here, and the budget prints them as stated.
+The solution of a campaign includes the noise of its readings and the priors of its set-ups. It does not include the laser's wavelength,
+temperatures, and errors that a smooth model cannot follow: those are stated here, and the budget prints them as stated.
 """
 
 from __future__ import annotations
@@ -69,11 +69,11 @@ class StatedInputs:
             raise ValueError("uncertainty inputs: orders_above must be 0 or more, repeatability_dof above 0")
 
     def as_measured(self) -> StatedInputs:
-        """The same for a machine whose scales are as warm as while it was measured: without the temperature of the scales."""
+        """The inputs at the temperature of the measurement: without the temperature of the scales."""
         return replace(self, u_scale_temperature_k=0.0)
 
     def without_stated_inputs(self) -> StatedInputs:
-        """The same without everything that is only stated: what is left is the covariance of the solution itself."""
+        """Zero stated inputs: only the covariance of the solution itself remains."""
         return replace(
             self,
             u_wavelength=0.0,

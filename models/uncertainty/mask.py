@@ -1,4 +1,4 @@
-"""Where the uncertainty is larger than the error: marked, and not to be compensated.
+"""Mask of points where the uncertainty exceeds the error: they are not compensated.
 
 The rule. A component of the deviation may be compensated where its size exceeds its expanded uncertainty, |d| > U = k u; with k of 95 % its
 sign is then known. A point may be compensated where the deviation's length exceeds the expanded uncertainty along the deviation itself,

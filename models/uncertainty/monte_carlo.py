@@ -13,22 +13,21 @@ from abbe.models.uncertainty.coverage import PROBABILITY, Interval, shortest_int
 from abbe.models.uncertainty.distributions import Moments
 
 Draw = Callable[[np.random.Generator, int], F2]
-"""Results of so many trials, shape (trials, m): inputs drawn from their distributions, sent through the whole measurement."""
+"""Function of the number of trials to results, shape (trials, m): inputs drawn from their distributions, propagated through the model."""
 BATCH = 10_000
 """Fewest trials of one batch; 100 / (1 - p) where that is more (GUM-S1 7.9.4)."""
 FEWEST_BATCHES = 10
-"""The spread of two batches says nothing: by chance it is below a tenth of its true size in one case of twelve. Of ten it is known to a
-quarter."""
+"""The spread of two batches is useless: in one case of twelve it is below a tenth of its true size. Of ten it is known to a quarter."""
 LARGEST = 1_000_000
 VALIDATION_SHARE = 0.2
 """The trials that judge the law of propagation must be known this much better than what they judge (GUM-S1 8.2)."""
 COLUMNS = 300
-"""Results whose trials are sorted at once."""
+"""Results whose trials are sorted together."""
 
 
 @dataclass(frozen=True)
 class MonteCarlo:
-    """What the trials say of m results.
+    """Statistics of m results from trials.
 
     Attributes
     ----------
@@ -43,7 +42,7 @@ class MonteCarlo:
     settled : array of bool, shape (m,)
         Whether mean, u and both ends of the shortest and the symmetric interval are known that well, at 95 %.
     ends_known : array, shape (m,)
-        How well the ends of the symmetric interval are known in fact, at 95 %; inf from fewer than `FEWEST_BATCHES` batches.
+        Half-width at 95 % of the ends of the symmetric interval; inf from fewer than `FEWEST_BATCHES` batches.
     """
 
     mean: F1
@@ -78,9 +77,9 @@ def adaptive(
     digits : int
         How many digits of u shall be right: 1 or 2 (GUM-S1 7.9.2).
     share : float
-        Part of half a unit of the last digit to which all shall be known; `VALIDATION_SHARE` for trials that `validate` is given.
+        Tolerance as a share of half a unit of the last digit; `VALIDATION_SHARE` for trials passed to `validate`.
     largest : int
-        Trials at which to give up. What did not settle by then says so.
+        Most trials; results that have not settled by then are marked in ``settled``.
 
     Raises
     ------

@@ -9,7 +9,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.uncertainty.coverage import PROBABILITY, coverage_factor, effective_dof, vector_factor
 from abbe.models.uncertainty.frame import RigidFree, field
-from abbe.models.uncertainty.sources import WORDS, ErrorSources
+from abbe.models.uncertainty.sources import SOURCE_TEXTS, ErrorSources
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,10 @@ def _budget(prediction: Prediction, points: np.ndarray[tuple[int, ...], np.dtype
     order = np.argsort(-variance, kind="stable")
     lines = tuple(
         BudgetLine(
-            prediction.names[i], WORDS[prediction.names[i]], float(np.sqrt(variance[i])), float(variance[i] / total) if total else 0.0
+            prediction.names[i],
+            SOURCE_TEXTS[prediction.names[i]],
+            float(np.sqrt(variance[i])),
+            float(variance[i] / total) if total else 0.0,
         )
         for i in order
     )
@@ -101,7 +104,7 @@ class Prediction:
     points_mm, deviation_mm : array, shape (m, 3)
     covariance_mm2 : array, shape (m, 3, 3)
     names : tuple of str
-        The sources (`abbe.models.uncertainty.sources.WORDS`).
+        The sources (`abbe.models.uncertainty.sources.SOURCE_TEXTS`).
     variance_mm2 : array, shape (sources, m, 3)
         What each source adds to the variance of each component: they sum up to the diagonal of ``covariance_mm2``.
     dof : array, shape (m, 3)

@@ -1,9 +1,8 @@
-"""Which inputs the solution of a campaign rests on, and what each of them does to it: one error source per input (GUM 5.1).
+"""Inputs of a campaign's solution and their influence on it: one error source per input (GUM 5.1).
 
 The estimate is linear in what went into it, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
-posterior covariance C. So the covariance falls apart without remainder, C = C A^T W A C + C P^-1 C: noise per instrument, and the prior of
-every single unknown (the bar's calibrated length, the set-ups, the typical size of errors). To that come the inputs that the solver does
-not know.
+posterior covariance C. So the covariance splits exactly, C = C A^T W A C + C P^-1 C: noise per instrument, and the prior of every single
+unknown (the bar's calibrated length, the set-ups, the typical size of errors). Inputs unknown to the solver are added.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def variances(sources: ErrorSources, per_unit: F2) -> F1:
 def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
     """Factor F of the covariance F F^T of m results together, shape (m, q), for draws that keep them in step.
 
-    What the estimated sizes add is cut off where it would make a combination of these results better than the rest says.
+    The contribution of the estimated sizes is clipped so that it never makes a combination of these results more certain.
     """
     turn, small = linalg.qr(per_unit, mode="economic") if len(per_unit) > per_unit.shape[1] else (None, per_unit)
     total = np.zeros((len(small), len(small)))
@@ -119,7 +118,7 @@ class Response:
     def dof_of(self, kind: str) -> float:
         """Degrees of freedom of the residuals of one instrument, from which its noise was estimated: its part of `dof`, at least 1.
 
-        A reading keeps what it does not take to determine itself: one minus its leverage.
+        Each reading contributes one minus its leverage.
         """
         leverage = self.weight * np.einsum("np,pq,nq->n", self.design, self.covariance, self.design, optimize=True)
         left = np.where(self.weight > 0, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
@@ -216,7 +215,7 @@ def _design(solution: JointSolution, above: tuple[Term, ...]) -> F2:
     return np.concatenate(rows)
 
 
-WORDS = {
+SOURCE_TEXTS = {
     "bar_noise": "sensor noise of the ball-bar (and what a smooth model cannot follow)",
     "laser_noise": "sensor noise of the laser (and what a smooth model cannot follow)",
     "repeatability": "repeatability of the machine",
@@ -246,7 +245,7 @@ class Source:
     Attributes
     ----------
     name : str
-        A key of `WORDS`.
+        A key of `SOURCE_TEXTS`.
     factor : array, shape (P, q)
         What q independent inputs of unit variance do to the coefficients of `ErrorSources.terms`: the source's covariance is factor
         factor^T.
@@ -351,7 +350,7 @@ def _compressed(factor: F2) -> F2:
 
 
 def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
-    """Scatter of the readings per instrument, the machine's repeatability told apart, and that sizes were estimated at all."""
+    """Scatter of the readings per instrument, the machine's repeatability apart, and the uncertainty of the estimated sizes."""
     out = []
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
@@ -367,9 +366,9 @@ def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
 
 
 def _widening(r: Response, n: int) -> tuple[F2, F2]:
-    """That sizes were estimated at all: the covariance on top of what holds for the estimated ones, as plus and minus.
+    """Uncertainty of the estimated sizes: covariance beyond that for fixed sizes, split into a positive and a negative part.
 
-    It is the allowance for their few degrees of freedom itself, so it has none of its own: they would count twice.
+    It is itself the allowance for their few degrees of freedom, so it has none of its own: they would count twice.
     """
     whole = r.widening[:n, :n]
     scale = np.sqrt(np.diag(r.covariance)[:n])
@@ -379,7 +378,7 @@ def _widening(r: Response, n: int) -> tuple[F2, F2]:
 
 
 def _priors(solution: JointSolution, r: Response) -> list[Source]:
-    """Influence of the prior of every unknown on the estimate; of correlated ones that of what each adds to those before it."""
+    """Influence of the prior of every unknown on the estimate; for correlated unknowns, of the part independent of earlier ones."""
     order = chosen_order(solution)
     above = {t.name for t in solution.terms if t.order > order}
     terms = {t.name for t in solution.terms}
@@ -418,7 +417,7 @@ def _travel(run: RunData) -> F1:
 
 
 def _temperature(solution: JointSolution, inputs: StatedInputs) -> list[Source]:
-    """Scales warmer than thought: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
+    """Uncertain scale temperature: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
 
     Written as the term of Legendre order 1, whose function is twice the share of the stroke (`abbe.models.geometry.bases.term_values`).
     """

@@ -1,6 +1,6 @@
-"""What would be left if a part of a solution's errors were corrected, with all that the solution does not know of them and the rest.
+"""Forecast of the residual errors after a partial correction, with the solution's whole uncertainty.
 
-A correction takes off what the solution says, not what is: its uncertainty stays in the machine. With coefficients theta of the truth,
+A correction removes the estimate, not the truth: the uncertainty stays in the machine. With coefficients theta of the truth,
 estimate t and a correction c made from the estimate, theta - c is normal about t - c with the whole covariance of the solution. Every
 figure is taken from draws of it (GUM Supplement 1), because the largest error, the range of a diagonal and an rms are no linear functions,
 and near zero their linear uncertainty is wrong. Before and after come from the same draws, so their difference has its own uncertainty. A
@@ -22,7 +22,7 @@ from abbe.models.uncertainty.known_field import KnownField
 from abbe.models.volumetric import volume_grid
 
 DRAWS = 600
-"""So many draws know a standard uncertainty to 3 %."""
+"""Draws that determine a standard uncertainty to 3 %."""
 SEED = 20_261_122
 Kind = Literal["rms", "largest", "range"]
 
@@ -99,7 +99,7 @@ def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: f
 
 
 def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure], *, draws: int = DRAWS, seed: int = SEED) -> list[Forecast]:
-    """Figures as the machine is, and as it would be with a part of what the solution says corrected.
+    """Figures of the machine as it is, and with a part of the estimate corrected.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure],
     taken_off : array, shape (P,)
         Coefficients of the correction: the estimate of some motions (`KnownField.estimate_of`), mean linear errors (`KnownField.linear`).
     figures : sequence of ForecastFigure
-        What to ask.
+        Quantities to forecast.
     draws, seed : int
         Monte Carlo trials; equal seeds give equal numbers.
     """

@@ -158,7 +158,7 @@ class Parser:
 
 
 class BallbarWire:
-    """The box's conversation: answers commands, writes the samples that are due, drops whole samples when nobody reads."""
+    """The box's conversation: answers commands, writes the samples that are due, drops whole samples when the host does not read."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class BallbarWire:
         self.samples_dropped = 0
         self.ledger = BoxLedger()
         self.spoil_every = 0
-        """Every so manieth sample gets a bit flipped on its way; 0: none."""
+        """Every n-th sample gets a bit flipped on its way; 0: none."""
 
     def received(self, data: bytes) -> None:
         """Take bytes from the host. The world must be up to date."""

@@ -1,4 +1,4 @@
-"""What a host told the controller, and when: the oracle of tests that ask what was commanded after something happened."""
+"""Log of a host's commands to the controller, with times: the oracle of tests about commands after an event."""
 
 from dataclasses import dataclass
 

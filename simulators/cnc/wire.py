@@ -160,7 +160,7 @@ class CncRegisters:
         return True
 
     def _take_bank(self, number: int, offset: int, values: list[int]) -> bool:
-        """Write into a bank. The log keeps refused ones too: whoever writes without the right to is found by it."""
+        """Write into a bank. The log also keeps refused writes, which shows hosts that write without the right to."""
         comp = self._cnc.comp
         owner = comp.owner(self._cnc.now_s)
         taken = comp.write(number, offset, values)

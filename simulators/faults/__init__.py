@@ -1,1 +1,1 @@
-"""Faults on purpose: proxies and lines between a device and its host that do what a scenario says."""
+"""Fault injection: proxies and lines between a device and its host that play a scenario."""

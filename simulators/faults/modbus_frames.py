@@ -64,7 +64,7 @@ class Cutter:
         return frames
 
     def _size(self) -> int:
-        """Length of the first frame, 0 while it cannot be told."""
+        """Length of the first frame, 0 while unknown."""
         held = self._held
         if self._framing == MBAP:
             return 6 + int.from_bytes(held[4:6], "big") if len(held) >= _HEADER else 0

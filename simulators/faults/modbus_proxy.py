@@ -1,4 +1,4 @@
-"""A TCP proxy between a host and a Modbus device (MBAP, or RTU frames over TCP) that does to the traffic what a scenario says."""
+"""A TCP proxy between a host and a Modbus device (MBAP, or RTU frames over TCP) that plays a fault scenario on the traffic."""
 
 import argparse
 import asyncio

@@ -1,11 +1,11 @@
-"""What happens to Modbus requests and replies on their way, told by a fault scenario. Pure: whoever carries bytes asks it.
+"""Faults of Modbus requests and replies on their way, from a fault scenario. Pure: the carrier of the bytes calls it.
 
 Kinds, with the keys of a fault that they use. They hit the request number ``at`` among those of the sort ``on`` (any, read, write), and
 its reply. ``on`` may name the first register too (``write 64``):
 
 ==================  ========================================================================================================
 drop_request        the device never sees it
-drop_reply          it is executed, nobody hears of it
+drop_reply          it is executed, the host gets no reply
 delay_reply         the answer comes ``seconds`` later, and all later ones after it, as from a device that does one thing at a time
 latency             the answer is ``seconds`` on its way, with a probability of ``value`` percent (0: always)
 duplicate_reply     a copy follows after ``seconds``
@@ -74,7 +74,7 @@ class Toxics:
     scenario: FaultScenario
     framing: str
     free_at_s: float = float("-inf")
-    """Loop time at which the device is through with what it was given: the next scenario begins with the same device."""
+    """Loop time at which the device has finished its requests; the next scenario begins with the same device."""
     dead: bool = False
     requests: int = 0
     _seen: Counter[str] = field(default_factory=Counter)

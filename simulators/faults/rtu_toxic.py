@@ -1,4 +1,4 @@
-"""A Modbus RTU device on a pty whose line does what a scenario says: late, doubled, cut, noisy replies, echoes, a second master."""
+"""A Modbus RTU device on a pty whose line plays a scenario: late, doubled, cut, noisy replies, echoes, a second master."""
 
 import asyncio
 from pathlib import Path
@@ -62,8 +62,8 @@ class ToxicRtuLine:
             self._host.close()
             self._host = None
 
-    def say(self, data: bytes) -> None:
-        """Put bytes on the line that nobody asked for: noise, or another master's traffic."""
+    def inject(self, data: bytes) -> None:
+        """Put unsolicited bytes on the line: noise, or another master's traffic."""
         if self._host is not None:
             self._host.send(data)
 
@@ -82,12 +82,12 @@ class ToxicRtuLine:
             if act.after_s > 0:
                 self._later(act)
             else:
-                self.say(act.data)
+                self.inject(act.data)
 
     def _later(self, act: Act) -> None:
         def send() -> None:
             self._timers.discard(timer)
-            self.say(act.data)
+            self.inject(act.data)
 
         timer = self._loop.call_later(act.after_s, send)
         self._timers.add(timer)

@@ -1,4 +1,4 @@
-"""Which fault, when, how often: plain data, read from TOML or written in a test. Whoever plays faults (a proxy, a line) knows its kinds.
+"""Which fault, when, how often: plain data, read from TOML or written in a test. Each player (a proxy, a line) knows its kinds.
 
 .. code-block:: toml
 

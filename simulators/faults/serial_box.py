@@ -1,4 +1,4 @@
-"""A ball-bar's box on a bad line, with a time of its own: samples come when somebody lets it run, so no test has to wait for a clock."""
+"""A ball-bar's box on a bad line, with its own time: tests advance it, and never wait for a clock."""
 
 import asyncio
 from collections.abc import Callable
@@ -36,7 +36,7 @@ class Window:
 
 
 class _Tapped:
-    """The line as the box sees it: what the box says is noted, and its windows are put in, before the line spoils it."""
+    """The line as the box sees it: records the box's frames and applies its windows before the line spoils them."""
 
     def __init__(self, box: "FaultyBox", line: FaultyLine) -> None:
         self._box, self._line = box, line
@@ -49,7 +49,7 @@ class _Tapped:
         return self._line.room()
 
     def send(self, data: bytes) -> None:
-        self._line.send(b"".join(self._box.said(frame) for frame in cut(data)))
+        self._line.send(b"".join(self._box.record(frame) for frame in cut(data)))
 
     def pump(self) -> None:
         self._line.pump()
@@ -119,7 +119,7 @@ class FaultyBox:
         await self.line.close()
 
     async def run(self, samples: int) -> None:
-        """Let the box take so many samples, as fast as the line takes them; nothing comes of it when it is not streaming."""
+        """Let the box take samples as fast as the line accepts them; without effect when it is not streaming."""
         left = samples
         while left > 0:
             piece, left = min(left, _PIECE), left - _PIECE
@@ -129,7 +129,7 @@ class FaultyBox:
             await asyncio.sleep(0)
 
     def advance(self, samples: int) -> None:
-        """Let the time of so many samples go by and send what was sampled."""
+        """Advance the time by ``samples`` periods and send the samples."""
         rate_hz = self.world.ballbar.rate_hz
         self._taken += samples
         # to the middle between two samples, so that rounding never decides
@@ -145,7 +145,7 @@ class FaultyBox:
             self.world.ballbar.rate_hz = round(self.world.ballbar.rate_hz * self.rate_factor)
 
     def pause(self, seconds: float) -> None:
-        """Have taken no samples for a while in which the box's clock ran on."""
+        """Advance the box's clock without samples."""
         self._late_us += round(seconds * 1e6)
 
     def reboot(self) -> None:
@@ -155,12 +155,12 @@ class FaultyBox:
         self._wire.restart(self.boot_id)
 
     def begin_anew(self, rate_hz: int = 1000) -> None:
-        """Start a stream that nobody here asked for, as another program would."""
+        """Start a stream on the box itself, as another program would."""
         self.world.ballbar.start(rate_hz, self.world.time_s)
         self._begun()
 
-    def said(self, frame: bytes) -> bytes:
-        """Note what the box says; gives the frame with its windows."""
+    def record(self, frame: bytes) -> bytes:
+        """Record a frame of the box and return it with its windows applied."""
         sample = sample_of(frame)
         if sample is None:
             return frame

@@ -1,4 +1,4 @@
-"""A serial line that can be pulled out, held, slowed and spoilt, between a box and whoever opens the terminal at the stable path."""
+"""A serial line that can be unplugged, stalled, slowed and corrupted, between a box and the host at the stable path."""
 
 import asyncio
 import os
@@ -70,8 +70,8 @@ class FaultyLine:
         Where the host finds it, whatever terminal it is.
         It may be changed while the line is not plugged in: that is another socket of the computer.
     box : Uart
-        Baud rate and parity of the box. The host's baud rate is what it has really set; terminals keep no parity, so the host's is said
-        in ``host_parity``.
+        Baud rate and parity of the box. The host's baud rate is read from the terminal; terminals store no parity, so the host's is set in
+        ``host_parity``.
     """
 
     def __init__(self, link: Path, box: Uart) -> None:
@@ -148,7 +148,7 @@ class FaultyLine:
 
     def _host(self) -> Uart:
         baud = self._terminal.host_baud() if self._terminal is not None else 0
-        # a terminal that nobody has opened yet has the speed of a modem; nobody hears it either
+        # a terminal that no host has opened yet has the default speed of a modem, and no reader
         return Uart(baud, self.host_parity) if baud > 38400 else self._box
 
     def _hear(self, data: bytes) -> None:

@@ -36,7 +36,7 @@ KINDS = (*_CHANGES, "stall", "unplug")
 
 
 def play(line: FaultyLine, scenario: FaultScenario) -> None:
-    """Let the line do what the scenario says, from the next frame on, instead of whatever it did before.
+    """Play the scenario on the line from the next frame on, in place of the previous one.
 
     Raises
     ------

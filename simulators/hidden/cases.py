@@ -11,7 +11,7 @@ from abbe.simulators.hidden.effect import Hidden
 from abbe.simulators.hidden.plans import Run, runs_of
 from abbe.simulators.hidden.projection import Projector, projector
 from abbe.simulators.hidden.rig import BentMachine, PerfectMachine, Rig
-from abbe.simulators.hidden.rivals import Scene, indistinct
+from abbe.simulators.hidden.rivals import FittedRuns, indistinct
 
 ALL_EFFECTS = (drive, instrument, outside, structure, thermal)
 """Imported so that they stand in the book."""
@@ -26,7 +26,7 @@ BEYOND = ["second_tool_length", "single_axis_laser", "angular_interferometer", "
 
 
 @dataclass(frozen=True)
-class Seen:
+class Visibility:
     """How visible an effect is: µm, and standard deviations of one reading."""
 
     raw_rms_um: float
@@ -111,39 +111,43 @@ def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
     return e
 
 
-def _sized(e: Hidden, wanted: float, perfect: PerfectMachine, runs: list[Run], space: Projector) -> tuple[Hidden, Seen] | None:
+def _sized(
+    e: Hidden, wanted: float, perfect: PerfectMachine, runs: list[Run], model_projector: Projector
+) -> tuple[Hidden, Visibility] | None:
     """The effect at the strength at which it has the wanted local visibility, within its physical limits; None: no trace at all."""
     low, high = (CATALOGUE | OUTSIDE)[e.name][3]
-    seen = visibility(e, perfect, runs, space)
+    seen = visibility(e, perfect, runs, model_projector)
     if seen.raw_rms_um < 1e-6:
         return None
     power = 0.5 if e.name == "contour_lag" else 1.0
     factor = (wanted / max(seen.snr_local, 1e-9)) ** power
     size = float(np.clip(abs(e["strength"]) * factor, low, high))
     sized = e.scaled(float(np.copysign(size, e["strength"])))
-    return sized, visibility(sized, perfect, runs, space)
+    return sized, visibility(sized, perfect, runs, model_projector)
 
 
-def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], space: Projector) -> Seen:
-    """What of an effect the present model cannot take in.
+def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], model_projector: Projector) -> Visibility:
+    """Visibility of the part of an effect that the present model cannot absorb.
 
     ``snr_total``: length of what remains of its whitened trace over all identify runs; ``snr_local``: its rms over the touched readings.
     """
     without, with_it = Rig(perfect, ()), Rig(perfect, (e,))
     trace = np.concatenate([with_it.reading(r) - without.reading(r) for r in runs])
-    left = space.left(trace[:, None])[:, 0]
+    left = model_projector.left(trace[:, None])[:, 0]
     touched = np.abs(left) > TOUCHED * np.max(np.abs(left), initial=0.0)
     local = float(np.sqrt(np.mean(left[touched] ** 2))) if touched.any() else 0.0
-    separable = 1e3 * float(np.sqrt(np.mean((left / space.weight) ** 2)))
+    separable = 1e3 * float(np.sqrt(np.mean((left / model_projector.weight) ** 2)))
     raw = 1e3 * float(np.sqrt(np.mean(trace**2)))
-    return Seen(raw, separable, local, float(np.linalg.norm(left)), float(np.mean(touched)), left)
+    return Visibility(raw, separable, local, float(np.linalg.norm(left)), float(np.mean(touched)), left)
 
 
-def _fact(e: Hidden, seen: Seen, setting: Setting, perfect: PerfectMachine, runs: list[Run], space: Projector) -> dict[str, object]:
-    """What the sealed file says of one effect."""
-    scene = Scene(perfect, runs, setting.model)
+def _fact(
+    e: Hidden, seen: Visibility, setting: Setting, perfect: PerfectMachine, runs: list[Run], model_projector: Projector
+) -> dict[str, object]:
+    """Entry of the sealed file for one effect."""
+    fitted = FittedRuns(perfect, runs, setting.model)
     known = e.name in CATALOGUE
-    alike = [] if e.name in RANDOM else indistinct(scene, space, seen.left, e.label)
+    alike = [] if e.name in RANDOM else indistinct(fitted, model_projector, seen.left, e.label)
     parameters: dict[str, object] = {**e.parameters, "wild": e.wild}
     return {
         "predictable": e.name not in RANDOM, "separated_by": _separated(e, setting, perfect, alike) if known else {}, "label": e.label,
@@ -155,15 +159,15 @@ def _fact(e: Hidden, seen: Seen, setting: Setting, perfect: PerfectMachine, runs
 
 
 def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: list[str]) -> dict[str, list[str]]:
-    """What would tell each alias apart: what plan full has in addition, if plan full tells; else what no plan here has."""
+    """Additions that would separate each alias: those of plan full, if they suffice; else those that no plan here has."""
     if not aliases:
         return {}
     still: list[str] = aliases
     if setting.plan in ADDED:
         runs = [r for r in runs_of("full", setting.machinery) if r.role == "identify"]
-        space = projector(perfect, runs, setting.model, setting.noise.bar_mm, setting.noise.laser_mm)
-        seen = visibility(e, perfect, runs, space)
-        still = indistinct(Scene(perfect, runs, setting.model), space, seen.left, e.label)
+        model_projector = projector(perfect, runs, setting.model, setting.noise.bar_mm, setting.noise.laser_mm)
+        seen = visibility(e, perfect, runs, model_projector)
+        still = indistinct(FittedRuns(perfect, runs, setting.model), model_projector, seen.left, e.label)
     return {alias: list(BEYOND if alias in still else ADDED[setting.plan]) for alias in aliases}
 
 

@@ -83,7 +83,7 @@ RANGES: dict[str, dict[str, Pair]] = {
     "local_bump": {"w_mm": (12.0, 30.0)},
 }
 RANDOM = frozenset({"stick_slip", "vibration", "beam_outliers", "interference_burst"})
-"""Their phase or place is nobody's to foretell."""
+"""Effects whose phase or place is unpredictable."""
 ONE_SIGN = RANDOM | {"reversal_spike", "cyclic_error", "contour_lag", "ram_sag", "straightness", "positioning_nonlinear", "angular_error",
     "bar_thermal", "setup_centre_offset", "mirror_tilt", "laser_cosine", "air_refraction", "axis_thermal_growth", "local_bump", "ball_form",
     "clamp_slip", "encoder_count_loss", "counterbalance_surge"}  # fmt: skip

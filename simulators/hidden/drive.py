@@ -105,7 +105,7 @@ def stick_slip(e: Hidden, track: Track, out: Bend) -> None:
 
     The faster, the less, exp(-(v / v_c)^2), as friction falls with speed (Stribeck); standing, it rests.
 
-    The state is the travel itself, and where in its tooth an axis was left is nobody's to know; wild: teeth of unequal length.
+    The state is the travel itself, with an unknown initial phase; wild: teeth of unequal length.
     """
     if not track.moving:
         return

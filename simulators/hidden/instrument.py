@@ -7,7 +7,7 @@ from abbe.simulators.hidden.effect import MRAD, PPM, UM, URAD, Bend, Hidden, eff
 from abbe.simulators.hidden.track import Track
 
 AIR_PPM_PER_K = -0.93
-"""Warmer air is thinner: the light is longer in it than the laser was told, and it counts fewer waves on the same way."""
+"""Warmer air is thinner: the wavelength exceeds the laser's assumed one, and it counts fewer waves on the same path."""
 DEAD_PATH_MM = 900.0
 
 

@@ -148,6 +148,6 @@ class Live:
         return self.effect.bend(track).reading
 
     def describe(self) -> dict[str, object]:
-        """Name, key and parameters, for whoever opens the truth."""
+        """Name, key and parameters, for the truth report."""
         whole = asdict(self.effect)
         return {name: whole[name] for name in ("name", "key", "parameters", "wild")}

@@ -1,4 +1,4 @@
-"""What else could leave the same trace: textbook traces of every named effect, to first order, and which of them nothing can tell apart."""
+"""Rivals of a hidden effect: first-order textbook traces of every named effect, and those that are indistinguishable from it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from abbe.simulators.hidden.rig import PerfectMachine
 from abbe.simulators.hidden.track import Track
 
 INDISTINCT = 20.0
-"""Chi-square by which the best trace of a rival falls short, below which nobody can tell it from the effect."""
+"""Chi-square deficit of a rival's best trace below which it is indistinguishable from the effect."""
 COMPONENTS = "XYZABC"
 DRIFT_S = (1500.0, 3000.0, 6000.0)
 Function = Callable[[Track], F]
@@ -22,8 +22,8 @@ Function = Callable[[Track], F]
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Runs that may be fitted on a perfect machine, and what the present model knows."""
+class FittedRuns:
+    """The runs to fit, a perfect machine, and the present model."""
 
     machine: PerfectMachine
     runs: list[Run]
@@ -42,7 +42,7 @@ class Scene:
         for tau in taus:
             yield self.stack(lambda r, tau=tau: _warm(r, direction, arm, tau))  # type: ignore[misc]
 
-    def alone(self, bar: Function | None, laser: Function | None) -> F:
+    def of_instruments(self, bar: Function | None, laser: Function | None) -> F:
         """Readings of an effect of the instruments themselves."""
         return self.stack(lambda r: _instrument(r, bar if r.track.kind == "bar" else laser))
 
@@ -84,52 +84,52 @@ def _fraction(track: Track, axis: int) -> F:
     return np.asarray((track.q_mm[:, axis] - track.low_mm[axis]) / (track.high_mm[axis] - track.low_mm[axis]))
 
 
-def traces(scene: Scene) -> Iterator[tuple[str, F]]:
+def traces(fitted: FittedRuns) -> Iterator[tuple[str, F]]:
     """Label and columns of one trace of every named effect that is no part of the present model; several traces share a label."""
-    low, high = scene.runs[0].track.low_mm, scene.runs[0].track.high_mm
+    low, high = fitted.runs[0].track.low_mm, fitted.runs[0].track.high_mm
     for a, axis in enumerate(AXES):
-        yield from _drive(scene, a, axis)
+        yield from _drive(fitted, a, axis)
         for fixed in (float(low[a]), float(high[a])):
-            for columns in scene.warming(a, _from(a, fixed)):
+            for columns in fitted.warming(a, _from(a, fixed)):
                 yield f"axis_thermal_growth:{axis}", columns
-        for columns in scene.warming(a, lambda q: np.ones(len(q))):
+        for columns in fitted.warming(a, lambda q: np.ones(len(q))):
             yield f"spindle_thermal_drift:{axis}", columns
-        yield from _slides(scene, a, axis)
+        yield from _slides(fitted, a, axis)
     for plane, (carriage, d) in {"XY": (1, 0), "ZX": (2, 0), "YZ": (2, 1)}.items():
-        for columns in scene.warming(d, _from(carriage, 0.0)):
+        for columns in fitted.warming(d, _from(carriage, 0.0)):
             yield f"squareness_thermal:{plane}", columns
-    yield from _instruments(scene)
-    if scene.model.level == "rigid6":
-        yield from _motions(scene)
+    yield from _instruments(fitted)
+    if fitted.model.level == "rigid6":
+        yield from _motions(fitted)
 
 
 def _from(axis: int, fixed_mm: float) -> Callable[[F], F]:
     return lambda q: np.asarray(q[:, axis] - fixed_mm)
 
 
-def _slides(scene: Scene, a: int, axis: str) -> Iterator[tuple[str, F]]:
+def _slides(fitted: FittedRuns, a: int, axis: str) -> Iterator[tuple[str, F]]:
     for d in (d for d in range(3) if d != a):
-        yield f"lateral_play:E{AXES[d]}{axis}", scene.moved(d, lambda t: 0.5 * t.sign[:, a])
-        yield f"nonrigid_bed:E{AXES[d]}{axis}", np.vstack([_bed(scene, r, a, d) for r in scene.runs])
+        yield f"lateral_play:E{AXES[d]}{axis}", fitted.moved(d, lambda t: 0.5 * t.sign[:, a])
+        yield f"nonrigid_bed:E{AXES[d]}{axis}", np.vstack([_bed(fitted, r, a, d) for r in fitted.runs])
 
 
-def _motions(scene: Scene) -> Iterator[tuple[str, F]]:
+def _motions(fitted: FittedRuns) -> Iterator[tuple[str, F]]:
     for a, axis in enumerate(AXES):
         for c in range(6):
             name = "angular_error" if c >= 3 else "positioning_nonlinear" if c == a else "straightness"
             key = axis if c == a else f"E{COMPONENTS[c]}{axis}"
-            yield f"{name}:{key}", scene.motion(a, c)
+            yield f"{name}:{key}", fitted.motion(a, c)
 
 
-def _drive(scene: Scene, a: int, axis: str) -> Iterator[tuple[str, F]]:
-    yield f"backlash:{axis}", scene.moved(a, lambda t: -0.5 * t.sign[:, a])
+def _drive(fitted: FittedRuns, a: int, axis: str) -> Iterator[tuple[str, F]]:
+    yield f"backlash:{axis}", fitted.moved(a, lambda t: -0.5 * t.sign[:, a])
     for k in (-0.75, 0.75):
-        yield f"backlash_position_dependent:{axis}", scene.moved(a, partial(_uneven, a, k))
+        yield f"backlash_position_dependent:{axis}", fitted.moved(a, partial(_uneven, a, k))
     for d0 in (0.25, 0.5, 0.9):
-        yield f"reversal_spike:{axis}", scene.moved(a, partial(_spike, a, d0))
+        yield f"reversal_spike:{axis}", fitted.moved(a, partial(_spike, a, d0))
     for lead in (5.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0):
-        yield f"cyclic_error:{axis}", scene.moved(a, *(partial(_wave, a, lead, part) for part in (0.0, 0.25)))
-    yield f"servo_mismatch:{axis}", scene.moved(a, lambda t: -t.v_mm_s[:, a])
+        yield f"cyclic_error:{axis}", fitted.moved(a, *(partial(_wave, a, lead, part) for part in (0.0, 0.25)))
+    yield f"servo_mismatch:{axis}", fitted.moved(a, lambda t: -t.v_mm_s[:, a])
 
 
 def _uneven(a: int, k: float, track: Track) -> F:
@@ -147,7 +147,7 @@ def _wave(a: int, lead_mm: float, part: float, track: Track) -> F:
     return np.asarray(np.sin(2.0 * np.pi * (track.q_mm[:, a] / lead_mm + part)))
 
 
-def _bed(scene: Scene, run: Run, a: int, d: int) -> F:
+def _bed(fitted: FittedRuns, run: Run, a: int, d: int) -> F:
     other = 3 - a - d
     low, high = run.track.low_mm, run.track.high_mm
 
@@ -155,25 +155,25 @@ def _bed(scene: Scene, run: Run, a: int, d: int) -> F:
         part = (q - low) / (high - low)
         return np.asarray((np.sin(np.pi * part[:, a]) * (2.0 * part[:, other] - 1.0))[:, None])
 
-    return motion_columns(scene.machine, run, a, d, at(run.track.q_mm), at(reference_mm(run)[None])[0])
+    return motion_columns(fitted.machine, run, a, d, at(run.track.q_mm), at(reference_mm(run)[None])[0])
 
 
-def _instruments(scene: Scene) -> Iterator[tuple[str, F]]:
-    yield "contour_lag", scene.stack(_lag)
+def _instruments(fitted: FittedRuns) -> Iterator[tuple[str, F]]:
+    yield "contour_lag", fitted.stack(_lag)
     for tau in (500.0, 1000.0):
-        yield "bar_thermal", scene.alone(lambda t, tau=tau: t.radius_mm * np.exp(-(t.t_s - t.set_s) / tau), None)  # type: ignore[misc]
-    yield "laser_cosine", scene.alone(None, lambda t: t.reach_mm)
+        yield "bar_thermal", fitted.of_instruments(lambda t, tau=tau: t.radius_mm * np.exp(-(t.t_s - t.set_s) / tau), None)  # type: ignore[misc]
+    yield "laser_cosine", fitted.of_instruments(None, lambda t: t.reach_mm)
     for period in (5000.0, 8000.0, 12000.0):
         waves = [lambda t, f=f, p=period: f(2.0 * np.pi * t.t_s / p) * t.reach_mm for f in (np.sin, np.cos)]
-        yield "air_refraction", np.hstack([scene.alone(None, w) for w in waves])
-    yield "dead_path", scene.alone(None, lambda t: t.t_s - t.t_s[0])
+        yield "air_refraction", np.hstack([fitted.of_instruments(None, w) for w in waves])
+    yield "dead_path", fitted.of_instruments(None, lambda t: t.t_s - t.t_s[0])
     for beta in (0.6, 0.9):
-        yield "ram_sag", scene.stack(lambda r, beta=beta: _ram(scene, r, beta))  # type: ignore[misc]
-    if "bar_length_error" not in scene.model.terms:
-        yield "bar_length_error", scene.alone(lambda t: np.ones(t.n), None)
+        yield "ram_sag", fitted.stack(lambda r, beta=beta: _ram(fitted, r, beta))  # type: ignore[misc]
+    if "bar_length_error" not in fitted.model.terms:
+        yield "bar_length_error", fitted.of_instruments(lambda t: np.ones(t.n), None)
     for name, kind in (("setup_centre_offset", "bar"), ("mirror_tilt", "laser")):
-        if name not in scene.model.terms:
-            yield name, _per_setup(scene, kind)
+        if name not in fitted.model.terms:
+            yield name, _per_setup(fitted, kind)
 
 
 def _lag(run: Run) -> F:
@@ -184,7 +184,7 @@ def _lag(run: Run) -> F:
     return np.asarray(inward[:, None])
 
 
-def _ram(scene: Scene, run: Run, beta: float) -> F:
+def _ram(fitted: FittedRuns, run: Run, beta: float) -> F:
     track = run.track
     down = 1 if track.vertical == 2 else track.vertical
     span = float(track.high_mm[2] - track.low_mm[2])
@@ -195,12 +195,12 @@ def _ram(scene: Scene, run: Run, beta: float) -> F:
         return np.stack([-z * z * (1.0 + beta * high), 2.0 * z / span * (1.0 + beta * high)], axis=1)
 
     at, still = sink(track.q_mm), sink(reference_mm(run)[None])[0]
-    both = [motion_columns(scene.machine, run, 2, c, at[:, k : k + 1], still[k : k + 1]) for k, c in ((0, down), (1, 3))]
+    both = [motion_columns(fitted.machine, run, 2, c, at[:, k : k + 1], still[k : k + 1]) for k, c in ((0, down), (1, 3))]
     return both[0] + both[1]
 
 
-def _per_setup(scene: Scene, kind: str) -> F:
-    setups = sorted({r.track.setup for r in scene.runs if r.track.kind == kind})
+def _per_setup(fitted: FittedRuns, kind: str) -> F:
+    setups = sorted({r.track.setup for r in fitted.runs if r.track.kind == kind})
 
     def block(run: Run) -> F:
         own = run.track.look if kind == "bar" else tilt_columns(run)
@@ -210,12 +210,12 @@ def _per_setup(scene: Scene, kind: str) -> F:
             out[:, k : k + own.shape[1]] = own
         return out
 
-    return scene.stack(block)
+    return fitted.stack(block)
 
 
-def indistinct(scene: Scene, projector: Projector, left: F, own: str) -> list[str]:
+def indistinct(fitted: FittedRuns, projector: Projector, left: F, own: str) -> list[str]:
     """Labels of rivals whose best trace falls short of an effect's remainder ``left`` (n,) by less than `INDISTINCT`."""
-    labels, blocks = zip(*traces(scene), strict=True)
+    labels, blocks = zip(*traces(fitted), strict=True)
     raw = np.hstack(blocks) * projector.weight[:, None]
     kept = projector.columns.T @ raw
     products = raw.T @ raw - kept.T @ (projector.inverse @ kept)

@@ -29,7 +29,7 @@ def packaged() -> list[Path]:
 def picked(seed: int) -> Scenario:
     """The scenario of a seed; the machine is drawn by the same seed.
 
-    Every scenario draws a lot of its own, the highest wins: one more scenario takes over the seeds that it wins and changes no other.
+    Every scenario draws its own number and the highest wins: an added scenario takes over the seeds that it wins and changes no other.
 
     Raises
     ------

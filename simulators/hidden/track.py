@@ -1,4 +1,4 @@
-"""A run as the machine drives it: where the drives are told to be at every instant, which way they last went, when they turned."""
+"""A run as the machine drives it: commanded positions at every instant, directions of the last motion, times of reversal."""
 
 import itertools
 from collections.abc import Callable
@@ -23,7 +23,7 @@ class Track:
     """One run, or one moment of standing.
 
     Attributes: ``kind`` "bar" or "laser"; ``setup``; ``q_mm`` (n, 3) commanded; ``t_s`` (n,); ``v_mm_s`` and ``a_mm_s2`` (n, 3);
-    ``sign`` (n, 3) direction of each axis' last motion (0: standing since nobody knows when); ``since_mm`` (n, 3) travel since the last
+    ``sign`` (n, 3) direction of each axis' last motion (0: standing for an unknown time); ``since_mm`` (n, 3) travel since the last
     turn (`NEVER_MM` before the first); ``travelled_mm`` (n, 3) travel of each axis in the run; ``look`` (n, 3) unit vector that the
     instrument looks along; ``reach_mm`` (n,) laser: nominal path since the first record, bar: zeros; ``start_s`` of the run;
     ``set_s`` of the set-up; ``low_mm``, ``high_mm`` (3,) stroke; ``number`` of the run; ``radius_mm`` of the bar;
@@ -145,7 +145,7 @@ def carriage_mm(track: Track, axis: int, half: Callable[[F], F]) -> F:
     """Where lost motion leaves an axis, minus where it was sent, (n,) mm; ``half``: half width as a function of the position."""
     if track.course is None:
         if track.kind == "bar":
-            return np.zeros(track.n)  # one moment: nobody knows from where it came
+            return np.zeros(track.n)  # one instant: the approach is unknown
         moved = track.q_mm[:, axis]
         lead = moved[0] - RUN_IN_MM * track.sign[0, axis]
         path = np.concatenate([[lead], moved])

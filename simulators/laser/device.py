@@ -51,7 +51,7 @@ class Mount:
 
 
 class LaserDevice:
-    """Makes one output sample every 1/20 s of its own time; the sample is worked out when somebody looks at it."""
+    """Makes one output sample every 1/20 s of its own time; samples are computed when read."""
 
     def __init__(self, draws: Draws, sizes: Magnitudes, air: Air, locate: Locate) -> None:
         self._draws, self._sizes, self._air, self._locate = draws, sizes, air, locate
@@ -93,7 +93,7 @@ class LaserDevice:
         if self._mount is None or self._lost or not self._zeroed:
             return output
         position = self._locate(np.array([time_s]), axes_mm[None, :])[0]
-        # one generator per sample: the reading does not depend on which samples somebody looked at
+        # one generator per sample: a reading does not depend on which other samples were read
         noise = generator(self._draws.seed, STREAM_LASER_NOISE, count).normal() * self._draws.laser_noise_mm
         path = self._mount.displacement(position)
         if not self._compensating:
@@ -112,7 +112,7 @@ class LaserDevice:
     # ---- people --------------------------------------------------------------------------------------------------
 
     def mount(self, beam: F, position_mm: F) -> None:
-        """Set up laser and mirror at the tool position (3,), beam along ``beam``; whoever does it clears the beam-lost latch."""
+        """Set up laser and mirror at the tool position (3,), beam along ``beam``; this clears the beam-lost latch."""
         self.output()
         nominal = beam / np.linalg.norm(beam)
         rng = generator(self._draws.seed, STREAM_MIRROR, self._mounts)

@@ -1,1 +1,1 @@
-"""The sealed truth: how the machine really moves. Nothing here is told to any instrument except through a reading."""
+"""The sealed truth: how the machine really moves. Instruments learn of it only through readings."""

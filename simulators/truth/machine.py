@@ -26,7 +26,7 @@ class Machine:
         self.geometry = geometry
         self.draws = draws
         self.extra_scale: F = np.zeros(3)
-        """Scale error (mm/mm) that somebody added after the draw, about the start of each stroke."""
+        """Scale error (mm/mm) added after the draw, about the start of each stroke."""
 
     def motions(self, axis: int, position_mm: F) -> tuple[F, F]:
         """Translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""

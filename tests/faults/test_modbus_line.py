@@ -37,7 +37,7 @@ class Forger(ToxicRtuLine):
         count = int.from_bytes(asked.pdu[3:5], "big")
         if self.forge and asked.pdu[0] in (3, 4) and asked.pdu[1:3] != b"\x00\x00":
             self.forge -= 1
-            self.say(Frame(1, bytes([asked.pdu[0], 2 * count]) + count * b"\x07\x07").bytes(RTU))
+            self.inject(Frame(1, bytes([asked.pdu[0], 2 * count]) + count * b"\x07\x07").bytes(RTU))
         super()._received(data)
 
 
@@ -90,7 +90,7 @@ async def test_foreign_traffic_is_heard_and_the_line_is_proven_again():
     async with forged(Canary()) as (line, link, _):
         await link.read(3000, 1)
         before = line.requests
-        line.say(b"\x02\x03\x00\x64\x00\x01\xc5\xe6")
+        line.inject(b"\x02\x03\x00\x64\x00\x01\xc5\xe6")
         while not link._wire.strays:  # noqa: ASYNC110 - what the link hears sets no event
             await asyncio.sleep(0.001)
         assert await link.read(3000, 1) == (3000,)

@@ -342,7 +342,7 @@ async def test_m10_a_disturbed_line():
 
             def disturb(rig: Rig) -> None:
                 if name == "foreign master":
-                    rig.line.say(bytes.fromhex(FOREIGN))  # type: ignore[union-attr]
+                    rig.line.inject(bytes.fromhex(FOREIGN))  # type: ignore[union-attr]
                 else:
                     rig.line.play(scenario(LINE_FAULTS[name](kind, kind.nth(rig))))
 

@@ -119,7 +119,7 @@ def prospects(
     if not rivals or not found:
         return ()
     noise = {**NOISE_MM, **(noise_mm or {})}
-    old = tuple(_thinned(r) for r in case.of("identify"))
+    old = tuple(_decimated(r) for r in case.of("identify"))
     new = tuple(r for o in found for r in (*o.runs, *o.subtracted))
     every = replace(case, runs=tuple(r for r, _ in old) + new)
     table = _Columns.of(_with_setups(every), leader, rivals, tuple(r.path for r in every.runs))
@@ -141,7 +141,7 @@ def _with_setups(case: Case) -> Baseline:
     return baseline_of(replace(case, includes=case.includes | {"setup_centre_offset", "bar_length_error", "mirror_tilt"}))
 
 
-def _thinned(run: CaseRun) -> tuple[CaseRun, float]:
+def _decimated(run: CaseRun) -> tuple[CaseRun, float]:
     """A run with fewer readings, and how many each represents."""
     step = max(run.path.n // THIN, 1)
     p, rows = run.path, slice(None, None, step)
@@ -178,7 +178,7 @@ class _Columns:
         return cls(base, tuple(np.asarray(s @ c) for s in own), found)
 
     def gram(self, run: CaseRun, k: int, weight: float, subtracted: tuple[CaseRun, int] | None = None) -> F2:
-        """Normal matrix of one run: simulation's unknowns, rivals, leader; ``subtracted``: a run whose readings are subtracted, its index."""
+        """Normal matrix of one run: simulation, rivals, leader; ``subtracted``: a run whose readings are subtracted, and its index."""
         columns = self._of_run(run, k)
         if subtracted is not None:
             columns = columns - self._of_run(*subtracted)

@@ -76,25 +76,25 @@ def where_of(effect: Effect, key: str, values: Values, case: Case) -> Localizati
     paths = tuple(r.path for r in case.of("identify", "holdout"))
     columns = effect.signal(paths, key, values)
     base = localize_signal(paths, tuple(np.linalg.norm(c, axis=1) for c in columns))
-    said: dict[str, object] = {"tests": base.tests, "runs": base.runs}
+    located: dict[str, object] = {"tests": base.tests, "runs": base.runs}
     letters = key[1:] if key[:1] == "E" else key
-    said["axes"] = tuple(a for a in AXES if a in letters) or base.axes
+    located["axes"] = tuple(a for a in AXES if a in letters) or base.axes
     kind = effect.name.removeprefix(PREFIX)
     if kind in ("step", "slip", "settling"):
         later = 3.0 * values.get("tau_s", 0.0)
-        said["time_s"] = (values["t0_s"] - CLOCK_S, values["t0_s"] + CLOCK_S + later)
+        located["time_s"] = (values["t0_s"] - CLOCK_S, values["t0_s"] + CLOCK_S + later)
     elif kind == "burst":
-        said["time_s"] = (values["t0_s"] - 2.0 * values["width_s"], values["t0_s"] + 2.0 * values["width_s"])
+        located["time_s"] = (values["t0_s"] - 2.0 * values["width_s"], values["t0_s"] + 2.0 * values["width_s"])
     elif kind == "surge":
-        said["period_s"] = values["period_s"]
+        located["period_s"] = values["period_s"]
     elif kind == "wave":
-        said["period_mm"] = values["pitch_mm"]
+        located["period_mm"] = values["pitch_mm"]
     elif kind == "lobes":
-        said |= {"angular_lobes": int(key[1:]), "axes": (), "tests": base.tests}
+        located |= {"angular_lobes": int(key[1:]), "axes": (), "tests": base.tests}
     elif kind == "bump":
         x, y, z = place_at(paths, values["at_s"])
-        said |= {"position_mm": (float(x), float(y), float(z)), "radius_mm": 2.0 * values["width_mm"]}
-    return Localization(**said, depends_on=DEPENDS[kind])  # type: ignore[arg-type]
+        located |= {"position_mm": (float(x), float(y), float(z)), "radius_mm": 2.0 * values["width_mm"]}
+    return Localization(**located, depends_on=DEPENDS[kind])  # type: ignore[arg-type]
 
 
 DEPENDS: dict[str, tuple[str, ...]] = {

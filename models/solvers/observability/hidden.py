@@ -90,9 +90,9 @@ def _proportion(terms: tuple[Term, ...], family: Family) -> str:
     used = np.flatnonzero(family.vectors[:, 0])
     if family.vectors.shape[1] != 1 or len(used) != 2 or any(terms[i].order > 1 for i in used):
         return ""
-    told = [(float(family.vectors[i, 0]), *_unit(terms[i])) for i in used]
-    a, b = (value * size for value, size, _, _ in told)
-    one, other = (f"{unit} of {terms[i].motion}{end}" for i, (_, _, unit, end) in zip(used, told, strict=True))
+    reported = [(float(family.vectors[i, 0]), *_unit(terms[i])) for i in used]
+    a, b = (value * size for value, size, _, _ in reported)
+    one, other = (f"{unit} of {terms[i].motion}{end}" for i, (_, _, unit, end) in zip(used, reported, strict=True))
     return f": 10 {one} look like {-b / a * 10.0:.3g} {other}"
 
 
@@ -123,7 +123,7 @@ def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None 
     -------
     list of Family, exact ones first; all vectors together with ``found`` span ``null``.
     """
-    told = np.zeros((len(terms), 0)) if found is None else found
+    reported = np.zeros((len(terms), 0)) if found is None else found
     shadow = null @ null.T
     out: list[tuple[tuple[str, ...], F2]] = []
     for highest, largest in ((LOW, LARGEST_SET_OF_LOW), (max(t.order for t in terms), LARGEST_SET)):
@@ -131,25 +131,25 @@ def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None 
         for i, t in enumerate(terms):
             if t.order <= highest:
                 rows.setdefault(t.motion, []).append(i)
-        new, told = _of_few(shadow, rows, largest, told, null.shape[1])
+        new, reported = _of_few(shadow, rows, largest, reported, null.shape[1])
         out += new
-    left, _ = _independent(_unit_length(sparse_rows(null.T).T), told)
+    left, _ = _independent(_unit_length(sparse_rows(null.T).T), reported)
     return _merged(terms, out, factor) + ([_family(terms, left, factor, exact=False)] if left.shape[1] else [])
 
 
-def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, told: F2, count: int) -> tuple[list[tuple[tuple[str, ...], F2]], F2]:
+def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, reported: F2, count: int) -> tuple[list[tuple[tuple[str, ...], F2]], F2]:
     """New hidden combinations of sets of up to ``largest`` motions, smallest sets first, and all reported combinations then."""
     active = {m: at for m, at in rows.items() if np.trace(shadow[np.ix_(at, at)]) > INSIDE}
     out: list[tuple[tuple[str, ...], F2]] = []
     for size in range(1, largest + 1):
         for chosen, held in _holding(shadow, active, size):
             known = sum(v.shape[1] for motions, v in out if set(motions) <= set(chosen))
-            if told.shape[1] == count or held <= known:
+            if reported.shape[1] == count or held <= known:
                 continue
-            new, told = _independent(_inside(shadow, [i for m in chosen for i in active[m]]), told)
+            new, reported = _independent(_inside(shadow, [i for m in chosen for i in active[m]]), reported)
             if new.shape[1]:
                 out.append((chosen, new))
-    return out, told
+    return out, reported
 
 
 def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], factor: F1) -> list[Family]:
@@ -188,21 +188,21 @@ def _unit_length(vectors: F2) -> F2:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
-def _independent(vectors: F2, told: F2) -> tuple[F2, F2]:
+def _independent(vectors: F2, reported: F2) -> tuple[F2, F2]:
     """The vectors independent of those already reported, and all reported so far, orthonormal."""
     new = []
     for v in vectors.T:
-        rest = _beside(v[:, None], told)
+        rest = _beside(v[:, None], reported)
         size = float(np.linalg.norm(rest))
         if size > 1e-4:
             new.append(v)
-            told = np.concatenate([told, rest / size], axis=1)
-    return (np.stack(new, axis=1) if new else vectors[:, :0]), told
+            reported = np.concatenate([reported, rest / size], axis=1)
+    return (np.stack(new, axis=1) if new else vectors[:, :0]), reported
 
 
-def _beside(vectors: F2, told: F2) -> F2:
-    once = vectors - told @ (told.T @ vectors)
-    return np.asarray(once - told @ (told.T @ once))
+def _beside(vectors: F2, reported: F2) -> F2:
+    once = vectors - reported @ (reported.T @ vectors)
+    return np.asarray(once - reported @ (reported.T @ once))
 
 
 def _family(terms: tuple[Term, ...], vectors: F2, factor: F1, *, exact: bool) -> Family:
