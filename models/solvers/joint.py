@@ -206,7 +206,7 @@ def _solution(problem: CampaignProblem, fit: CampaignFit, model: str, order: int
         prior_sd=fit.prior_sd,
         information=information,
         prior_root=fit.sizes.typical[:, None] * fit.sizes.root * c.half(fit.sizes),
-        weight_per_mm2=(np.exp(-c.eta) / fit.thinning)[problem.readings.kind] * fit.weight / problem.sigma**2,
+        weight_per_mm2=(np.exp(-c.eta) / fit.decimation)[problem.readings.kind] * fit.weight / problem.sigma**2,
         order=order,
         noise_mm={k: float(problem.noise.sigma_mm[k] * factor[i]) for i, k in enumerate(KINDS) if whole.count[i] > 0},
         noise_repeats_mm={k: v for i, (k, v) in enumerate(problem.noise.repeats_mm.items()) if whole.count[i] > 0},
