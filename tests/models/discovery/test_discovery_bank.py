@@ -9,7 +9,7 @@ import pytest
 
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
-from abbe.models.discovery.whitened_problem import WhitenedProblem, taken_out, whiten
+from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten, with_projection
 from abbe.models.effects.catalogue import CATALOGUE
 from tests.models.discovery.test_discovery_search import campaign
 
@@ -61,6 +61,6 @@ def test_what_another_bank_holds_is_not_made_again_and_is_the_same(problem: Whit
 def test_another_scene_starts_without_banks(problem: WhitenedProblem) -> None:
     bank = bank_of(problem, PICKS[:3])
     assert bank in problem.banks
-    assert not taken_out(problem).banks
+    assert not with_projection(problem).banks
     del bank
     assert not any(isinstance(b, Bank) and len(b.known) == 3 for b in problem.banks)  # nobody else keeps it

@@ -12,7 +12,7 @@ import pytest
 
 from abbe.models.discovery.answer import NamedEffect
 from abbe.models.discovery.finding import _confounded, _of_scatter, residues
-from abbe.models.discovery.localization import Where
+from abbe.models.discovery.localization import Localization
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.discovery.discovery_answer import answer_doc
@@ -80,7 +80,7 @@ def test_the_strongest_name_is_never_a_residue() -> None:
 
 
 def test_a_parameter_of_the_scatter_claims_no_certainty() -> None:
-    named = _of_scatter(VarianceFinding("vibration", "Z", 1.0, 0.1, {"frequency_hz": 7.0}, 50.0, Where()))
+    named = _of_scatter(VarianceFinding("vibration", "Z", 1.0, 0.1, {"frequency_hz": 7.0}, 50.0, Localization()))
     assert math.isnan(named.parameters["frequency_hz"][1])
     answer = answered(named)["parameters"]
     assert answer["frequency_hz"] == 7.0

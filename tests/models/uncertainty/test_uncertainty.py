@@ -14,7 +14,7 @@ from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
 from abbe.models.uncertainty.inputs import STEEL_PER_K, StatedInputs
 from abbe.models.uncertainty.mask import compensable_mask
 from abbe.models.uncertainty.prediction import budget_over, predict_deviation
-from abbe.models.uncertainty.sources import WORDS, error_sources, omitted_prior_sd, response
+from abbe.models.uncertainty.sources import SOURCE_TEXTS, error_sources, omitted_prior_sd, response
 from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
@@ -151,7 +151,7 @@ def test_repeatability_takes_its_share_out_of_the_readings_and_adds_to_a_single_
 def test_every_source_has_words_and_degrees_of_freedom(solution):
     inputs = StatedInputs(repeatability_mm=1e-4, repeatability_dof=9.0)
     sources = error_sources(solution, inputs)
-    assert {s.name for s in sources.sources} == set(WORDS)
+    assert {s.name for s in sources.sources} == set(SOURCE_TEXTS)
     assert sources.source("repeatability").dof == 9.0
     assert sources.source("scale_temperature").dof == np.inf
     assert sources.source("estimated_sizes").dof == np.inf  # it is the allowance for few degrees of freedom itself
