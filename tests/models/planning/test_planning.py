@@ -155,7 +155,7 @@ def test_hemispheres_open_towards_the_spindle(tool, vertical, opens):
     """Vertical axis Y and a spindle along Z: a hemisphere that opened along Y would bring the spindle down beside the cup."""
     m = replace(MACHINE, tool_mm=np.array(tool, dtype=float))
     towards = opening(m, vertical)
-    assert towards.words == opens
+    assert towards.text == opens
     assert bool(towards.warning) == (not any(tool))
     for test in candidates(m, TOOLS, vertical):
         if isinstance(test, HelixTest):
