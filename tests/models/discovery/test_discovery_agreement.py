@@ -136,7 +136,9 @@ def test_what_noise_was_assumed_does_not_matter(folder: Path) -> None:
     projection = replace(problem.projection, y=0.5 * problem.projection.y, moment=0.5 * problem.projection.moment)
     first = agreements(problem, solution, predicted)[0]
     second = agreements(
-        replace(problem, colours=colours, projection=projection), replace(solution, theta_covariance=4.0 * solution.theta_covariance), predicted
+        replace(problem, colours=colours, projection=projection),
+        replace(solution, theta_covariance=4.0 * solution.theta_covariance),
+        predicted,
     )[0]
     assert [a.run for a in second] == [a.run for a in first]
     assert [a.p for a in second] == pytest.approx([a.p for a in first], rel=1e-3)
