@@ -75,7 +75,7 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
     from abbe.service.demo.demo_hidden import run_hidden_demo
-    from abbe.service.demo.demo_hidden_words import hidden_json, story
+    from abbe.service.demo.demo_hidden_text import hidden_json, summary_lines
     from abbe.service.rendering.document_page import write_document
     from abbe.service.report.report_discovery import found_report
 
@@ -90,7 +90,7 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     if as_json:
         sys.stdout.write(json.dumps({"seed": seed, "speed": speed} | hidden_json(result), indent=2) + "\n")
     else:
-        for line in story(result):
+        for line in summary_lines(result):
             typer.echo(line)
     Console(stderr=True).print(f"report: {report}")
 

@@ -100,7 +100,7 @@ def show(found: Sequence[PaperResult], console: Console) -> None:
 
 
 def _numbers(console: Console, title: str, rows: Sequence[PaperRow], notes: dict[str, int]) -> None:
-    from abbe.service.papers.words import lines
+    from abbe.service.papers.text import lines
 
     cells = [
         (line.where, line.quantity, line.printed, line.computed, line.difference, line.within, line.status, _key(line.note, notes))
@@ -111,7 +111,7 @@ def _numbers(console: Console, title: str, rows: Sequence[PaperRow], notes: dict
 
 
 def _checks(console: Console, result: PaperResult, notes: dict[str, int]) -> None:
-    from abbe.service.papers.words import check_lines
+    from abbe.service.papers.text import check_lines
 
     cells = [(*line[:-1], _key(line[-1], notes)) for line in check_lines(result.checks)]
     if cells:

@@ -20,8 +20,8 @@ from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import operator_needed
-from abbe.service.tables.table_gate import accept_strange, check_in_force, said, vouch
-from abbe.service.tables.unverified import KnownState, known_tables
+from abbe.service.tables.table_gate import accept_strange, acceptance_doc, check_in_force, vouch
+from abbe.service.tables.unverified import KnownTables, known_tables
 
 READY = "make the machine ready (interlocks, link), then start again"
 
@@ -164,7 +164,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
     await _given_to_a_person(store, site, chain)
     for other_chain in _open_with(crc, known) - {chain}:
         book = await _given_to_a_person(store, site, other_chain)
-        await book.append(await book.entries(), PushState.ACCEPTED, said(now, by))
+        await book.append(await book.entries(), PushState.ACCEPTED, acceptance_doc(now, by))
     await vouch(store, site, now, by)
     text = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
     push = known.unverified.get(crc)
@@ -174,7 +174,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
     return f"{text}; it is that of push {push.push}{name}, which no measurement has verified"
 
 
-def _open_with(crc: int, known: KnownState) -> set[str]:
+def _open_with(crc: int, known: KnownTables) -> set[str]:
     """Journal of the last push that brought this table, if it is still open: under another name or address it would be taken back."""
     push = known.pushed.get(crc)
     return {push.chain} if push is not None and push.may_be_active else set()

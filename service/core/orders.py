@@ -35,7 +35,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, put_right
+from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, reconciled
 
 log = structlog.get_logger("abbe.orders")
 
@@ -143,7 +143,7 @@ class _TableOrderJob(_OrderJob):
         self._look, self._retrying = look, retrying
 
     async def end(self, outcome: JobOutcome) -> SlotState:
-        return await super().end(put_right(await self._retrying(self._look), outcome))
+        return await super().end(reconciled(await self._retrying(self._look), outcome))
 
     async def interrupted(self) -> None:
         """Record where it stands by the journal; the next start takes back what is open."""

@@ -16,14 +16,14 @@ from abbe.service.errors import AbbeError
 from abbe.service.scheduler.loop import Alarms
 from abbe.service.tables.in_force import InForce, LookAtTable
 from abbe.service.tables.table_gate import STRANGE as STRANGE_TABLE
-from abbe.service.verification.verified_by import STRANGE
+from abbe.service.verification.verified_by import STRANGE_TABLE as STRANGE_TABLE_CODE
 
 log = structlog.get_logger("abbe.table")
 
 LOOK_S = 10.0
 AGAIN_S = 1.0
 """A first difference is looked at once more after this: a push of another process may have ended between both readings."""
-CODE = STRANGE
+CODE = STRANGE_TABLE_CODE
 REMEDY = "find out who wrote it; restore the right table at the controller, or, if this one is right: abbe accept-table MACHINE.toml"
 """Neither a rollback nor a push: both are refused while such a table is in force (`abbe.service.tables.table_gate`)."""
 

@@ -32,7 +32,7 @@ MAX_SAMPLES_PER_S = 6000
 
 CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
 """Simulated instruments are as good as their simulator says, for ever."""
-RAW = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
+FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 """Nobody has ever corrected these machines: their first tables replace nothing by everything, as a person would allow after a look."""
 
 
@@ -60,7 +60,9 @@ def demo_site(ready: dict[str, Any]) -> Site:
     """The machine file's content for a simulated machine: its nominal geometry and where its devices listen."""
     machine = machine_from_doc(ready["machine"])
     urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
-    return Site("demo-machine", machine, machine_doc("demo-machine", machine), urls, limits=RAW, calibrated_until=CERTIFICATES)
+    return Site(
+        "demo-machine", machine, machine_doc("demo-machine", machine), urls, limits=FIRST_TABLE_LIMITS, calibrated_until=CERTIFICATES
+    )
 
 
 def write_machine_file(site: Site, folder: Path) -> Path:
@@ -98,10 +100,10 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()
-    world_args = ["--seed", str(seed)]
-    args = [*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]
-    async with running_simulators(args) as world:
-        site = demo_site(world.ready)
+    simulator_args = ["--seed", str(seed)]
+    args = [*simulator_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]
+    async with running_simulators(args) as simulator:
+        site = demo_site(simulator.ready)
         write_machine_file(site, folder)
         result = DemoResult(seed, speed, site, folder, clock.utc().isoformat(timespec="seconds"))
         store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
@@ -112,8 +114,8 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
             store.close()
     progress(Progress("truth", 0.0, 1.0, None, "asking the simulator's sealed truth"))
     bank = folder / "active_bank.bin"
-    result.truth_before = await sealed_truth(world_args, None)
-    result.truth_after = await sealed_truth(world_args, bank)
+    result.truth_before = await sealed_truth(simulator_args, None)
+    result.truth_after = await sealed_truth(simulator_args, bank)
     result.duration_s = clock.monotonic_s() - start
     return result
 

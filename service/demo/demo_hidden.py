@@ -47,7 +47,7 @@ class HiddenDemo:
     ``refused``: why no table was written where one was tried; ``truth``: the simulator's own words, opened at the end.
     """
 
-    world_args: list[str]
+    simulator_args: list[str]
     site: Site
     folder: Path
     started_utc: str
@@ -62,13 +62,13 @@ class HiddenDemo:
 
 
 async def run_hidden_demo(
-    world_args: list[str], speed: float, folder: Path, progress: ProgressSink, *, tables: bool = True, clock: Clock | None = None
+    simulator_args: list[str], speed: float, folder: Path, progress: ProgressSink, *, tables: bool = True, clock: Clock | None = None
 ) -> HiddenDemo:
     """Play a discovery on a simulated machine over real wires.
 
     Parameters
     ----------
-    world_args : list of str
+    simulator_args : list of str
         Arguments of the simulators: ``--hidden SEED``, or a scenario file, which stays unread here.
     folder : Path
         Keeps database and machine file.
@@ -82,10 +82,10 @@ async def run_hidden_demo(
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()
-    async with running_simulators([*world_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
-        site = demo_site(world.ready)
+    async with running_simulators([*simulator_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
+        site = demo_site(simulator.ready)
         write_machine_file(site, folder)
-        result = HiddenDemo(world_args, site, folder, clock.utc().isoformat(timespec="seconds"))
+        result = HiddenDemo(simulator_args, site, folder, clock.utc().isoformat(timespec="seconds"))
         store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
         try:
             async with open_session(site.urls) as session:
@@ -93,7 +93,7 @@ async def run_hidden_demo(
         finally:
             store.close()
     progress(Progress("truth", 0.0, 1.0, None, "opening the simulator's sealed truth"))
-    result.truth = await sealed_truth(world_args, None)
+    result.truth = await sealed_truth(simulator_args, None)
     result.duration_s = clock.monotonic_s() - start
     return result
 
@@ -110,7 +110,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     job = await asyncio.to_thread(prepare, old, catalogue(), current(store, site.name), thin=few)
     journal = await asyncio.to_thread(journal_of, store, job)
     result.job, result.journal = job, journal
-    result.finding = await _searched(job, journal, progress)
+    result.finding = await _search(job, journal, progress)
     ids = await measure(session, store, site, new_measurement(site.machine, rate_hz=rate, name=ANEW), progress=progress)
     progress(Progress("prediction", 0.0, 1.0, None, "the new measurement against what the model says"))
     new = await asyncio.to_thread(from_store, store, ANEW)
@@ -126,17 +126,17 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
         result.refused = str(error)
 
 
-async def _searched(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> Finding:
+async def _search(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> Finding:
     """The search, off the event loop; stopped, it ends with its next word about how far it is."""
     stopped = threading.Event()
 
-    def told(p: Progress) -> None:
+    def checked_progress(p: Progress) -> None:
         if stopped.is_set():
             raise InterruptedError("the search was stopped")
         progress(p)
 
     try:
-        return await asyncio.to_thread(discover, job, journal, search, told)
+        return await asyncio.to_thread(discover, job, journal, search, checked_progress)
     except asyncio.CancelledError:
         stopped.set()
         raise

@@ -34,7 +34,7 @@ from abbe.service.report.solution_sections import contributions, parameter_rows,
 from abbe.service.verification.verify import VerificationFigures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
-ALL_SEEN = (
+ALL_OBSERVABLE = (
     "nothing of the model: these runs tell every parameter apart. Errors outside the model remain possible; the residuals are the place to "
     "look"
 )
@@ -136,7 +136,7 @@ def demo_report(result: DemoResult) -> Document:
                 "Identified parameters", [*parameter_pictures(rows, contributions(joint)), parameter_table(shown), *setup_section(rows)]
             ),
         ),
-        not_observable=[g.text for g in observability_of(joint).hidden] or [ALL_SEEN],
+        not_observable=[g.text for g in observability_of(joint).hidden] or [ALL_OBSERVABLE],
         appendix=(
             Section("Compensation tables", _compensation(c)),
             Section("Residuals", residual_picture(residual_series(joint), runs)),

@@ -48,8 +48,8 @@ USER = "approver"
 EVERY_MIN = 2.0
 """Minutes of the real clock between checks: at the usual speed of the demonstration hours of the machine."""
 READY_S, STOP_S, LOOK_S = 30.0, 6.0, 0.5
-LOCKED_LOOKS = 60
-ROOM_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
+MAX_LOCKED_READS = 60
+MARGIN_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
 """Nobody has corrected this machine, and it is good enough as it is: the limits are what it does today, U and so much more."""
 
 
@@ -63,7 +63,7 @@ class Serving:
     log: Path
 
 
-async def run_served_demo(seed: int, speed: float, folder: Path, port: int, say: Callable[[str], None]) -> None:
+async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show: Callable[[str], None]) -> None:
     """Commission a simulated machine, let the service watch it, tell the story, and go on until somebody ends it.
 
     Raises
@@ -71,35 +71,35 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, say:
     AbbeError, DriverError
         One cause, one remedy. Service and simulators are gone in any case.
     """
-    async with running_simulators(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as world:
-        site = demo_site(world.ready)
+    async with running_simulators(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
+        site = demo_site(simulator.ready)
         machine_file = write_machine_file(site, folder)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-            say("what the control does with a table is proved first: abbe comp commission")
+            show("what the control does with a table is proved first: abbe comp commission")
             async with open_session(site.urls) as session:
                 await commission_levels(session.controller, store, site)
                 await commission(session, store, site, progress=ignore_progress)
-                say("what the machine does today is what its limits shall allow: a verification")
-                limits_um = await limits_of_today(session, store, site, bar_rate_hz(speed))
-                say("what its errors are today is kept, to tell later what has changed: an identification")
-                await solved_today(session, store, site, bar_rate_hz(speed))
+                show("what the machine does today is what its limits shall allow: a verification")
+                limits_um = await measured_limits(session, store, site, bar_rate_hz(speed))
+                show("what its errors are today is kept, to tell later what has changed: an identification")
+                await store_baseline(session, store, site, bar_rate_hz(speed))
             async with served(machine_file, store, port, limits_um) as serving:
-                say(f"page: {serving.page}")
-                say(f"   log in as {serving.user} with {serving.password} (what the service writes: {serving.log})")
-                await story(world, site.name, store, serving, say)
-                say("the service goes on: Ctrl-C ends it")
+                show(f"page: {serving.page}")
+                show(f"   log in as {serving.user} with {serving.password} (what the service writes: {serving.log})")
+                await narrate(simulator, site.name, store, serving, show)
+                show("the service goes on: Ctrl-C ends it")
                 await asyncio.Event().wait()
 
 
-async def limits_of_today(session: Session, store: Store, site: Site, rate_hz: int) -> dict[str, float]:
+async def measured_limits(session: Session, store: Store, site: Site, rate_hz: int) -> dict[str, float]:
     """Limits that the machine just keeps as it is now, µm."""
     plan = paced(verification(site.machine, rate_hz=rate_hz, name="as it is"), site.max_feed_mm_min)
     ids = await measure(session, store, site, plan, progress=ignore_progress)
     rows = figure_rows(figures(await load_runs(store, ids)))
-    return {key: round(rows[key][0] + COVERAGE * rows[key][1] + room, 1) for key, room in ROOM_UM.items()}
+    return {key: round(rows[key][0] + COVERAGE * rows[key][1] + room, 1) for key, room in MARGIN_UM.items()}
 
 
-async def solved_today(session: Session, store: Store, site: Site, rate_hz: int) -> None:
+async def store_baseline(session: Session, store: Store, site: Site, rate_hz: int) -> None:
     """Measure and solve the machine as it is, and keep that; nothing is proposed."""
     plan = paced(identification(site.machine, rate_hz=rate_hz, name="as delivered"), site.max_feed_mm_min)
     ids = await measure(session, store, site, plan, progress=ignore_progress)
@@ -108,7 +108,7 @@ async def solved_today(session: Session, store: Store, site: Site, rate_hz: int)
     await store.write(store.solutions.add, campaign.id, "joint", ids, solution_doc(solved) | {"machine": site.doc})
 
 
-def served_lines(port: int, limits_um: dict[str, float]) -> str:
+def service_config(port: int, limits_um: dict[str, float]) -> str:
     """What the machine file says more when it is served: a check every few minutes, and proposals by themselves."""
     limits = "\n".join(f"{key} = {value:g}" for key, value in limits_um.items())
     return f"""
@@ -162,7 +162,7 @@ async def served(
     """
     port = free_port(port)
     with machine_file.open("a", encoding="utf-8") as out:
-        out.write(served_lines(port, limits_um))
+        out.write(service_config(port, limits_um))
     password = add_approver(store, clock or SystemClock())
     log = machine_file.with_name("service.log")
     with log.open("wb") as out_log:
@@ -208,9 +208,9 @@ async def _end(process: asyncio.subprocess.Process) -> None:
         await process.wait()
 
 
-async def drift(world: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -> None:
+async def drift(simulator: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -> None:
     """Let the simulated machine's X axis grow. Only a simulator can be asked for that."""
-    host, port = str(world.ready["fixture"]).removeprefix("fixture+tcp://").rsplit(":", 1)
+    host, port = str(simulator.ready["fixture"]).removeprefix("fixture+tcp://").rsplit(":", 1)
     reader, writer = await asyncio.open_connection(host, int(port))
     try:
         writer.write(json.dumps({"id": 1, "op": "drift", "axis": "X", "um_per_m": um_per_m}).encode() + b"\n")
@@ -222,7 +222,7 @@ async def drift(world: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -> No
         raise AbbeError(f"the simulated machine does not drift: {answer}", "check the scenario")
 
 
-async def story(world: SimulatorProcess, machine: str, store: Store, serving: Serving, say: Callable[[str], None]) -> None:
+async def narrate(simulator: SimulatorProcess, machine: str, store: Store, serving: Serving, show: Callable[[str], None]) -> None:
     """Say what happens, as it happens, one line each; ends when the alarm is over.
 
     Raises
@@ -230,27 +230,27 @@ async def story(world: SimulatorProcess, machine: str, store: Store, serving: Se
     AbbeError
         The simulated machine does not drift.
     """
-    say(f"1. check by the timetable: {await _check(store, machine, 1)}")
-    await drift(world)
-    say(f"2. unknown to the service, the machine's X axis grows by {DRIFT_UM_PER_M:g} µm/m")
-    say(f"3. check by the timetable: {await _check(store, machine, 2)}")
+    show(f"1. check by the timetable: {await _check(store, machine, 1)}")
+    await drift(simulator)
+    show(f"2. unknown to the service, the machine's X axis grows by {DRIFT_UM_PER_M:g} µm/m")
+    show(f"3. check by the timetable: {await _check(store, machine, 2)}")
     alarm = (await _until(lambda: alarms_of(store, machine)))[-1]
-    say(f"4. alarm {alarm.number}: {alarm.text}")
+    show(f"4. alarm {alarm.number}: {alarm.text}")
     found = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.DISCOVERED, AlarmKind.ENDED, AlarmKind.FAILED))
-    say(f"5. the service has measured the full campaign and searched: {found.doc['text']}")
+    show(f"5. the service has measured the full campaign and searched: {found.doc['text']}")
     proposed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PROPOSED, AlarmKind.ENDED, AlarmKind.FAILED))
     proposal = int(proposed.doc.get("proposal", 0))
-    say(f"   {proposed.doc['text']}")
+    show(f"   {proposed.doc['text']}")
     if proposed.kind is not AlarmKind.PROPOSED:
         raise AbbeError("the story ends here: the service proposes nothing", f"{serving.log} says more; try another --seed")
-    say(f"   approve it at {serving.page}proposal?id={proposal}")
+    show(f"   approve it at {serving.page}proposal?id={proposal}")
     who = (await _until(lambda: store.proposals.approvals(proposal)))[-1].name
-    say(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")
+    show(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")
     pushed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PUSHED))
-    say(f"7. {pushed.doc['text']}")
+    show(f"7. {pushed.doc['text']}")
     await _until(lambda: not alarms_of(store, machine)[-1].active)
     checks = await _until(lambda: _checks(store, machine))
-    say(f"8. the check after it: {checks[-1]}; the alarm is over")
+    show(f"8. the check after it: {checks[-1]}; the alarm is over")
 
 
 def _checks(store: Store, machine: str) -> list[str]:
@@ -271,7 +271,7 @@ async def _until(look: Callable[[], T | None]) -> T:
     Raises
     ------
     StoreError
-        It could not be read `LOCKED_LOOKS` times on end.
+        It could not be read `MAX_LOCKED_READS` times on end.
     """
     refused = 0
     while True:
@@ -280,7 +280,7 @@ async def _until(look: Callable[[], T | None]) -> T:
             refused = 0
         except StoreError:
             found, refused = None, refused + 1
-            if refused >= LOCKED_LOOKS:
+            if refused >= MAX_LOCKED_READS:
                 raise
         if found:
             return found

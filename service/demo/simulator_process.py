@@ -44,7 +44,7 @@ async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]
 
     Raises
     ------
-    WorldError
+    SimulatorError
         It did not start; the child's own line says why.
     """
     process = await asyncio.create_subprocess_exec(
@@ -71,8 +71,8 @@ async def _ready(process: asyncio.subprocess.Process) -> dict[str, Any]:
     try:
         ready: dict[str, Any] = json.loads(line)
     except ValueError:
-        said = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
-        raise SimulatorError(f"the simulators did not start: {said[-1] if said else 'no reason given'}", "check the scenario") from None
+        errors = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
+        raise SimulatorError(f"the simulators did not start: {errors[-1] if errors else 'no reason given'}", "check the scenario") from None
     return ready
 
 
@@ -98,14 +98,14 @@ async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
 
     Raises
     ------
-    WorldError
+    SimulatorError
         It failed; the child's own line says why.
     """
-    words = python_words("abbe.simulators", "truth", *args, "--arrows")
+    command = python_words("abbe.simulators", "truth", *args, "--arrows")
     if bank is not None:
-        words += ["--bank", str(bank)]
+        command += ["--bank", str(bank)]
     process = await asyncio.create_subprocess_exec(
-        *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, start_new_session=True
+        *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE, start_new_session=True
     )
     try:
         out, err = await process.communicate()

@@ -19,7 +19,7 @@ from abbe.service.formats.identified import Identified, Values, axis_tables, gri
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable, correction_at
 
 JUDGE_NODES, COARSE_NODES = 12, 6
-WORTH = 0.02
+MIN_GAIN = 0.02
 """A larger set of tables is taken only if it leaves at least this share less (rms) than a smaller one."""
 
 
@@ -90,7 +90,7 @@ def best_of(found: tuple[FormatChoice, ...]) -> FormatChoice:
 def _marked(found: list[FormatChoice]) -> tuple[FormatChoice, ...]:
     best = found[0]
     for c in sorted(found[1:], key=lambda c: c.numbers):
-        if c.rms_mm < (1.0 - WORTH) * best.rms_mm:
+        if c.rms_mm < (1.0 - MIN_GAIN) * best.rms_mm:
             best = c
     return tuple(replace(c, best=c is best) for c in found)
 
@@ -133,7 +133,7 @@ class _Builder:
         self._sets = tuple(_grids(known, n, reference_mm) for n in (control.own_points, control.cross_points))
         self.offered = products_of(known, self._sets[1], reference_mm) if control.products else ()
         self._whole = table_values(known, known.deviation_mm, self._sets, reference_mm, smooth=True)
-        self._of = {p.name: table_values(known, partial(_alone, p), self._sets, reference_mm) for p in self.offered}
+        self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
 
     def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
         """Own-axis tables on their grid, cross tables (axis, output) on theirs, both for what the products leave."""
@@ -166,7 +166,7 @@ class _Builder:
             products, pairs = products_, pairs_
 
 
-def _alone(product: ProductTable, points_mm: F2) -> F2:
+def _added_by(product: ProductTable, points_mm: F2) -> F2:
     """What one product adds: tables beside it have to take as much less out."""
     return correction_at(Compensation(products=(product,)), points_mm)
 

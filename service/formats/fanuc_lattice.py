@@ -62,10 +62,10 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
             if text.strip() != HEADER:
                 raise file.wrong(line, f"the heading is {text.strip()!r}, expected {HEADER!r}")
             continue
-        words = text.split(",")
-        if len(words) != 7:
-            raise file.wrong(line, f"{len(words)} values, expected 7")
-        row = [file.number(line, w.strip(), n) for w, n in zip(words, HEADER.split(","), strict=True)]
+        cells = text.split(",")
+        if len(cells) != 7:
+            raise file.wrong(line, f"{len(cells)} values, expected 7")
+        row = [file.number(line, w.strip(), n) for w, n in zip(cells, HEADER.split(","), strict=True)]
         if row[0] != line - 1:
             raise file.wrong(line, f"node {row[0]:g}, expected {line - 1}")
         rows.append(row)

@@ -123,7 +123,7 @@ def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
 def _active(cma: TextFile) -> dict[str, str]:
     lines = list(cma.lines())
     columns, rows = _body(cma)
-    active = [n for n, words in rows if words and words[-1] == "*"]
+    active = [n for n, cells in rows if cells and cells[-1] == "*"]
     if len(active) != 1:
         raise cma.wrong(active[1] if active else 3, f"{len(active)} lines are active, expected one")
     head, row = lines[1][1], lines[active[0] - 1][1]
@@ -139,10 +139,10 @@ def _read_com(file: TextFile, axis: str) -> list[AxisTable]:
     if len(rows) > LIMITS.points:
         raise file.wrong(rows[LIMITS.points][0], f"more than {LIMITS.points} points")
     values: list[list[float]] = []
-    for line, words in rows:
-        if len(words) != len(columns):
-            raise file.wrong(line, f"{len(words)} values for {len(columns)} columns")
-        values.append([file.number(line, w, c) for w, c in zip(words, columns, strict=True)])
+    for line, cells in rows:
+        if len(cells) != len(columns):
+            raise file.wrong(line, f"{len(cells)} values for {len(columns)} columns")
+        values.append([file.number(line, w, c) for w, c in zip(cells, columns, strict=True)])
     if len(values) < 2:
         raise file.wrong(3, "fewer than 2 points")
     increasing(file, [v[1] for v in values], [n for n, _ in rows])

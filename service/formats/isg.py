@@ -124,10 +124,10 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
     again = [n for n in names if n in curves or n in square]
     if again or not rows:
         raise file.wrong(line, f"{again[0]} stands in two blocks" if again else "there are no rows under this heading")
-    for n, words in rows:
-        if len(words) != len(names):
-            raise file.wrong(n, f"{len(words)} values for {len(names)} columns")
-    table = np.array([[file.number(n, w, c) for w, c in zip(words, names, strict=True)] for n, words in rows])
+    for n, cells in rows:
+        if len(cells) != len(names):
+            raise file.wrong(n, f"{len(cells)} values for {len(names)} columns")
+    table = np.array([[file.number(n, w, c) for w, c in zip(cells, names, strict=True)] for n, cells in rows])
     if not arguments:
         if len(rows) != 1 or not set(names) <= set(SQUARENESS):
             raise file.wrong(rows[0][0], "a table without an argument has one row, of C0Y, B0Z, A0Z")

@@ -58,11 +58,11 @@ def _read_one(file: TextFile, kind: int) -> AxisTable:
     rows: list[list[float]] = []
     lines: list[int] = []
     for line, text in file.lines():
-        words = text.split()
-        if len(words) != 3:
-            found = "is blank" if not words else f"is {text.strip()!r}"
+        cells = text.split()
+        if len(cells) != 3:
+            found = "is blank" if not cells else f"is {text.strip()!r}"
             raise file.wrong(line, f"the line {found}: LinuxCNC ends the table here without an error", "write bare triplets only")
-        rows.append([file.number(line, w, n) for w, n in zip(words, ("the position", "forward", "reverse"), strict=True)])
+        rows.append([file.number(line, w, n) for w, n in zip(cells, ("the position", "forward", "reverse"), strict=True)])
         lines.append(line)
     if not rows:
         raise file.wrong(1, "the file is empty: no compensation at all")

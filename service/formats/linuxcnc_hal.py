@@ -133,19 +133,19 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def _take(net: _Network, file: TextFile, line: int, text: str) -> None:
-    words = text.split()
-    if words[:2] == ["loadrt", "lincurve"] and len(words) == 4:
-        names, sizes = words[2].removeprefix("names=").split(","), words[3].removeprefix("personality=").split(",")
+    cells = text.split()
+    if cells[:2] == ["loadrt", "lincurve"] and len(cells) == 4:
+        names, sizes = cells[2].removeprefix("names=").split(","), cells[3].removeprefix("personality=").split(",")
         if len(names) != len(sizes) or not all(s.isdigit() and 2 <= int(s) <= LIMITS.points for s in sizes):
             raise file.wrong(line, f"names and personality do not belong together, or a curve has not 2 to {LIMITS.points} points")
         net.points |= {n: int(s) for n, s in zip(names, sizes, strict=True)}
-    elif words[:1] == ["addf"] and len(words) == 3:
-        net.running.add(words[1])
-    elif words[:1] == ["setp"] and len(words) == 3:
-        net.values[words[1]] = (file.number(line, words[2], words[1]), line)
-    elif words[:1] == ["net"] and len(words) > 3:
-        net.wired |= {w.partition(".")[0] for w in words[3:] if w.endswith((".in", ".in0", ".in1", ".out"))} | {words[2].partition(".")[0]}
-    elif words[:1] != ["loadrt"]:
+    elif cells[:1] == ["addf"] and len(cells) == 3:
+        net.running.add(cells[1])
+    elif cells[:1] == ["setp"] and len(cells) == 3:
+        net.values[cells[1]] = (file.number(line, cells[2], cells[1]), line)
+    elif cells[:1] == ["net"] and len(cells) > 3:
+        net.wired |= {w.partition(".")[0] for w in cells[3:] if w.endswith((".in", ".in0", ".in1", ".out"))} | {cells[2].partition(".")[0]}
+    elif cells[:1] != ["loadrt"]:
         raise file.wrong(line, f"{text.strip()!r} is no line of such a network")
 
 

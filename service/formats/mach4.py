@@ -60,10 +60,10 @@ def _read_one(file: TextFile) -> AxisTable:
     start, length, count = (file.number(k + 2, head[name], name) for k, name in enumerate(_HEAD[1:]))
     rows: list[list[float]] = []
     for line, text in lines[5:]:
-        words = text.split(",")
-        if len(words) != 4:
-            raise file.wrong(line, f"{len(words)} values, expected 4")
-        rows.append([file.number(line, w.strip(), n) for w, n in zip(words, HEADER.split(","), strict=True)])
+        cells = text.split(",")
+        if len(cells) != 4:
+            raise file.wrong(line, f"{len(cells)} values, expected 4")
+        rows.append([file.number(line, w.strip(), n) for w, n in zip(cells, HEADER.split(","), strict=True)])
         wanted = start + (len(rows) - 1) * length / max(1.0, count - 1.0)
         if rows[-1][0] != len(rows) or abs(rows[-1][1] - wanted) > 1e-5:
             raise file.wrong(line, f"point {rows[-1][0]:g} at {rows[-1][1]:g}, expected point {len(rows)} at {wanted:g}")

@@ -26,7 +26,7 @@ from abbe.service.papers import kwon_printed as paper
 from abbe.service.papers.compare import Computed, agrees, computed_from
 from abbe.service.papers.printed import Printed, values
 from abbe.service.papers.row import Erratum, PaperRow, stated
-from abbe.service.papers.words import minus
+from abbe.service.papers.text import minus
 
 ALPHA = 0.01
 GRID = "9 × 9 points, steps of 0.25 mm as printed, ± 1 mm assumed from the stroke of 2 mm and the 82 points of the text"

@@ -15,7 +15,7 @@ from abbe.service.papers.check import PaperCheck
 from abbe.service.papers.pictures import figures
 from abbe.service.papers.row import PaperRow
 from abbe.service.papers.run import PaperResult
-from abbe.service.papers.words import NONE, check_cells, computed_cells, note, short
+from abbe.service.papers.text import NONE, check_cells, computed_cells, note, short
 from abbe.service.rendering.numbers import printable
 from abbe.service.rendering.page_file import write_page as write_text
 from abbe.service.rendering.palette import style_rules

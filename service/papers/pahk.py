@@ -11,7 +11,7 @@ from abbe.service.papers.pahk_printed import Cmm
 from abbe.service.papers.printed import values
 from abbe.service.papers.probe_example import pattern
 from abbe.service.papers.row import Erratum, PaperRow, stated
-from abbe.service.papers.words import minus
+from abbe.service.papers.text import minus
 
 URAD = 1e-6
 
@@ -99,10 +99,10 @@ def diagonal_evidence(cmm: Cmm) -> str:
     volume, squareness = machine_inputs(cmm)
     alone = squareness_diagonals_mm(cmm.type_name, volume, squareness)
     misfit, _ = best_assignment(cmm.type_name, volume, squareness, [d.value * 1e-3 for d in cmm.diagonals_um])
-    words = ", ".join(f"{name} {minus(f'{1e3 * value:.1f}')}" for name, value in alone.items())
+    sizes = ", ".join(f"{name} {minus(f'{1e3 * value:.1f}')}" for name, value in alone.items())
     mean = float(np.mean(values(cmm.diagonals_um)))
     return (
         f"only squareness is printed, the curves of the other errors are lost and it is not said which diagonal is which."
-        f" Squareness alone gives {words} µm (mean 0, printed mean {minus(f'{mean:.2f}')}); none of 24 orders and 2 senses of angle brings"
+        f" Squareness alone gives {sizes} µm (mean 0, printed mean {minus(f'{mean:.2f}')}); none of 24 orders and 2 senses of angle brings"
         f" the printed four nearer than {misfit / URAD:.0f} µrad to the printed squareness"
     )

@@ -19,7 +19,7 @@ from abbe.service.papers.pahk_printed import Cmm
 from abbe.service.papers.printed import values
 from abbe.service.papers.probe_example import EXAMPLE, example
 from abbe.service.papers.row import Paper
-from abbe.service.papers.words import minus, short
+from abbe.service.papers.text import minus, short
 from abbe.service.papers.yang_table3 import bar_line_um, restored_x_mm
 from abbe.service.rendering.plots.comparison import Comparison, comparison_plot
 from abbe.service.rendering.plots.contours import contour_plot

@@ -27,7 +27,7 @@ SIGNATURES = ("Measured by", "Checked by", "Approved by")
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class ReportFigure:
     """One figure. ``symbol``: as the standard has it; ``method``: by which rule; ``limit`` and ``verdict``: where it was judged."""
 
     group: str
@@ -112,7 +112,7 @@ class Document:
     verdict: tuple[Sign, str, str] | None = None
     remarks: Sequence[str] = ()
     sections: Sequence[Section] = ()
-    figures: Sequence[Figure] = ()
+    figures: Sequence[ReportFigure] = ()
     statements: Sequence[str] = ()
     not_observable: Sequence[str] | None = None
     instruments: Sequence[Instrument] = ()

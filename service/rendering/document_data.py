@@ -17,9 +17,9 @@ from abbe.service.rendering.document import (
     Block,
     Document,
     Facts,
-    Figure,
     Lines,
     Picture,
+    ReportFigure,
     Section,
     TextTable,
     blocks,
@@ -76,7 +76,7 @@ def _data(document: Document) -> dict[str, Any]:
     }
 
 
-def _figure(figure: Figure) -> dict[str, Any]:
+def _figure(figure: ReportFigure) -> dict[str, Any]:
     u = _number(figure.u)
     return {
         "group": figure.group,
@@ -117,15 +117,15 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
     data = _data(document)
     groups: dict[str, list[dict[str, str]]] = {}
     for f in document.figures:
-        groups.setdefault(f.group, []).append(_words(f))
-    words = data | {name: _pairs(data[name]) for name in ("about", "conditions", "provenance")}
-    words["groups"] = [{"name": name, "rows": rows} for name, rows in groups.items()]
-    words["judged"] = any(f.limit is not None for f in document.figures)
-    words["not_observable"] = data["not_observable"] if document.not_observable is None else data["not_observable"] or [NOTHING_HIDDEN]
-    words["lang"], words["coverage"] = document.lang, tidy(COVERAGE)
-    words["sections"], words["appendix"] = ([_block(s, draw) for s in some] for some in (document.sections, document.appendix))
-    del words["figures"]
-    clean: dict[str, Any] = _clean(words)
+        groups.setdefault(f.group, []).append(_figure_cells(f))
+    context = data | {name: _pairs(data[name]) for name in ("about", "conditions", "provenance")}
+    context["groups"] = [{"name": name, "rows": rows} for name, rows in groups.items()]
+    context["judged"] = any(f.limit is not None for f in document.figures)
+    context["not_observable"] = data["not_observable"] if document.not_observable is None else data["not_observable"] or [NOTHING_HIDDEN]
+    context["lang"], context["coverage"] = document.lang, tidy(COVERAGE)
+    context["sections"], context["appendix"] = ([_block(s, draw) for s in some] for some in (document.sections, document.appendix))
+    del context["figures"]
+    clean: dict[str, Any] = _clean(context)
     return clean
 
 
@@ -158,7 +158,7 @@ def _right(columns: int, rows: Sequence[Sequence[str]]) -> list[bool]:
     return [k > 0 and bool(some) and all(_NUMERIC.fullmatch(c) for c in some) for k, some in enumerate(cells)]
 
 
-def _words(figure: Figure) -> dict[str, str]:
+def _figure_cells(figure: ReportFigure) -> dict[str, str]:
     value, expanded = with_uncertainty(figure.value, figure.u)
     if figure.unit == "":
         value = NOT_AVAILABLE if figure.value is None else plain(figure.value)

@@ -123,7 +123,7 @@ class Svg:
             f'<polygon points="{_points(shape)}" class="f-{_attr(style)}"/>{_tip(tip)}</g>'
         )
 
-    def text(self, at: XY, words: object, style: str = "", *, anchor: str = "start", turn: float = 0.0) -> None:
+    def text(self, at: XY, content: object, style: str = "", *, anchor: str = "start", turn: float = 0.0) -> None:
         """Text on its base line; ``anchor`` is ``start``, ``middle`` or ``end``, ``turn`` in degrees clockwise."""
         if not _finite(at):
             return
@@ -131,15 +131,15 @@ class Svg:
         kind = f' class="{_attr(style)}"' if style else ""
         side = f' text-anchor="{anchor}"' if anchor != "start" else ""
         rotation = f' transform="rotate({coordinate(turn)} {x} {y})"' if turn else ""
-        self._body.append(f'<text x="{x}" y="{y}"{kind}{side}{rotation}>{escape(printable(words))}</text>')
+        self._body.append(f'<text x="{x}" y="{y}"{kind}{side}{rotation}>{escape(printable(content))}</text>')
 
     def legend(self, at: XY, entries: Sequence[tuple[str, str]]) -> None:
-        """Row of line samples with their names. Entries: style class of the line, words."""
+        """Row of line samples with their names. Entries: style class of the line, name."""
         x, y = at
-        for style, words in entries:
+        for style, name in entries:
             self.line((x, y - 4.0), (x + 22.0, y - 4.0), style)
-            self.text((x + 28.0, y), words, "t-small")
-            x += 44.0 + 6.2 * len(words)
+            self.text((x + 28.0, y), name, "t-small")
+            x += 44.0 + 6.2 * len(name)
 
     def render(self) -> str:
         """The ``<svg>`` element, ready to stand inside an HTML page (which needs no namespace declaration)."""

@@ -52,8 +52,8 @@ class RunRow:
 
 def stated(value: float | None, u: float | None) -> str:
     """Value ± U (k = 2), rounded together; the value alone where it has no uncertainty."""
-    words, expanded = with_uncertainty(value, u)
-    return words if expanded == NOT_AVAILABLE else f"{words} ± {expanded}"
+    number, expanded = with_uncertainty(value, u)
+    return number if expanded == NOT_AVAILABLE else f"{number} ± {expanded}"
 
 
 def summary_table(rows: Sequence[SummaryRow]) -> TextTable:

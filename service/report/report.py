@@ -10,12 +10,12 @@ from abbe.service.config_schema import MachineFile
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.rendering.document import Document
+from abbe.service.report.later_changes import with_later_changes
 from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_done import push_report, verification_report
 from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report, run_report
 from abbe.service.report.report_parts import Rules
-from abbe.service.report.report_table import table_said
-from abbe.service.report.report_then import of_then
+from abbe.service.report.report_table import table_remarks
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
 
@@ -58,15 +58,15 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
 def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules) -> Document:
     """Report of a stored run or campaign."""
     if isinstance(record, CampaignRecord):
-        return _of_then(store, _measured(store, record.name), record.created_utc, rules)
+        return _with_later_changes(store, _measured(store, record.name), record.created_utc, rules)
     campaign = from_store(store, record.campaign)
     if all(r["run_id"] != record.label for r in campaign.runs):  # incomplete: what is there is reported and said to be so
         campaign = Campaign(campaign.name, campaign.site, [*campaign.runs, load_run(store, record.id)], None, campaign.doc)
     facts = {"Started": record.started_utc, "Ended": record.ended_utc or "not ended"}
     runs = [r for r in campaign.runs if r["run_id"] == record.label]
-    table = table_said(store, campaign.site.name, runs)
+    table = table_remarks(store, campaign.site.name, runs)
     document = run_report(Measured(campaign, facts, [_state(record)], table=table), record.label, rules)
-    return of_then(document, store, campaign.site.name, record.started_utc, runs)
+    return with_later_changes(document, store, campaign.site.name, record.started_utc, runs)
 
 
 def solution_report(store: Store | None, campaign: Campaign, solution: SolutionResult, made_utc: str, rules: Rules) -> Document:
@@ -88,11 +88,11 @@ def solution_report(store: Store | None, campaign: Campaign, solution: SolutionR
     left_out = {r["run_id"] for r in found.campaign.runs} - {r["run_id"] for r in campaign.runs}
     states = [s for s in found.states if s[0] not in left_out]
     found = replace(found, campaign=campaign, facts=found.facts | solved, states=states, solution=solution)
-    return _of_then(store, found, store.campaigns.find(campaign.name).created_utc, rules)
+    return _with_later_changes(store, found, store.campaigns.find(campaign.name).created_utc, rules)
 
 
-def _of_then(store: Store, found: Measured, created_utc: str, rules: Rules) -> Document:
-    return of_then(campaign_report(found, rules), store, found.campaign.site.name, created_utc, found.campaign.runs)
+def _with_later_changes(store: Store, found: Measured, created_utc: str, rules: Rules) -> Document:
+    return with_later_changes(campaign_report(found, rules), store, found.campaign.site.name, created_utc, found.campaign.runs)
 
 
 def folder_report(folder: Path, rules: Rules) -> Document:
@@ -109,7 +109,7 @@ def _measured(store: Store, name: str) -> Measured:
         facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
     solution = next((SolutionResult(s.doc, s.id) for s in reversed(store.solutions.all(record.id)) if "mean_over_volume" in s.doc), None)
     campaign = from_store(store, name)
-    table = table_said(store, campaign.site.name, campaign.runs)
+    table = table_remarks(store, campaign.site.name, campaign.runs)
     return Measured(campaign, facts, [_state(r) for r in runs], solution, table)
 
 

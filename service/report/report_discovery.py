@@ -30,7 +30,7 @@ from abbe.service.discovery.discovery_words import (
 from abbe.service.domain.finding import EffectFound, Finding
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import StoreError
-from abbe.service.rendering.document import Block, Document, Facts, Figure, Lines, Picture, Section, Sign, TextTable
+from abbe.service.rendering.document import Block, Document, Facts, Lines, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import PlaceMap, Trace
 from abbe.service.rendering.numbers import NOT_AVAILABLE, plain
 from abbe.service.rendering.plots.gap import gap_bars, place_plot, trace_plot
@@ -171,8 +171,8 @@ def _sections(found: _Found) -> list[Section]:
     out.append(Section("The gap before and after", [gap_table(finding), *_pictures(found)]))
     following = next_of(finding)
     if following or finding.effects:
-        words = Lines([line.strip() for line in following]) if following else "Nothing is needed to tell suspects apart."
-        out.append(Section("What to measure next", [words]))
+        text = Lines([line.strip() for line in following]) if following else "Nothing is needed to tell suspects apart."
+        out.append(Section("What to measure next", [text]))
     return out
 
 
@@ -212,32 +212,32 @@ def _pictures(found: _Found) -> list[Block]:
     finding = found.finding
     out: list[Block] = []
     if finding.runs:
-        words = "Measured minus simulated, run by run. Where the lower bar ends at the dashed tick, nothing but noise is left."
-        out.append(Picture(words, [gap_bars(finding.runs)], "wide"))
+        text = "Measured minus simulated, run by run. Where the lower bar ends at the dashed tick, nothing but noise is left."
+        out.append(Picture(text, [gap_bars(finding.runs)], "wide"))
     traces = [trace_plot(t, key=f"trace-{i}") for i, t in enumerate(_traces(found))]
     if traces:
         what = _what(finding)
-        words = f"The run that shows most, simulated without and with {what}" if what else "The run with the largest gap; nothing was added"
-        out.append(Picture(f"{words}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
+        text = f"The run that shows most, simulated without and with {what}" if what else "The run with the largest gap; nothing was added"
+        out.append(Picture(f"{text}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
     places = [place_plot(p, key=f"place-{i}") for i, (a, b) in enumerate(((0, 1), (0, 2))) if (p := _place(found, a, b)) is not None]
     if places:
-        words = "Gap before, cell by cell of what was measured, over the noise of one reading. A ring marks what was located."
-        out.append(Picture(words, places))
+        text = "Gap before, cell by cell of what was measured, over the noise of one reading. A ring marks what was located."
+        out.append(Picture(text, places))
     return out
 
 
-def _figures(finding: Finding) -> list[Figure]:
+def _figures(finding: Finding) -> list[ReportFigure]:
     out = []
     for e in finding.effects:
         group = f"Effect: {e.words}"
-        out.append(Figure(group, e.label, e.title, e.strength, e.u_strength, unit(e.unit), e.source))
-        out += [Figure(group, n, n.replace("_", " "), p.value, p.u, unit(p.unit)) for n, p in e.parameters.items()]
+        out.append(ReportFigure(group, e.label, e.title, e.strength, e.u_strength, unit(e.unit), e.source))
+        out += [ReportFigure(group, n, n.replace("_", " "), p.value, p.u, unit(p.unit)) for n, p in e.parameters.items()]
     for role, gap in finding.gaps.items():
         group = f"Gap of the {role} runs"
-        out.append(Figure(group, "before", "measured minus simulated, rms", gap.before_um, None, "µm"))
+        out.append(ReportFigure(group, "before", "measured minus simulated, rms", gap.before_um, None, "µm"))
         if what := _what(finding):
-            out.append(Figure(group, "after", f"the same with {what}", gap.after_um, None, "µm"))
-        out.append(Figure(group, "floor", "noise", gap.floor_um, None, "µm"))
+            out.append(ReportFigure(group, "after", f"the same with {what}", gap.after_um, None, "µm"))
+        out.append(ReportFigure(group, "floor", "noise", gap.floor_um, None, "µm"))
     return out
 
 

@@ -14,14 +14,14 @@ from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
 from abbe.service.push.entries import NOT_YET, WORD, JournalBroken, JournalEntry, PushFacts, check_chain, facts
 from abbe.service.push.states import TERMINAL, PushState
-from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
+from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
 from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
+from abbe.service.report.later_changes import with_later_changes
 from abbe.service.report.report_parts import Doc, Rules
-from abbe.service.report.report_table import table_said
-from abbe.service.report.report_then import of_then
+from abbe.service.report.report_table import table_remarks
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import tables_from_image
 from abbe.service.tables.push_journal import JournalView, push_log
@@ -55,8 +55,8 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     machine = store.machines.get(record.machine_id)
     campaign = None if record.campaign_id is None else from_store(store, store.campaigns.find(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
-    told = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"))
-    table = table_said(store, machine.name, runs)
+    evaluated = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"))
+    table = table_remarks(store, machine.name, runs)
     figures = verification_figures(record, rules)
     condition, remarks = parts.conditions(runs, rules)
     about = parts.machine_facts(machine.doc) | {"Verification": str(number), "Decided": record.utc}
@@ -70,19 +70,19 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
         title=f"Verification {number} of {machine.name}",
         about=about,
         verdict=verdict,
-        figures=[*figures, *told.figures],
+        figures=[*figures, *evaluated.figures],
         instruments=_instruments(campaign, rules),
         conditions=condition,
-        not_observable=told.not_observable if campaign is not None else ["its readings: no campaign is stored with it"],
-        remarks=[*table.remarks, *told.remarks, *remarks],
-        statements=[parts.VERIFICATION_STATEMENT, *told.statements],
+        not_observable=evaluated.not_observable if campaign is not None else ["its readings: no campaign is stored with it"],
+        remarks=[*table.remarks, *evaluated.remarks, *remarks],
+        statements=[parts.VERIFICATION_STATEMENT, *evaluated.statements],
         provenance=parts.provenance(parts.data_digest(runs) if runs else parts.doc_digest(record.doc)),
-        appendix=picture_section(told.pictures),
+        appendix=picture_section(evaluated.pictures),
     )
-    return of_then(document, store, machine.name, str(record.doc.get("started_utc") or record.utc), runs)
+    return with_later_changes(document, store, machine.name, str(record.doc.get("started_utc") or record.utc), runs)
 
 
-def verification_figures(record: VerificationRecord, rules: Rules) -> list[Figure]:
+def verification_figures(record: VerificationRecord, rules: Rules) -> list[ReportFigure]:
     """The figures that a verification was decided by, with limits: those stored with it, else the machine file's."""
     rows = _stored_rows(record.doc)
     limits = record.doc.get("limits") or rules.limits_um
@@ -147,7 +147,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
         | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": known.meaning},
         appendix=[*_drawn(tables), Section("Journal", [TextTable(("Entry", "What happened"), lines)])],
     )
-    return of_then(document, store, machine, journal[-1].utc, []) if journal[-1].state is PushState.KEEP else document
+    return with_later_changes(document, store, machine, journal[-1].utc, []) if journal[-1].state is PushState.KEEP else document
 
 
 def _is_of(store: Store, record: VerificationRecord, machine: str, push: int) -> bool:
@@ -206,12 +206,14 @@ def _curves(tables: NineTables) -> list[TableCurve]:
     return [TableCurve(AXES[a], AXES[i], tables.position_mm[a], tables.correction_mm[a][:, i] * 1e3) for a in range(3) for i in range(3)]
 
 
-def _sizes(tables: NineTables | None) -> list[Figure]:
+def _sizes(tables: NineTables | None) -> list[ReportFigure]:
     if tables is None:
         return []
     out = []
     for curve in _curves(tables):
         size = float(np.abs(np.asarray(curve.correction_um)).max())
         name = f"largest correction of {curve.axis_out} when {curve.axis_in} moves"
-        out.append(Figure("Corrections of the new table", f"{curve.axis_in} to {curve.axis_out}", name, size, None, "µm", "as stored"))
+        out.append(
+            ReportFigure("Corrections of the new table", f"{curve.axis_in} to {curve.axis_out}", name, size, None, "µm", "as stored")
+        )
     return out

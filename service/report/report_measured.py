@@ -14,7 +14,7 @@ from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.identification.solve_report import HIDDEN_NOTE, Account
-from abbe.service.rendering.document import Document, Figure, Picture, Section, Sign, TextTable
+from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import ParameterRow, PolarTrace, ResidualSeries
 from abbe.service.rendering.numbers import plain
 from abbe.service.rendering.plots.bars import uncertainty_bars
@@ -23,7 +23,7 @@ from abbe.service.rendering.plots.residuals import residual_plot
 from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_parts import Doc, Rules
-from abbe.service.report.report_table import NOTHING_SAID, TableSaid
+from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
 from abbe.service.runs.coverage import not_judged
 from abbe.service.runs.helix_axis import about_axis, path_axis
@@ -61,32 +61,32 @@ class Measured:
     facts: dict[str, str] = field(default_factory=dict)
     states: Sequence[Sequence[str]] = ()
     solution: SolutionResult | None = None
-    table: TableSaid = NOTHING_SAID
+    table: TableRemarks = NO_TABLE_REMARKS
 
 
 def campaign_report(found: Measured, rules: Rules) -> Document:
     """Everything a campaign says: figures of the standards, figures of a verification, the solution."""
     campaign = found.campaign
-    told = evaluate(campaign.runs, campaign.doc.get("instruments"))
+    evaluated = evaluate(campaign.runs, campaign.doc.get("instruments"))
     checked, verdict = _verification(campaign.runs, rules)
     condition, remarks = parts.conditions(campaign.runs, rules)
     solved = _solution(found.solution)
-    remarks = [*found.table.remarks, *_unfinished(found.states, campaign.runs), *solved.remarks, *told.remarks, *remarks]
+    remarks = [*found.table.remarks, *_unfinished(found.states, campaign.runs), *solved.remarks, *evaluated.remarks, *remarks]
     return Document(
         kind="campaign",
         title=f"Campaign {campaign.name}",
         about=parts.machine_facts(campaign.site.doc) | {"Campaign": campaign.name} | found.facts,
         verdict=found.table.verdict(parts.verdict_of(verdict, remarks, _solution_verdict(found.solution))),
-        figures=[*checked, *solved.figures, *told.figures],
+        figures=[*checked, *solved.figures, *evaluated.figures],
         instruments=parts.instruments(campaign.runs, campaign.doc, rules),
         conditions=condition,
-        not_observable=[*solved.not_observable, *told.not_observable],
+        not_observable=[*solved.not_observable, *evaluated.not_observable],
         remarks=remarks,
-        statements=[*solved.statements, *([parts.VERIFICATION_STATEMENT] if checked else []), *told.statements],
+        statements=[*solved.statements, *([parts.VERIFICATION_STATEMENT] if checked else []), *evaluated.statements],
         provenance=parts.provenance(parts.data_digest(campaign.runs), _made(found.solution)) | _same_as(found.solution),
         sections=_sections(found.solution),
         appendix=[
-            *picture_section([*solved.pictures, *told.pictures]),
+            *picture_section([*solved.pictures, *evaluated.pictures]),
             *_residuals(found.solution),
             *_budget(found.solution),
             Section("Runs", [_run_table(found)]),
@@ -97,30 +97,30 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
 def run_report(found: Measured, label: str, rules: Rules) -> Document:
     """One run: what its standard says of it, and its readings."""
     run = next(r for r in found.campaign.runs if r["run_id"] == label)
-    told = evaluate([run], found.campaign.doc.get("instruments"))
+    evaluated = evaluate([run], found.campaign.doc.get("instruments"))
     condition, remarks = parts.conditions([run], rules)
     own, why = _own(run), not_judged(run)
-    setup = [(k, _words(v)) for k, v in sorted(run["setup"].items())]
+    setup = [(k, _value_text(v)) for k, v in sorted(run["setup"].items())]
     return Document(
         kind="run",
         title=f"Run {found.campaign.name}/{label}",
         about=parts.machine_facts(run["machine"]) | {"Campaign": found.campaign.name, "Run": label, "Test": run["test"]} | found.facts,
         verdict=found.table.verdict(("open", "Not judged", f"{why}." if why else NOT_JUDGED)),
-        figures=[*own.figures, *told.figures],
+        figures=[*own.figures, *evaluated.figures],
         instruments=parts.instruments([run], found.campaign.doc, rules),
         conditions=condition,
-        not_observable=[*own.not_observable, *told.not_observable],
-        remarks=[*found.table.remarks, *_unfinished(found.states, [run]), *told.remarks, *remarks],
-        statements=told.statements,
+        not_observable=[*own.not_observable, *evaluated.not_observable],
+        remarks=[*found.table.remarks, *_unfinished(found.states, [run]), *evaluated.remarks, *remarks],
+        statements=evaluated.statements,
         provenance=parts.provenance(parts.data_digest([run])),
         appendix=[
-            *picture_section([*told.pictures, *own.pictures]),
+            *picture_section([*evaluated.pictures, *own.pictures]),
             Section("Set-up", [TextTable(("Name", "Value"), setup)]),
         ],
     )
 
 
-def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[Figure], Verdict | None]:
+def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[ReportFigure], Verdict | None]:
     """Figures that the machine file has limits for, where these runs hold the four body diagonals, once out and back."""
     known = [r for r in runs if r["columns"].get("deviation_mm") is not None and r["setup"].get("cycles", 1) == 1 and not not_judged(r)]
     body = {r["setup"].get("diagonal") for r in known if r["test"] == "laser_diagonal" and not r["setup"].get("order")}
@@ -158,27 +158,27 @@ def _solution(solution: SolutionResult | None) -> Evaluated:
     )
 
 
-def _parameters(doc: Doc, group: str) -> list[Figure]:
+def _parameters(doc: Doc, group: str) -> list[ReportFigure]:
     """Scales, squareness and lost motion; one that the runs do not show by itself says so."""
     figures = []
     for name, p in doc["mean_over_volume"].items():
-        words, unit = ("scale error", "µm/m") if name[0] == "E" else ("squareness", "µrad")
+        text, unit = ("scale error", "µm/m") if name[0] == "E" else ("squareness", "µrad")
         status = doc.get("motions", {}).get(name, {}).get("status")
         hidden = f"; {HIDDEN_NOTE}" if status == "not observable" else ""
-        figures.append(Figure(group, name, words + hidden, p["value"] * 1e6, p["u"] * 1e6, unit, "joint solution"))
+        figures.append(ReportFigure(group, name, text + hidden, p["value"] * 1e6, p["u"] * 1e6, unit, "joint solution"))
     for name, p in doc.get("parameters", {}).items():
         if name.startswith("backlash_"):
-            words = "lost motion, not compensated"
-            figures.append(Figure(group, name.replace("_", " "), words, p["value"] * 1e3, p["u"] * 1e3, "µm", "joint solution"))
+            text = "lost motion, not compensated"
+            figures.append(ReportFigure(group, name.replace("_", " "), text, p["value"] * 1e3, p["u"] * 1e3, "µm", "joint solution"))
     return figures
 
 
 def _solution_verdict(solution: SolutionResult | None) -> tuple[Sign, str, str]:
     if solution is None:
         return "open", "Not judged", NOT_JUDGED
-    told = solution.doc["verdict"]
-    word = str(told["word"])
-    return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(told["text"])
+    evaluated = solution.doc["verdict"]
+    word = str(evaluated["word"])
+    return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(evaluated["text"])
 
 
 def _made(solution: SolutionResult | None) -> dict[str, str] | None:
@@ -248,7 +248,7 @@ def _own(run: Doc) -> Evaluated:
     above = (data.deviation_mm - nominal_reading(data)) * 1e3
     valid = int(np.sum(np.asarray(run["columns"].get("valid", np.ones(len(run["columns"]["t_s"]))), dtype=bool)))
     group = "Readings"
-    rows = [Figure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count")]
+    rows = [ReportFigure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count")]
     series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
     pictures = [
         Picture(f"Run {data.label}: deviation against time, as read.", [residual_plot(series, noise_um=None, key="readings")], "wide")
@@ -256,13 +256,13 @@ def _own(run: Doc) -> Evaluated:
     if why := not_judged(run):
         return Evaluated(figures=rows, pictures=pictures, not_observable=[f"any figure of the whole path: {why}"])
     rows += [
-        Figure(group, "min", "smallest deviation", float(above.min()), None, "µm", "as read"),
-        Figure(group, "max", "largest deviation", float(above.max()), None, "µm", "as read"),
+        ReportFigure(group, "min", "smallest deviation", float(above.min()), None, "µm", "as read"),
+        ReportFigure(group, "max", "largest deviation", float(above.max()), None, "µm", "as read"),
     ]
     if data.test == "helix":
         found = helix_figure(data)
         rows.append(
-            Figure(
+            ReportFigure(
                 group,
                 "helix rms",
                 "rms about its own centre and length",
@@ -277,14 +277,14 @@ def _own(run: Doc) -> Evaluated:
         except MeasurementFault as error:
             return Evaluated(figures=rows, pictures=pictures, not_observable=[f"its picture: {error.detail}"])
         angle = np.degrees(about_axis(data.axes_mm - np.asarray(data.centre_mm), axis))
-        words = f"Deviation of the helix around its axis ({AXES[axis]}), centre and length of the bar fitted away."
-        pictures.append(Picture(words, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
+        text = f"Deviation of the helix around its axis ({AXES[axis]}), centre and length of the bar fitted away."
+        pictures.append(Picture(text, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
     return Evaluated(figures=rows, pictures=pictures)
 
 
-def _words(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, list | tuple):
-        return ", ".join(_words(v) for v in value)
+        return ", ".join(_value_text(v) for v in value)
     if isinstance(value, float):
         return f"{value:.9g}"
     return str(value)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
-from abbe.service.rendering.document import Figure, Instrument, Sign
+from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy
 from abbe.service.verification.verify import Verdict, judge, overall
 
@@ -70,31 +70,31 @@ def _certificate(kind: str, rules: Rules) -> str:
 
 
 def _known(kind: str, runs: Sequence[Doc], campaign: Doc) -> str:
-    words = []
+    facts = []
     resolution = ((campaign.get("instruments") or {}).get(kind) or {}).get("resolution_mm")
     if resolution is not None:
-        words.append(f"resolution {plain(float(resolution) * 1e3, 2)} µm")
+        facts.append(f"resolution {plain(float(resolution) * 1e3, 2)} µm")
     if kind == "ballbar":
         bars = {(r["setup"].get("length_calibrated"), r["setup"].get("u_length_mm")) for r in runs if r["test"].startswith("ballbar")}
         for calibrated, u in sorted(bars, key=repr):
             if calibrated:
-                words.append("length calibrated" + ("" if u is None else f", standard uncertainty {plain(float(u) * 1e3, 2)} µm"))
+                facts.append("length calibrated" + ("" if u is None else f", standard uncertainty {plain(float(u) * 1e3, 2)} µm"))
             else:
-                words.append("length not calibrated")
-    return "; ".join(words) or "nothing stated"
+                facts.append("length not calibrated")
+    return "; ".join(facts) or "nothing stated"
 
 
 def conditions(runs: Sequence[Doc], rules: Rules) -> tuple[dict[str, str], list[str]]:
     """Conditions in words, and what about them the reader has to know."""
     out, remarks = {}, []
     for column, name, unit in SENSORS:
-        seen = [float(v) for r in runs for v in r["columns"].get(column) or [] if v is not None and np.isfinite(v)]
-        if seen:
-            out[name[0].upper() + name[1:]] = f"{min(seen):.2f} to {max(seen):.2f} {unit}"
+        read = [float(v) for r in runs for v in r["columns"].get(column) or [] if v is not None and np.isfinite(v)]
+        if read:
+            out[name[0].upper() + name[1:]] = f"{min(read):.2f} to {max(read):.2f} {unit}"
             if column == "temp_air_C" and rules.temperature_c is not None:
                 low, high = rules.temperature_c
                 out["Allowed"] = f"{low:g} to {high:g} °C"
-                if min(seen) < low or max(seen) > high:
+                if min(read) < low or max(read) > high:
                     remarks.append(f"the air was outside of the allowed {low:g} to {high:g} °C: the figures cannot be judged")
     if not any(name.startswith("temp") and r["columns"].get(name) for r in runs for name in r["columns"]):
         remarks.append("no temperature is on record")
@@ -133,7 +133,7 @@ def provenance(digest: str, made: Mapping[str, str] | None = None) -> dict[str, 
     return out | {"Typesetter of the PDF": f"typst {version('typst')}"}
 
 
-def judged(rows: Mapping[str, tuple[float, float]], rules: Rules, group: str) -> tuple[list[Figure], Verdict | None]:
+def judged(rows: Mapping[str, tuple[float, float]], rules: Rules, group: str) -> tuple[list[ReportFigure], Verdict | None]:
     """Figures of a verification (of `figure_rows`) with their limits, and the verdict on all that have one."""
     figures, verdicts = [], []
     for key, (value, u) in rows.items():
@@ -143,7 +143,7 @@ def judged(rows: Mapping[str, tuple[float, float]], rules: Rules, group: str) ->
         if word is not None:
             verdicts.append(word)
         symbol, name, method = figure_names(key)
-        figures.append(Figure(group, symbol, name, value, u, "µm", method, limit, word or ""))
+        figures.append(ReportFigure(group, symbol, name, value, u, "µm", method, limit, word or ""))
     return figures, overall(verdicts) if verdicts else None
 
 

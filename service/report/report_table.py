@@ -10,13 +10,13 @@ from abbe.service.report.report_parts import Doc
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, Images, images_of
 from abbe.service.tables.table_gate import STRANGE
-from abbe.service.tables.unverified import KnownState, known_tables
+from abbe.service.tables.unverified import KnownTables, known_tables
 
 WORD = "Unverified table"
 
 
 @dataclass(frozen=True, slots=True)
-class TableSaid:
+class TableRemarks:
     """``unverified``: why the verdict cannot be what the limits alone say, empty if it can; ``remarks``: what the reader has to know."""
 
     unverified: str = ""
@@ -30,14 +30,14 @@ class TableSaid:
         return "bad", WORD, f"{self.unverified[:1].upper()}{self.unverified[1:]}. By the figures alone: {word}. {text}".strip()
 
 
-NOTHING_SAID = TableSaid()
+NO_TABLE_REMARKS = TableRemarks()
 
 
-def table_said(store: Store, machine: str, runs: Sequence[Doc]) -> TableSaid:
+def table_remarks(store: Store, machine: str, runs: Sequence[Doc]) -> TableRemarks:
     """Hold the tables that runs of a machine were measured with against the journals of this database, as they stand now."""
     used = {int(t["crc"]): t for r in runs if (t := r.get("table")) and t.get("crc") is not None}
     if not used:
-        return TableSaid()
+        return TableRemarks()
     known, images, chain = known_tables(store), images_of(store), store.pushes.chain(machine)
     unverified = [
         f"measured with the table of push {push.push} of machine {push.machine!r} (CRC {crc:08X}), which was never verified"
@@ -45,7 +45,7 @@ def table_said(store: Store, machine: str, runs: Sequence[Doc]) -> TableSaid:
         if (push := known.unverified.get(crc)) is not None
     ]
     remarks = [_remark(crc, known, chain) for crc in sorted(used) if crc not in known.unverified and _corrects(crc, used[crc], images)]
-    return TableSaid("; ".join(unverified), (*unverified, *filter(None, remarks)))
+    return TableRemarks("; ".join(unverified), (*unverified, *filter(None, remarks)))
 
 
 def _corrects(crc: int, table: Doc, images: Images) -> bool:
@@ -54,9 +54,9 @@ def _corrects(crc: int, table: Doc, images: Images) -> bool:
     return bool(table.get("acting")) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
 
 
-def _remark(crc: int, known: KnownState, chain: str) -> str:
+def _remark(crc: int, known: KnownTables, chain: str) -> str:
     """Whose table it is and who accepted it for this machine; empty where its own journal says that it is right."""
-    elsewhere, here, push = known.elsewhere(crc, chain), known.fine.get(crc, {}).get(chain), known.pushed.get(crc)
+    elsewhere, here, push = known.elsewhere(crc, chain), known.endorsed.get(crc, {}).get(chain), known.pushed.get(crc)
     if elsewhere is not None:
         return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: nobody has accepted it"
     if here is not None and (here.how != "accepted" or (push is not None and push.chain == chain)):

@@ -128,12 +128,12 @@ def _tables(doc: dict[str, Any]) -> list[Section]:
     out = [Section("Monte Carlo trials", [checked])] if checked else []
     if rows := doc.get("tables"):
         cells = [(t["kind"], str(t["entries"]), *(stated(t[k], t[f"u_{k}"]) for k in ("rms_um", "q95_um", "max_um"))) for t in rows]
-        words = (
+        text = (
             f"Errors of distances over the inner 80 % of the strokes that are left, µm, with {U_OF}. What is unknown of this machine is in "
             "every row."
         )
         table = TextTable(("Table", "Numbers", "rms", "95 % below", "Largest"), cells)
-        out.append(Section("What each kind of table can reach", [words, table]))
+        out.append(Section("What each kind of table can reach", [text, table]))
     return out
 
 

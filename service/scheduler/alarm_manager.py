@@ -26,7 +26,7 @@ from abbe.service.scheduler.ports import Doc, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, put_right
+from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
 
@@ -155,7 +155,7 @@ class AlarmManager(RetryingStore):
 
     async def settled(self, found: Approved, after: int, reported: JobOutcome) -> JobOutcome:
         """Record how a push later than ``after`` ended, by the journal; return that."""
-        done = put_right(await self._read(self._of_proposal, found.proposal, after), reported)
+        done = reconciled(await self._read(self._of_proposal, found.proposal, after), reported)
         await self._record_pushed(found.alarm, found.proposal, after, done)
         return done
 

@@ -12,7 +12,7 @@ from abbe.service.domain.service_records import HeartbeatRecord
 from abbe.service.scheduler.heartbeat import SILENT_AFTER
 from abbe.service.storage.store import Store
 from abbe.service.verification.trend_table import FigureTrend, trends
-from abbe.service.verification.verified_by import LOOKED, VerifiedBy, of_push_taken_back, verified_by
+from abbe.service.verification.verified_by import LATEST_CHECKS, VerifiedBy, of_push_taken_back, verified_by
 
 CHECKS = 400
 """So many checks of each machine are looked at for its trend, which uses no more (`abbe.models.trend.MOST_CHECKS`)."""
@@ -104,7 +104,9 @@ def stands(store: Store, now: datetime) -> list[MachineStatus]:
         With time zone.
     """
     said = store.heartbeats.all()
-    return [_stand(store, name, said.get(name), store.verifications.of_machine(name, LOOKED), now) for name in store.machines.names()]
+    return [
+        _stand(store, name, said.get(name), store.verifications.of_machine(name, LATEST_CHECKS), now) for name in store.machines.names()
+    ]
 
 
 def fleet(store: Store, now: datetime) -> list[MachineLine]:

@@ -73,9 +73,10 @@ def claims_of(machine: str, form: str, files: Mapping[str, bytes], base: str, li
 
 def sign(claims: Claims, key: Ed25519PrivateKey) -> bytes:
     """Bytes of FILE.sig."""
-    said = asdict(claims)
+    claimed = asdict(claims)
     return (
-        canonical({"format": FORM, "key": public_of(key), "claims": said, "signature": key.sign(PURPOSE + canonical(said)).hex()}) + b"\n"
+        canonical({"format": FORM, "key": public_of(key), "claims": claimed, "signature": key.sign(PURPOSE + canonical(claimed)).hex()})
+        + b"\n"
     )
 
 
@@ -108,17 +109,17 @@ def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, 
     except (InvalidSignature, ValueError):
         raise SignatureRefused("the signature does not belong to what it stands under", FILE_REMEDY) from None
     _check_files(claims, files)
-    for what, said, here in (
+    for what, claimed, here in (
         ("machine", claims.machine, expected.machine),
         ("format", claims.form, expected.form),
         ("limits", claims.limits, expected.limits),
         ("base", claims.base, claims.base if expected.base is None else expected.base),
     ):
-        if said != here:
+        if claimed != here:
             raise SignatureRefused(
-                f"signed for {what} {said[:64]!r}, and here it is {here[:64]!r}", "have it signed for this machine as it is now"
+                f"signed for {what} {claimed[:64]!r}, and here it is {here[:64]!r}", "have it signed for this machine as it is now"
             )
-    if not _moment(claims.signed_utc) <= now < _moment(claims.expiry_utc):
+    if not _utc(claims.signed_utc) <= now < _utc(claims.expiry_utc):
         raise SignatureRefused(
             f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)", "have it signed anew, or set the clock"
         )
@@ -145,13 +146,13 @@ def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
         signature = bytes.fromhex(doc["signature"])
         if not all(isinstance(text, str) for text in texts) or signature.hex() != doc["signature"]:
             raise ValueError
-        _moment(claims.signed_utc), _moment(claims.expiry_utc)
+        _utc(claims.signed_utc), _utc(claims.expiry_utc)
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise SignatureRefused(f"no signature of the form {FORM}, or it was changed", FILE_REMEDY) from None
     return doc["key"], claims, signature
 
 
-def _moment(text: str) -> datetime:
+def _utc(text: str) -> datetime:
     found = datetime.fromisoformat(text)
     if found.tzinfo is None:
         raise ValueError

@@ -18,7 +18,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables import table_gate
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.tables.table_gate import InForceNow
-from abbe.service.tables.unverified import KnownState, known_tables
+from abbe.service.tables.unverified import KnownTables, known_tables
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
         async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
             known = await asyncio.to_thread(known_tables, store)
             chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
-            now = await _seen(session.controller, known, chain, corrects)
+            now = await _look_or_strange(session.controller, known, chain, corrects)
         # After the controller: a push that ended in between is known to the journal before it can be missed here.
         wanted, settled = (await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)).wanted
         push = now.unverified
@@ -71,7 +71,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
     return look
 
 
-async def _seen(controller: TableController, known: KnownState, chain: str, corrects: dict[int, bool]) -> InForceNow:
+async def _look_or_strange(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool]) -> InForceNow:
     """The gate's look. A table without the CRC that is stated for it is strange."""
     try:
         return await table_gate.look(controller, known, chain, corrects)

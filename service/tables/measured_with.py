@@ -18,7 +18,7 @@ KIND_AT, NO_CORRECTION = slice(4, 6), 0
 """Bytes of an image that say its kind (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
 Images = Callable[[int], bytes | None]
 REMEDY = "measure again without a table in force; or, where the control has Abbe's register map, let abbe correct add the tables"
-SAY_SO = "if none was, say so: --without-table"
+CONFIRM_REMEDY = "if none was, say so: --without-table"
 
 
 def distinct(tables: Iterable[Doc]) -> list[Doc]:
@@ -56,7 +56,7 @@ def no_images(crc: int) -> bytes | None:
     return None
 
 
-def check_fresh(tables: list[Doc], images: Images, *, said_so: bool = False) -> bool:
+def check_fresh(tables: list[Doc], images: Images, *, confirmed_none: bool = False) -> bool:
     """Refuse a solution that was measured with a correction in force; gives whether it is known that there was none.
 
     Parameters
@@ -65,7 +65,7 @@ def check_fresh(tables: list[Doc], images: Images, *, said_so: bool = False) -> 
         From `distinct`.
     images : callable
         Image of a CRC, or None.
-    said_so : bool
+    confirmed_none : bool
         A person says that no correction was in force: believed where nothing else is known, never against what is known.
 
     Raises
@@ -81,6 +81,6 @@ def check_fresh(tables: list[Doc], images: Images, *, said_so: bool = False) -> 
         name = f"table {table['crc']:08X}"
         if acts:
             raise FormatRefused(f"this solution was measured while {name} corrected the machine: alone it would take that away", REMEDY)
-        if acts is None and not said_so:
-            raise FormatRefused(f"this solution was measured with {name}, and nothing says whether it corrected anything", SAY_SO)
-    return bool(tables) or said_so
+        if acts is None and not confirmed_none:
+            raise FormatRefused(f"this solution was measured with {name}, and nothing says whether it corrected anything", CONFIRM_REMEDY)
+    return bool(tables) or confirmed_none

@@ -44,7 +44,7 @@ class TableOrigin:
 
 
 @dataclass(frozen=True, slots=True)
-class Names:
+class TableNames:
     """What the two tables of a push are called in its sentence: the one that comes, the same again in short, and the one that goes."""
 
     new: str = "the new table"
@@ -52,7 +52,7 @@ class Names:
     old: str = "the old table"
 
 
-BACK = Names("the table ordered back", "the one ordered back", "the table from before the order")
+BACK = TableNames("the table ordered back", "the one ordered back", "the table from before the order")
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,13 +211,13 @@ class JournalView:
 
     def of_proposal(self, proposal: int, after: int = 0) -> JobOutcome | None:
         """How the last push of a proposal stands, of those later than push ``after``; None: the journal has none, nothing was written."""
-        return self._last_own(lambda number, origin: number > after and origin.proposal == proposal, Names())
+        return self._last_own(lambda number, origin: number > after and origin.proposal == proposal, TableNames())
 
     def of_order(self, order: str) -> JobOutcome | None:
         """How the push of an ordered rollback stands; None: the journal has none, nothing was written."""
         return self._last_own(lambda _, origin: origin.order == order, BACK)
 
-    def _last_own(self, own: Callable[[int, TableOrigin], bool], names: Names) -> JobOutcome | None:
+    def _last_own(self, own: Callable[[int, TableOrigin], bool], names: TableNames) -> JobOutcome | None:
         mine = [journal for number, journal in self.pushes.items() if own(number, self.origin(journal))]
         return outcome_of(mine[-1], names) if mine else None
 
@@ -273,13 +273,13 @@ class JournalView:
         summaries = tuple(self._summary(journal) for journal in self.pushes.values())
         try:
             offer, refusal = self.offer(), ""
-        except TableRefused as no:
-            offer, refusal = None, no.detail
+        except TableRefused as error:
+            offer, refusal = None, error.detail
         return TableHistory(self._now(summaries), tuple(reversed(summaries)), offer, refusal)
 
     def _summary(self, journal: Journal) -> PushSummary:
         last, known, origin = journal[-1], facts(journal), self.origin(journal)
-        outcome = outcome_of(journal, BACK if origin.kind == KIND else Names())
+        outcome = outcome_of(journal, BACK if origin.kind == KIND else TableNames())
         # What was in force when it ended need not be now: of a push that has ended only the cause is given.
         ended = {PushState.KEEP: known.verify, PushState.ROLLED_BACK: known.why, PushState.ABORTED: known.why}
         return PushSummary(
@@ -341,7 +341,7 @@ def push_log(journal: Journal) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def outcome_of(journal: Journal, names: Names = Names()) -> JobOutcome:
+def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome:
     """How a push stands by its journal."""
     last, known = journal[-1], facts(journal)
     name, why = f"push {last.push}", known.why
@@ -367,14 +367,14 @@ def outcome_of(journal: Journal, names: Names = Names()) -> JobOutcome:
     )
 
 
-def put_right(found: JobOutcome | None, heard: JobOutcome) -> JobOutcome:
-    """What was heard of a push, put right by the journal (None: it says nothing): the journal says what is in force."""
+def reconciled(found: JobOutcome | None, reported: JobOutcome) -> JobOutcome:
+    """What was reported of a push, put right by the journal (None: it says nothing): the journal says what is in force."""
     if found is None:
-        return heard if heard.word in ("refused", STOPPED) else JobOutcome("failed", heard.text)
-    if found.word == heard.word:
-        return heard
-    word = STOPPED if (found.word, heard.word) == ("failed", STOPPED) else found.word
-    return JobOutcome(word, f"{found.text}; {heard.text}")
+        return reported if reported.word in ("refused", STOPPED) else JobOutcome("failed", reported.text)
+    if found.word == reported.word:
+        return reported
+    word = STOPPED if (found.word, reported.word) == ("failed", STOPPED) else found.word
+    return JobOutcome(word, f"{found.text}; {reported.text}")
 
 
 def operator_needed(journal: Journal, detail: str = "") -> TableMismatch:

@@ -16,7 +16,7 @@ from abbe.service.push.states import PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
-from abbe.service.tables.unverified import Fine, KnownState, PushedTable, known_tables
+from abbe.service.tables.unverified import Endorsement, KnownTables, PushedTable, known_tables
 
 LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
 STRANGE = "a table that this database did not push"
@@ -37,7 +37,7 @@ class InForceNow:
     status: CompStatus
     unverified: PushedTable | None
     strange: bool
-    elsewhere: Fine | None
+    elsewhere: Endorsement | None
 
     @property
     def crc(self) -> int:
@@ -45,7 +45,7 @@ class InForceNow:
         return self.status.bank_crc[self.status.active_bank]
 
 
-async def look(controller: TableController, known: KnownState, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
+async def look(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
     """Ask the controller which table acts, and the journals which that is. Its content is read only where ``chain``, the journal of this
     control, does not say that it is right, and once for each CRC where ``corrects`` keeps what was read.
 
@@ -57,12 +57,12 @@ async def look(controller: TableController, known: KnownState, chain: str, corre
     now = await controller.comp_status()
     crc = now.bank_crc[now.active_bank]
     unverified, elsewhere = known.unverified.get(crc), known.elsewhere(crc, chain)
-    asked = (crc not in known.seen or elsewhere is not None) and unverified is None
+    asked = (crc not in known.known_crcs or elsewhere is not None) and unverified is None
     read = {} if corrects is None else corrects
     if asked and crc not in read:
         read[crc] = await _corrects(controller, now)
     acts = asked and read[crc]
-    return InForceNow(now, unverified, acts and crc not in known.seen, elsewhere if acts else None)
+    return InForceNow(now, unverified, acts and crc not in known.known_crcs, elsewhere if acts else None)
 
 
 async def _corrects(controller: TableController, now: CompStatus) -> bool:
@@ -97,7 +97,7 @@ async def check_in_force(controller: TableController, store: Store, site: Site) 
         raise TableMismatch(f"the table in force (CRC {now.crc:08X}) was {now.elsewhere.not_here}", ACCEPT)
 
 
-def _journals(store: Store, site: Site) -> tuple[KnownState, str]:
+def _journals(store: Store, site: Site) -> tuple[KnownTables, str]:
     return known_tables(store), store.pushes.chain(site.name, site.control)
 
 
@@ -131,9 +131,11 @@ async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
     """Write a person's word for the table in force into the journal of the control, whose last push has come to its end."""
     book = await StoreBook.word(store, site.name, SystemClock(), site.control)
     journal = await book.entries()
-    await book.append(journal, PushState.ACCEPTED, said(now, by) | ({} if journal else {"machine": site.name, "control": site.control}))
+    await book.append(
+        journal, PushState.ACCEPTED, acceptance_doc(now, by) | ({} if journal else {"machine": site.name, "control": site.control})
+    )
 
 
-def said(now: CompStatus, by: str) -> Doc:
+def acceptance_doc(now: CompStatus, by: str) -> Doc:
     """What a journal keeps of a person's word."""
     return {"accepted_bank": now.active_bank, "accepted_crc": now.bank_crc[now.active_bank], "by": by}

@@ -47,7 +47,7 @@ class PushedTable:
 
 
 @dataclass(frozen=True, slots=True)
-class Fine:
+class Endorsement:
     """Why a table is right on one control: a push kept it there, a person vouched for it, or the first push found it in force.
 
     ``push``: 0 for a person's word before the first; ``by``: who vouched, empty for no person.
@@ -67,54 +67,54 @@ class Fine:
 
 
 @dataclass(frozen=True, slots=True)
-class KnownState:
+class KnownTables:
     """Tables by their CRC, over all journals of a database.
 
-    ``unverified``: which push brought it; ``seen``: every table that a push brought or found in force, or that a person vouched for;
-    ``pushed``: the last push of each; ``fine``: in which journals it is right, and why.
+    ``unverified``: which push brought it; ``known_crcs``: every table that a push brought or found in force, or that a person vouched for;
+    ``pushed``: the last push of each; ``endorsed``: in which journals it is right, and why.
     """
 
     unverified: dict[int, PushedTable]
-    seen: frozenset[int]
+    known_crcs: frozenset[int]
     pushed: dict[int, PushedTable]
-    fine: dict[int, dict[str, Fine]]
+    endorsed: dict[int, dict[str, Endorsement]]
 
-    def elsewhere(self, crc: int, chain: str) -> Fine | None:
+    def elsewhere(self, crc: int, chain: str) -> Endorsement | None:
         """Where a table is right that is not known to be so in this journal; None if it is, or is nowhere."""
-        where = self.fine.get(crc, {})
+        where = self.endorsed.get(crc, {})
         return None if chain in where else max(where.values(), key=lambda one: (one.how == "verified", one.utc), default=None)
 
 
-def known_tables(store: Store) -> KnownState:
+def known_tables(store: Store) -> KnownTables:
     """Read the journals of all machines, without the images in them."""
     marks = store.pushes.marks()
     unverified = _unverified([((m.machine, m.push), m.state, m.doc) for m in marks])
     last: dict[Hashable, PushedTable] = {}
     crc: dict[Hashable, int] = {}
-    fine: dict[int, dict[str, Fine]] = {}
-    seen: set[int] = set()
+    endorsed: dict[int, dict[str, Endorsement]] = {}
+    crcs: set[int] = set()
     for mark in marks:
         key, doc = (mark.machine, mark.push), mark.doc
         named = (last[key].machine, last[key].control) if key in last else (doc.get("machine", mark.machine), doc.get("control", ""))
         last[key] = PushedTable(mark.machine, mark.push, mark.state, str(named[0]), str(named[1]))
-        seen.update(int(doc[name]) for name in ("base_crc", "crc", "accepted_crc") if name in doc)
+        crcs.update(int(doc[name]) for name in ("base_crc", "crc", "accepted_crc") if name in doc)
         if mark.state == PushState.SNAPSHOT and "crc" in doc:
             base = int(doc["base_crc"])
-            if base in fine or base not in crc.values():
-                _add(fine, base, "found in force", last[key], mark)
+            if base in endorsed or base not in crc.values():
+                _add(endorsed, base, "found in force", last[key], mark)
             crc[key] = int(doc["crc"])
         elif mark.state == PushState.KEEP and key in crc:
-            _add(fine, crc[key], "verified", last[key], mark)
+            _add(endorsed, crc[key], "verified", last[key], mark)
         elif "accepted_crc" in doc:
-            _add(fine, int(doc["accepted_crc"]), "accepted", last[key], mark)
+            _add(endorsed, int(doc["accepted_crc"]), "accepted", last[key], mark)
     pushed = {number: last[key] for key, number in crc.items()}
-    return KnownState({number: last[key] for number, key in unverified.items()}, frozenset(seen), pushed, fine)
+    return KnownTables({number: last[key] for number, key in unverified.items()}, frozenset(crcs), pushed, endorsed)
 
 
-def _add(fine: dict[int, dict[str, Fine]], crc: int, how: How, push: PushedTable, mark: PushEntryRecord) -> None:
+def _add(endorsed: dict[int, dict[str, Endorsement]], crc: int, how: How, push: PushedTable, mark: PushEntryRecord) -> None:
     """Note why a table is right in a journal; that a later push found it in force says less than what is there."""
-    one = Fine(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
-    where, chain = fine.setdefault(crc, {}), push.chain
+    one = Endorsement(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
+    where, chain = endorsed.setdefault(crc, {}), push.chain
     if how != "found in force" or chain not in where:
         where[chain] = one
 
@@ -129,16 +129,16 @@ def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
     """A table that was in force before a push was put there by a person, unless an earlier push had brought it and not kept it."""
     candidates: dict[int, Hashable] = {}
     pushed: dict[Hashable, int] = {}
-    fine: set[int] = set()
+    endorsed: set[int] = set()
     for push, state, doc in rows:
         if state == PushState.SNAPSHOT and "crc" in doc:
             base, crc = int(doc["base_crc"]), int(doc["crc"])
             if base not in candidates:
-                fine.add(base)
+                endorsed.add(base)
             pushed[push] = crc
             candidates.setdefault(crc, push)
         elif state == PushState.KEEP and push in pushed:
-            fine.add(pushed[push])
+            endorsed.add(pushed[push])
         elif state == PushState.ACCEPTED and "accepted_crc" in doc:
-            fine.add(int(doc["accepted_crc"]))
-    return {crc: push for crc, push in candidates.items() if crc not in fine}
+            endorsed.add(int(doc["accepted_crc"]))
+    return {crc: push for crc, push in candidates.items() if crc not in endorsed}

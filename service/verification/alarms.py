@@ -60,17 +60,17 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
         return
     limit, value, u = one.limit, one.latest, one.expanded_uncertainty / COVERAGE
     name, unit = NAMES.get(one.figure, one.figure), " µm" if one.figure.endswith("_um") else ""
-    said = f"{name} {value:.1f} ± {one.expanded_uncertainty:.1f}{unit} (U, k = 2)"
+    reading = f"{name} {value:.1f} ± {one.expanded_uncertainty:.1f}{unit} (U, k = 2)"
     if judge(value, u, limit) == "fail":
-        yield Signal(one.figure, "limit", value, one.expanded_uncertainty, limit, f"{said} is above its limit of {limit:g}{unit}")
+        yield Signal(one.figure, "limit", value, one.expanded_uncertainty, limit, f"{reading} is above its limit of {limit:g}{unit}")
     before = _before(one, records, terms)
     if before is not None and jumps(value - before[0], float(np.hypot(u, before[1])), limit):
         expanded = COVERAGE * float(np.hypot(u, before[1]))
-        text = f"{said} is {value - before[0]:+.1f} ± {expanded:.1f}{unit} from the checks before"
+        text = f"{reading} is {value - before[0]:+.1f} ± {expanded:.1f}{unit} from the checks before"
         yield Signal(one.figure, "jump", value, one.expanded_uncertainty, limit, text, *before)
     if one.direction > 0:
         since = "" if one.since_utc is None else f" since {one.since_utc:%Y-%m-%d %H:%M} UTC"
-        yield Signal(one.figure, "drift", value, one.expanded_uncertainty, limit, f"{said} drifts up{since}")
+        yield Signal(one.figure, "drift", value, one.expanded_uncertainty, limit, f"{reading} drifts up{since}")
     if terms.warn_days and one.days_until_limit_95 is not None and one.days_until_limit_95[0] < terms.warn_days:
         text = f"{name} reaches its limit of {limit:g}{unit} in {one.ahead} days (95 %)"
         yield Signal(one.figure, "days", value, one.expanded_uncertainty, limit, text)
@@ -92,7 +92,7 @@ READ_CHECKS = 4 * MOST_CHECKS
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
+class AlarmCheck:
     """What a check means for the alarm of its recipe: ``kind`` None: nothing."""
 
     kind: AlarmKind | None
@@ -169,20 +169,20 @@ def series_begins(store: Store, machine: str) -> datetime | None:
     return datetime.fromisoformat(changed[-1].utc) if changed else None
 
 
-def look(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> Looked:
+def look(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> AlarmCheck:
     """Hold the latest check of a recipe against those before it and against the alarm that is active. Nothing is written."""
     begins, now = series_begins(store, machine), active_alarm(store, machine, recipe)
     compare = None
     if now is not None and (begins is None or begins < datetime.fromisoformat(now.raised_utc)):
         compare = {d["figure"]: (d["baseline"], d["baseline_u"]) for d in now.first if d["kind"] == "jump"}
     found = found_in(records, AlarmTerms(recipe, begins, warn_days, compare))
-    return Looked(after_check(now, found), now, found)
+    return AlarmCheck(after_check(now, found), now, found)
 
 
-def check_line(looked: Looked, recipe: str, schedule: str, verification: int) -> Doc:
+def check_line(check: AlarmCheck, recipe: str, schedule: str, verification: int) -> Doc:
     """The document of the line that a check writes."""
-    signals = [asdict(s) for s in looked.found.signals]
-    return {"recipe": recipe, "schedule": schedule, "verification": verification, "signals": signals, "text": looked.found.text}
+    signals = [asdict(s) for s in check.found.signals]
+    return {"recipe": recipe, "schedule": schedule, "verification": verification, "signals": signals, "text": check.found.text}
 
 
 def last_seq(entries: Sequence[AlarmEntryRecord], number: int) -> int:

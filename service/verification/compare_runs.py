@@ -15,7 +15,7 @@ from abbe.models.machine import AXES
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import U_WAVELENGTH
 from abbe.models.verification import U_REPEAT_MM, helix_figure
-from abbe.service.rendering.document import Figure
+from abbe.service.rendering.document import ReportFigure
 from abbe.service.rendering.numbers import COVERAGE, finite
 from abbe.service.runs.coverage import not_judged
 from abbe.service.runs.helix_axis import about_axis, helix_axis, path_axis
@@ -40,7 +40,7 @@ class LoadedRun:
     machine: str
     run: dict[str, Any]
     data: RunData
-    figures: Sequence[Figure]
+    figures: Sequence[ReportFigure]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +136,8 @@ def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -
             out.append(f"{other.label} was driven in another direction than {first.label}: reversal errors are in the difference")
         feeds = [float(np.median(f)) if (f := _column(r, "feed_mm_min")) else float("nan") for r in (first, other)]
         if abs(feeds[1] - feeds[0]) > SAME_FEED * abs(feeds[0]):
-            told = f"{feed(feeds[1])}, {first.label} with {feed(feeds[0])}"
-            out.append(f"{other.label} was driven with {told}: what depends on feed is in the difference")
+            feeds_text = f"{feed(feeds[1])}, {first.label} with {feed(feeds[0])}"
+            out.append(f"{other.label} was driven with {feeds_text}: what depends on feed is in the difference")
     return out
 
 

@@ -81,7 +81,7 @@ def circle_tests(runs: Sequence[Run], refused: list[str]) -> list[CircleTest]:
         try:
             out.append(_circle(run))
         except (AbbeError, ValueError) as error:
-            refused.append(f"circle {run['run_id']}: {_said(error)}")
+            refused.append(f"circle {run['run_id']}: {_message(error)}")
     return out
 
 
@@ -98,7 +98,7 @@ def _circle(run: Run) -> CircleTest:
     return CircleTest(run["run_id"], plane, data.setup, float(run["setup"]["radius_mm"]), sense, path, u)
 
 
-def _said(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return error.detail if isinstance(error, AbbeError) else str(error)
 
 
@@ -122,7 +122,7 @@ def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTe
     try:
         readings = _approaches(name, group)
     except (AbbeError, ValueError) as error:
-        refused.append(f"{name} ({', '.join(runs)}): {_said(error)}")
+        refused.append(f"{name} ({', '.join(runs)}): {_message(error)}")
         return None
     return AxisTest(name, setup, runs, readings, tuple(_notes(group)))
 

@@ -14,7 +14,7 @@ from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circula
 from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
-from abbe.service.rendering.document import Figure, Picture
+from abbe.service.rendering.document import Picture, ReportFigure
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.numbers import plain
 from abbe.service.rendering.plots.polar import polar_plot
@@ -40,7 +40,7 @@ BAR_STATEMENT = (
 class Evaluated:
     """What the standards say of some runs; ``statements`` are part of the uncertainty statement."""
 
-    figures: list[Figure] = field(default_factory=list)
+    figures: list[ReportFigure] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     not_observable: list[str] = field(default_factory=list)
@@ -114,19 +114,19 @@ def _rows(p: Positioning) -> list[tuple[str, str, Value | None]]:
     ]
 
 
-def _figure(group: str, symbol: str, name: str, value: Value | None, method: str) -> Figure:
+def _figure(group: str, symbol: str, name: str, value: Value | None, method: str) -> ReportFigure:
     if value is None:
-        return Figure(group, symbol, name, None, None, "µm", method)
-    return Figure(group, symbol, name, value.value_mm * UM, value.u_mm * UM, "µm", method)
+        return ReportFigure(group, symbol, name, None, None, "µm", method)
+    return ReportFigure(group, symbol, name, value.value_mm * UM, value.u_mm * UM, "µm", method)
 
 
 def _positioning(label: str, x_label: str, p: Positioning) -> Picture:
     s = [None if v is None else v * UM for v in (p.s_forward_mm, p.s_backward_mm)]
     curves = PositioningCurves(label, x_label, p.position_mm, p.mean_forward_mm * UM, p.mean_backward_mm * UM, *s)
-    words = ", ".join(f"{n} {plain(v.value_mm * UM)} µm" for n, v in (("E", p.E), ("B", p.B), ("R", p.R), ("A", p.A)) if v is not None)
+    text = ", ".join(f"{n} {plain(v.value_mm * UM)} µm" for n, v in (("E", p.E), ("B", p.B), ("R", p.R), ("A", p.A)) if v is not None)
     bars = "; bars are two standard deviations to both sides" if p.s_forward_mm is not None else ""
-    caption = f"{label}: mean deviation of both directions{bars}. {words}."
-    return Picture(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=words)], "wide")
+    caption = f"{label}: mean deviation of both directions{bars}. {text}."
+    return Picture(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=text)], "wide")
 
 
 def _diagonals(out: Evaluated, where: str, tests: list[AxisTest], budget: ScaleBudget) -> None:
@@ -138,7 +138,7 @@ def _diagonals(out: Evaluated, where: str, tests: list[AxisTest], budget: ScaleB
         ("M_d", "range of the mean bidirectional deviations, of diagonal {}", found.M_d),
         ("B_d", "reversal, of diagonal {}", found.B_d),
     ] + ([("R_d", "repeatability, of diagonal {}", found.R_d)] if found.R_d is not None else [])
-    out.figures += [_figure(group, symbol, words.format(name), value, "ISO 230-6") for symbol, words, (name, value) in rows]
+    out.figures += [_figure(group, symbol, text.format(name), value, "ISO 230-6") for symbol, text, (name, value) in rows]
     out.figures += [_figure(group, f"E {n}", f"systematic deviation of diagonal {n}", p.E, "ISO 230-6") for n, p in found.each.items()]
     out.pictures += [_positioning(f"diagonal {n}", "along the diagonal in mm", p) for n, p in found.each.items()]
     if found.missing:
@@ -182,7 +182,7 @@ def _circle(out: Evaluated, group: str, test: CircleTest) -> None:
         (f"F_{sub},max (LSC)", f"about the least squares centre, largest, run {test.run}", one.F_max_centred_mm, u_f),
         (f"F_{sub},min (LSC)", f"about the least squares centre, smallest, run {test.run}", one.F_min_centred_mm, u_f),
     ]
-    out.figures += [Figure(group, s, n, v * UM, None if w is None else float(w) * UM, "µm", "ISO 230-4") for s, n, v, w in rows]
+    out.figures += [ReportFigure(group, s, n, v * UM, None if w is None else float(w) * UM, "µm", "ISO 230-4") for s, n, v, w in rows]
     if not one.is_whole:
         out.remarks.append(
             f"circle {test.run}: an arc of {np.degrees(one.covered_rad):.0f}°, no whole circle: its centre is less well known"
@@ -196,10 +196,12 @@ def _pair(out: Evaluated, group: str, forward: CircleTest, backward: CircleTest)
     u = float(np.sqrt(2.0) * max(_u(circular(t.path)) for t in (forward, backward)))
     runs = f"runs {forward.run} and {backward.run}"
     out.figures.append(
-        Figure(group, f"G(b)_{forward.plane}", f"bidirectional circular deviation, {runs}", both.G_b_mm * UM, u * UM, "µm", "ISO 230-4")
+        ReportFigure(
+            group, f"G(b)_{forward.plane}", f"bidirectional circular deviation, {runs}", both.G_b_mm * UM, u * UM, "µm", "ISO 230-4"
+        )
     )
     name = f"circular hysteresis, at {np.degrees(both.at_rad):.0f}°, {runs}"
-    out.figures.append(Figure(group, f"H_{forward.plane}", name, both.H_mm * UM, u * UM, "µm", "ISO 230-4"))
+    out.figures.append(ReportFigure(group, f"H_{forward.plane}", name, both.H_mm * UM, u * UM, "µm", "ISO 230-4"))
 
 
 def _u(one: OnePath) -> float:

@@ -21,15 +21,15 @@ from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
 
-LOOKED = 20
+LATEST_CHECKS = 20
 """So many of the latest checks are looked at for one that measured something."""
-STRANGE = "CMP-010"
+STRANGE_TABLE = "CMP-010"
 """Code of the alarm that somebody else has changed the table in force."""
 
-Word = Literal["verified", "unverified", "unknown"]
-Why = Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"]
+VerifiedState = Literal["verified", "unverified", "unknown"]
+VerifiedReason = Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"]
 
-_WORDS: dict[str, str] = {
+_TEXTS: dict[str, str] = {
     "check": "checked with the table in force: check {number} of {when}",
     "push": "verified by push {number} of {when}, which measured before and after; not checked since",
     "rollback": "unverified since the rollback of {when} (push {number})",
@@ -65,8 +65,8 @@ class VerifiedBy:
         Whenever a table came into force.
     """
 
-    state: Word
-    why: Why
+    state: VerifiedState
+    why: VerifiedReason
     number: int = 0
     utc: datetime | None = None
     crc: Annotated[int | None, Field(exclude=True)] = None
@@ -82,7 +82,7 @@ class VerifiedBy:
     @property
     def text(self) -> str:
         """One line for people: ``unverified since the rollback of 2026-11-23 02:10 UTC (push 3)``."""
-        return _WORDS[self.why].format(number=self.number, when=minute(self.utc))
+        return _TEXTS[self.why].format(number=self.number, when=minute(self.utc))
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -112,7 +112,7 @@ def minute(utc: datetime | None) -> str:
 
 def strange_table(attention: Sequence[str]) -> bool:
     """Whether what needs a person now is that somebody else has changed the table in force."""
-    return any(text.startswith(f"{STRANGE}:") for text in attention)
+    return any(text.startswith(f"{STRANGE_TABLE}:") for text in attention)
 
 
 def verified_by(store: Store, machine: str, *, control: str = "", strange: bool = False) -> VerifiedBy:
@@ -137,20 +137,20 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
     journal = JournalView.read(store, machine, control, origins=False)
     if not journal.sound:
         return VerifiedBy("unknown", "journal")
-    checks = store.verifications.of_machine(machine, LOOKED)
-    return _of_journal(store, journal, checks, strange=strange or _said_strange(store, machine, journal, checks))
+    checks = store.verifications.of_machine(machine, LATEST_CHECKS)
+    return _of_journal(store, journal, checks, strange=strange or _reported_strange(store, machine, journal, checks))
 
 
-def _said_strange(store: Store, machine: str, journal: JournalView, checks: Sequence[VerificationRecord]) -> bool:
+def _reported_strange(store: Store, machine: str, journal: JournalView, checks: Sequence[VerificationRecord]) -> bool:
     """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
     the journal's one in force.
     """
-    said = store.heartbeats.all().get(machine)
-    if said is None or not strange_table(said.doc.get("attention") or []):
+    heartbeat = store.heartbeats.all().get(machine)
+    if heartbeat is None or not strange_table(heartbeat.doc.get("attention") or []):
         return False
-    seen = datetime.fromisoformat(said.seen_utc)
+    seen = datetime.fromisoformat(heartbeat.seen_utc)
     last = _last_measured(checks)
-    if last is not None and _with(store, last, journal.wanted[0], seen):
+    if last is not None and _measured_with(store, last, journal.wanted[0], seen):
         return False
     return all(datetime.fromisoformat(e.utc) <= seen for e in journal.changes)
 
@@ -166,7 +166,7 @@ def _of_journal(store: Store, journal: JournalView, checks: Sequence[Verificatio
     last = _last_measured(checks)
     if strange:
         return VerifiedBy("unverified", "changed", **known)
-    if last is not None and (not changes or started(last) > changes[-1] or _with(store, last, crc, changes[-1])):
+    if last is not None and (not changes or started(last) > changes[-1] or _measured_with(store, last, crc, changes[-1])):
         table = table_of(store, last)
         other = crc is not None and table is not None and table != crc
         return VerifiedBy("unverified" if other else "verified", "other" if other else "check", last.id, started(last), **known)
@@ -206,7 +206,7 @@ def _last_measured(checks: Sequence[VerificationRecord]) -> VerificationRecord |
     return next((one for one in checks if measured(one)), None)
 
 
-def _with(store: Store, record: VerificationRecord, crc: int | None, since: datetime) -> bool:
+def _measured_with(store: Store, record: VerificationRecord, crc: int | None, since: datetime) -> bool:
     """Whether a check began after a moment, and the table in force was this one."""
     return crc is not None and began(store, record) > since and table_of(store, record) == crc
 

@@ -22,7 +22,7 @@ from abbe.service.push.book import StoreBook, read_entries
 from abbe.service.push.entries import WORD, check_chain
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import PushState
-from abbe.service.report.report_table import table_said
+from abbe.service.report.report_table import table_remarks
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -143,11 +143,11 @@ async def test_unverified_is_looked_up_over_all_journals_and_no_later_base_makes
 async def test_a_report_gives_no_verdict_on_an_unverified_table(store: Store) -> None:
     await pushed(store, "a", (OLD, NEW), UP_TO_ACTIVE, HERE)
     crc = next(iter(known_tables(store).unverified))
-    said = table_said(store, "a", [{"table": {"crc": crc, "bank": 1, "acting": True}}])
+    said = table_remarks(store, "a", [{"table": {"crc": crc, "bank": 1, "acting": True}}])
     sign, word, text = said.verdict(("ok", "Within limits", "By the limits."))
     assert (sign, word) == ("bad", "Unverified table")
     assert "push 1 of machine 'a'" in text
-    strange = table_said(store, "a", [{"table": {"crc": 5, "acting": True}}, {"table": {"crc": 6, "acting": False}}])
+    strange = table_remarks(store, "a", [{"table": {"crc": 5, "acting": True}}, {"table": {"crc": 6, "acting": False}}])
     assert strange.remarks == ("measured with a table that this database did not push (CRC 00000005): nobody has accepted it",)
     assert strange.verdict(("ok", "Within limits", "By the limits.")) == ("ok", "Within limits", "By the limits.")
 
@@ -155,9 +155,9 @@ async def test_a_report_gives_no_verdict_on_an_unverified_table(store: Store) ->
 async def test_a_report_names_a_table_that_was_verified_on_another_machine(store: Store) -> None:
     await pushed(store, "a", (OLD, ACTING), KEPT, HERE)
     used = [{"table": {"crc": crc32(ACTING), "acting": True}}]
-    assert table_said(store, "a", used).remarks == ()
+    assert table_remarks(store, "a", used).remarks == ()
     remark = f"measured with a table (CRC {crc32(ACTING):08X}) that was verified on machine 'a' (push 1), not on this one"
-    assert table_said(store, "b", used).remarks == (f"{remark}: nobody has accepted it",)
+    assert table_remarks(store, "b", used).remarks == (f"{remark}: nobody has accepted it",)
 
 
 async def test_a_verdict_of_the_control_that_had_the_name_before_is_not_this_one_s(store: Store) -> None:
@@ -372,8 +372,8 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             assert (told.now.how, told.pushes, f"{told.now.crc:08X}") == ("accepted", (), crc)
             await accept(controller, store, site, "eve")  # the same word by `abbe accept-table`
             used = [{"table": {"crc": int(crc, 16), "acting": True}}]
-            assert "accepted by eve at " in table_said(store, site.name, used).remarks[0]
-            assert table_said(store, "lathe", used).remarks == (
+            assert "accepted by eve at " in table_remarks(store, site.name, used).remarks[0]
+            assert table_remarks(store, "lathe", used).remarks == (
                 f"measured with a table (CRC {crc}) that was accepted on machine 'sim', not on this one: nobody has accepted it",
             )
             assert (await StoreBook.new(store, "sim", SystemClock(), site.control))._push == 1  # a word is no push

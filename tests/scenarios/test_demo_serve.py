@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import Page, expect, sync_playwright
 
 from abbe.service.demo import demo_serve
-from abbe.service.demo.demo_serve import DRIFT_UM_PER_M, ROOM_UM, USER, served_lines
+from abbe.service.demo.demo_serve import DRIFT_UM_PER_M, MARGIN_UM, USER, service_config
 from abbe.service.errors import StoreError
 from abbe.service.storage.store import Store
 from tests.system.serve_bench import Process, require
@@ -138,7 +138,7 @@ def test_the_machine_file_of_the_demonstration_is_one(tmp_path: Path) -> None:
     urls = {"cnc": "modbus+tcp://127.0.0.1:1", "ballbar": "socket://127.0.0.1:2", "laser": "modbus+tcp://127.0.0.1:3"}
     path = write_machine_file(demo_site({"machine": doc, "fixture": "fixture+tcp://127.0.0.1:4"} | urls), tmp_path)
     with path.open("a") as out:
-        out.write(served_lines(8123, dict.fromkeys(ROOM_UM, 12.5)))
+        out.write(service_config(8123, dict.fromkeys(MARGIN_UM, 12.5)))
     machine = load_machine(path).machine
     (entry,) = machine.schedule
     assert (entry.recipe, entry.on_alarm, machine.alarm.push, machine.web.port) == ("verification", "propose", "approved", 8123)

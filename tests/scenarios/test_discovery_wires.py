@@ -14,7 +14,7 @@ import signal
 import pytest
 
 from abbe.service.demo.demo_hidden import ANEW, CAMPAIGN, run_hidden_demo
-from abbe.service.demo.demo_hidden_words import judged, story
+from abbe.service.demo.demo_hidden_text import judged, summary_lines
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.storage.store import Store
 from abbe.simulators.hidden.suite import packaged, picked
@@ -57,7 +57,7 @@ LONG = pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="a minute
 @pytest.mark.parametrize("family", NAMED)
 def test_what_a_machine_hides_is_named_and_the_model_with_it_holds_on_a_new_measurement(family, tmp_path):
     found = played(family, tmp_path / "kept")
-    said = "\n".join(story(found))
+    said = "\n".join(summary_lines(found))
     assert (found.finding.verdict, labels(found)) == ("named", [NAMED[family]]), said
     assert judged(found)[0], said
     assert book(tmp_path / "kept") == [[NAMED[family]]]
@@ -70,7 +70,7 @@ def test_what_a_machine_hides_is_named_and_the_model_with_it_holds_on_a_new_meas
 @LONG
 def test_what_no_catalogue_names_is_called_unknown_and_located(tmp_path):
     found = played("unlisted", tmp_path / "kept")
-    said = "\n".join(story(found))
+    said = "\n".join(summary_lines(found))
     assert (found.finding.verdict, labels(found)) == ("unknown", []), said
     assert found.finding.where.period_s == pytest.approx(40.0, rel=0.01), said
     assert found.finding.where.axes == ("Z",), said
@@ -83,7 +83,7 @@ def test_what_no_catalogue_names_is_called_unknown_and_located(tmp_path):
 @LONG
 def test_where_nothing_is_hidden_nothing_is_found(tmp_path):
     found = played("none", tmp_path / "kept")
-    said = "\n".join(story(found))
+    said = "\n".join(summary_lines(found))
     assert (found.finding.verdict, labels(found)) == ("none", []), said
     assert found.anew.gap.before_um < NEAR * found.anew.gap.floor_um, said
     assert judged(found)[0]
@@ -94,7 +94,7 @@ def test_where_nothing_is_hidden_nothing_is_found(tmp_path):
 def test_an_instrument_error_that_this_campaign_cannot_show_is_not_named(tmp_path):
     """4 mrad in every set-up is one scale of 8 ppm, 1.2 um of a bar of 145 mm known to 2 um: nothing may be made of it."""
     found = played("cosine", tmp_path / "kept")
-    said = "\n".join(story(found))
+    said = "\n".join(summary_lines(found))
     assert (found.finding.verdict, labels(found)) == ("none", []), said
     assert found.anew.gap.before_um < NEAR * found.anew.gap.floor_um, said
     assert book(tmp_path / "kept") == []

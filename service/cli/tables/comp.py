@@ -71,7 +71,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     known = identified(doc)
     seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
-    fresh = _fresh(solution, db, machine, said_so=without_table)
+    fresh = _fresh(solution, db, machine, confirmed_none=without_table)
     made = export(known, form, reference_of(reference), fresh=fresh)
     written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
     if seal is not None and config is not None:
@@ -146,15 +146,15 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
     return solution_document(source, stored)
 
 
-def _fresh(source: str, db: str | None, machine: Path | None, *, said_so: bool) -> bool:
+def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none: bool) -> bool:
     """Whether a solution is known to have been measured without a correction; refused where there was one."""
     from abbe.service.compensation.comp_export import solution_document
     from abbe.service.tables.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
 
     if not source.isdigit():
-        return check_fresh(tables_of(solution_document(source, lambda _: {})), no_images, said_so=said_so)
+        return check_fresh(tables_of(solution_document(source, lambda _: {})), no_images, confirmed_none=confirmed_none)
     with open_store(database_url(db, machine)) as store:
-        return check_fresh(stored_tables(store, int(source)), images_of(store), said_so=said_so)
+        return check_fresh(stored_tables(store, int(source)), images_of(store), confirmed_none=confirmed_none)
 
 
 def _machine_file(file: Path | None) -> MachineFile | None:

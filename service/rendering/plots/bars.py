@@ -27,13 +27,13 @@ def contribution_bars(
     key : str, optional
         Identifier, unique in the page.
     heading : str, optional
-        Words above the picture.
+        Heading of the picture.
     unit : Unit, optional
         What the reader sees them in.
     """
-    ranked = sorted((_seen(r, unit) for r in rows), key=lambda r: -abs(r.value_um) if finite(r.value_um) else 1.0)
-    words = "; ".join(f"{r.name} {_rounded(r)} {unit.sign}" for r in ranked)
-    svg = Svg(WIDTH, TOP + ROW * max(len(ranked), 1) + BOTTOM, key, heading, f"{heading}: {words}.")
+    ranked = sorted((_in_unit(r, unit) for r in rows), key=lambda r: -abs(r.value_um) if finite(r.value_um) else 1.0)
+    summary = "; ".join(f"{r.name} {_rounded(r)} {unit.sign}" for r in ranked)
+    svg = Svg(WIDTH, TOP + ROW * max(len(ranked), 1) + BOTTOM, key, heading, f"{heading}: {summary}.")
     svg.text((10.0, 18.0), heading, "t-head")
     ends = [abs(r.value_um) + COVERAGE * (r.u_um if finite(r.u_um) else 0.0) for r in ranked if finite(r.value_um)]
     panel = Panel(LABELS, TOP, WIDTH - LABELS - FIGURES, ROW * max(len(ranked), 1), (0.0, data_range(ends, zero=True)[1]), (0.0, 1.0))
@@ -50,7 +50,7 @@ def contribution_bars(
     return svg.render()
 
 
-def _seen(row: Contribution, unit: Unit) -> Contribution:
+def _in_unit(row: Contribution, unit: Unit) -> Contribution:
     """The same numbers in what the reader sees."""
     value, u = (v / unit.size if finite(v) else v for v in (row.value_um, row.u_um))
     return Contribution(row.name, value, u)
@@ -88,8 +88,8 @@ def uncertainty_bars(rows: Sequence[ParameterRow], *, key: str = "parameters") -
 
 
 def _one_unit(unit: str, rows: Sequence[ParameterRow], key: str) -> str:
-    words = "; ".join("{} {} ± {}".format(r.name, *with_uncertainty(r.value, r.u)) for r in rows)
-    svg = Svg(WIDTH, TOP + ROW * len(rows) + BOTTOM, key, f"Parameters in {unit}", f"Values with U (k = 2) in {unit}: {words}.")
+    summary = "; ".join("{} {} ± {}".format(r.name, *with_uncertainty(r.value, r.u)) for r in rows)
+    svg = Svg(WIDTH, TOP + ROW * len(rows) + BOTTOM, key, f"Parameters in {unit}", f"Values with U (k = 2) in {unit}: {summary}.")
     svg.text((10.0, 18.0), f"Parameters in {unit}, whiskers U (k = 2)", "t-head")
     ends = [v for r in rows if finite(r.value) and finite(r.u) for v in (r.value - COVERAGE * r.u, r.value + COVERAGE * r.u)]
     panel = Panel(LABELS, TOP, WIDTH - LABELS - 16.0, ROW * len(rows), data_range(ends, zero=True), (0.0, 1.0))

@@ -33,13 +33,13 @@ def slice_plot(found: Slice, step: float, *, key: str, heading: str) -> str:
     step : float
         Width of a colour band, µm, from `common_step`.
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     """
     low, high = float(np.nanmin(found.values)), float(np.nanmax(found.values))
-    words = f"from {plain(low)} to {plain(high)} µm, {found.at}"
-    svg = Svg(WIDTH, HEIGHT, key, heading, f"Map over a plane: {words}.")
+    summary = f"from {plain(low)} to {plain(high)} µm, {found.at}"
+    svg = Svg(WIDTH, HEIGHT, key, heading, f"Map over a plane: {summary}.")
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
+    svg.text((WIDTH / 2.0, 36.0), summary, "t-soft", anchor="middle")
     dx, dy = (0.5 * float(v[1] - v[0]) for v in (found.x_mm, found.y_mm))
     ranges = (float(found.x_mm[0]) - dx, float(found.x_mm[-1]) + dx), (float(found.y_mm[0]) - dy, float(found.y_mm[-1]) + dy)
     panel = Panel(LEFT, TOP, WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, *ranges)

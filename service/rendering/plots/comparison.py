@@ -39,12 +39,12 @@ def comparison_plot(data: Comparison, *, key: str, heading: str) -> str:
     ----------
     data : Comparison
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     """
     apart = data.readings_um - data.lines[0][1]
     size = np.abs(apart)
-    words = f"{data.name} − {data.lines[0][0]}: largest {plain(float(size.max()))} µm, mean size {plain(float(size.mean()))} µm"
-    svg = Svg(WIDTH, TOP + UPPER + GAP + LOWER + BOTTOM, key, heading, words)
+    summary = f"{data.name} − {data.lines[0][0]}: largest {plain(float(size.max()))} µm, mean size {plain(float(size.mean()))} µm"
+    svg = Svg(WIDTH, TOP + UPPER + GAP + LOWER + BOTTOM, key, heading, summary)
     svg.text((LEFT, 18.0), heading, "t-head")
     svg.dot((LEFT + 8.0, 38.0), 3.5, "f-c1")
     svg.text((LEFT + 18.0, 42.0), data.name, "t-small")
@@ -68,5 +68,5 @@ def comparison_plot(data: Comparison, *, key: str, heading: str) -> str:
         svg.dot(lower.at(float(a), float(d)), 3.5, "f-c1", tip)
     upper.draw_frame(svg)
     lower.draw_frame(svg)
-    svg.text((LEFT + width, lower.top - 8.0), words, "t-small", anchor="end")
+    svg.text((LEFT + width, lower.top - 8.0), summary, "t-small", anchor="end")
     return svg.render()

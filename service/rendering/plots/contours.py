@@ -30,15 +30,17 @@ def contour_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str
     scale : SignedScale
         Bands of the colours and levels of the lines; zero is drawn stronger.
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     dots : sequence of points, optional
         Places to mark, in the coordinates of the axes.
     """
     low, high = extremes(surface.values.ravel())
-    words = f"from {plain(low)} to {plain(high)} {surface.unit}"
-    svg = Svg(WIDTH, HEIGHT, key, heading, f"Level lines over a plane: {words}.")
+    summary = f"from {plain(low)} to {plain(high)} {surface.unit}"
+    svg = Svg(WIDTH, HEIGHT, key, heading, f"Level lines over a plane: {summary}.")
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), f"{words}; one line every {tick_text(scale.step, scale.step)} {surface.unit}", "t-soft", anchor="middle")
+    svg.text(
+        (WIDTH / 2.0, 36.0), f"{summary}; one line every {tick_text(scale.step, scale.step)} {surface.unit}", "t-soft", anchor="middle"
+    )
     ranges = (float(surface.x[0]), float(surface.x[-1])), (float(surface.y[0]), float(surface.y[-1]))
     panel = Panel(LEFT, TOP, WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, *ranges)
     panel.draw_x(svg, surface.x_label)

@@ -27,15 +27,15 @@ def deformed_grid(grid_mm: Array, deviation_um: Array, *, key: str, heading: str
     grid_mm, deviation_um : arrays, shape (nx, ny, nz, 3)
         Nodes and actual minus nominal there.
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     """
     longest = float(np.linalg.norm(deviation_um, axis=3).max())
     low, high = grid_mm[0, 0, 0], grid_mm[-1, -1, -1]
     magnified = round_down(SHARE * float(np.linalg.norm(high - low)) / (longest * 1e-3)) if longest > 0.0 else 1.0
-    words = f"longest {plain(longest)} µm; errors drawn {tidy(magnified)} ×"
-    svg = Svg(WIDTH, HEIGHT, key, heading, f"Isometric view of a nominal grid and the same grid with its errors: {words}.")
+    summary = f"longest {plain(longest)} µm; errors drawn {tidy(magnified)} ×"
+    svg = Svg(WIDTH, HEIGHT, key, heading, f"Isometric view of a nominal grid and the same grid with its errors: {summary}.")
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
+    svg.text((WIDTH / 2.0, 36.0), summary, "t-soft", anchor="middle")
     actual = grid_mm + deviation_um * 1e-3 * magnified
     paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, 232.0), WIDTH - 170.0, HEIGHT - 200.0))
     for nodes, style in ((grid_mm, "hidden-edge"), (actual, "s-c2")):

@@ -32,8 +32,8 @@ def diagonal_plot(before: Curves, after: Curves, *, key: str = "diagonals") -> s
     names = list(dict.fromkeys([*before, *after]))
     rows = max(1, math.ceil(len(names) / COLUMNS))
     height = TOP + rows * CELL_HEIGHT + (rows - 1) * GAP + BOTTOM
-    words = "; ".join(f"{n}: range {_spread(before, n)} before, {_spread(after, n)} after" for n in names)
-    svg = Svg(WIDTH, height, key, "Body diagonals", f"Deviation along the body diagonals. {words}.")
+    summary = "; ".join(f"{n}: range {_spread(before, n)} before, {_spread(after, n)} after" for n in names)
+    svg = Svg(WIDTH, height, key, "Body diagonals", f"Deviation along the body diagonals. {summary}.")
     svg.legend((LEFT, 18.0), [("s-c1 dash", "before correction"), ("s-c2", "after correction")])
     everything = [float(v) for curves in (before, after) for _, y in curves.values() for v in y]
     y_range = data_range(everything, zero=True)

@@ -65,13 +65,13 @@ def surface_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str
     scale : SignedScale
         Shared by all pictures that are to be compared; the height of the box is its whole range.
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     """
     low_value, high_value = extremes(surface.values.ravel())
-    words = f"from {plain(low_value)} to {plain(high_value)} {surface.unit}"
-    svg = Svg(WIDTH, HEIGHT, key, heading, f"Surface over a plane: {words}.")
+    summary = f"from {plain(low_value)} to {plain(high_value)} {surface.unit}"
+    svg = Svg(WIDTH, HEIGHT, key, heading, f"Surface over a plane: {summary}.")
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
+    svg.text((WIDTH / 2.0, 36.0), summary, "t-soft", anchor="middle")
     low, high = np.array([0.0, 0.0, FLOOR]), np.array([1.0, 1.0, ROOF])
     paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, 206.0), WIDTH - 120.0, HEIGHT - 150.0))
     top = 4.0 * scale.step
@@ -98,10 +98,10 @@ def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scal
     """
     low_value, high_value = extremes(values.ravel())
     relief = 0.22 / (4.0 * scale.step)
-    words = f"from {plain(low_value)} to {plain(high_value)} µm; {tidy(4.0 * scale.step)} µm drawn as 22 % of the radius"
-    svg = Svg(WIDTH, HEIGHT, key, heading, f"Probe error as relief on a hemisphere: {words}.")
+    summary = f"from {plain(low_value)} to {plain(high_value)} µm; {tidy(4.0 * scale.step)} µm drawn as 22 % of the radius"
+    svg = Svg(WIDTH, HEIGHT, key, heading, f"Probe error as relief on a hemisphere: {summary}.")
     svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), words, "t-soft", anchor="middle")
+    svg.text((WIDTH / 2.0, 36.0), summary, "t-soft", anchor="middle")
     paper = Paper.around(
         np.array([-0.95, -0.95, 0.0]), np.array([0.95, 0.95, 1.0]), ViewWindow((WIDTH / 2.0, 208.0), WIDTH - 130.0, HEIGHT - 110.0)
     )

@@ -30,8 +30,8 @@ def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
         for label, r in runs.items()
         if r.rms_before_um is not None and r.rms_after_um is not None
     ]
-    words = "; ".join(f"{label} {plain(before)} to {plain(after)} µm, noise {plain(r.floor_um)} µm" for label, r, before, after in rows)
-    svg = Svg(WIDE, TOP + ROW * max(len(rows), 1) + BOTTOM, key, "Gap of every run before and after", words or "no run was judged")
+    summary = "; ".join(f"{label} {plain(before)} to {plain(after)} µm, noise {plain(r.floor_um)} µm" for label, r, before, after in rows)
+    svg = Svg(WIDE, TOP + ROW * max(len(rows), 1) + BOTTOM, key, "Gap of every run before and after", summary or "no run was judged")
     svg.text((10.0, 18.0), "rms of measured minus simulated, every run", "t-head")
     svg.legend((LABELS, 38.0), [("s-c1", "before"), ("s-c2", "after"), ("band-edge", "noise floor")])
     values = [v for _, r, before, after in rows for v in (before, after, r.floor_um)]

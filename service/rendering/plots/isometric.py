@@ -84,11 +84,11 @@ def label_edges(svg: Svg, paper: Paper, low: F2, high: F2) -> None:
     )
     for axis, (point, shift, anchor) in enumerate(spots):
         x, y = paper(point)
-        words = f"{'XYZ'[axis]} {tidy(float(low[axis]))} … {tidy(float(high[axis]))}"
+        label = f"{'XYZ'[axis]} {tidy(float(low[axis]))} … {tidy(float(high[axis]))}"
         if axis == 2:
-            svg.text((x - 22.0, y), f"{words} mm", "t-soft t-halo", anchor="middle", turn=-90.0)
+            svg.text((x - 22.0, y), f"{label} mm", "t-soft t-halo", anchor="middle", turn=-90.0)
         else:
-            svg.text((x + shift[0], y + shift[1]), f"{words} mm", "t-soft t-halo", anchor=anchor)
+            svg.text((x + shift[0], y + shift[1]), f"{label} mm", "t-soft t-halo", anchor=anchor)
 
 
 def round_down(value: float) -> float:

@@ -25,11 +25,11 @@ def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str
     rows : sequence of MotionShare
         In the order in which they are drawn.
     key, heading : str, optional
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     """
     kept = [r.name for r in rows if r.status == "observed"]
-    words = f"{len(kept)} of {len(rows)} may stand in a table of their own: {', '.join(kept) or 'none'}"
-    svg = Svg(WIDTH, TOP + ROW * max(len(rows), 1) + BOTTOM, key, heading, f"{heading}: {words}.")
+    summary = f"{len(kept)} of {len(rows)} may stand in a table of their own: {', '.join(kept) or 'none'}"
+    svg = Svg(WIDTH, TOP + ROW * max(len(rows), 1) + BOTTOM, key, heading, f"{heading}: {summary}.")
     svg.text((10.0, 18.0), heading, "t-head")
     svg.text((10.0, 38.0), f"{len(kept)} of {len(rows)} may stand in a table of their own", "t-soft")
     panel = Panel(LABELS, TOP, WIDTH - LABELS - WORDS, ROW * max(len(rows), 1), (0.0, 100.0), (0.0, 1.0))
@@ -53,7 +53,7 @@ def gain_map(found: Slice, *, key: str, heading: str = "Noise gain") -> str:
     found : Slice
         ``values`` without unit; finer than ten nodes a side looks smooth.
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     """
     labels = (f"{found.x_axis} in mm", f"{found.y_axis} in mm")
     surface = Surface(found.x_mm, found.y_mm, found.values, *labels, "µm per µm")

@@ -20,8 +20,8 @@ STYLES = ("s-c1 dash", "s-c2", "s-c3", "s-c4")
 def overlay_plot(curves: Sequence[tuple[str, Array, Array]], *, key: str, heading: str, labels: tuple[str, str], unit: Unit = UM) -> str:
     """Up to four curves (name, abscissa, µm) on one scale; ``labels``: of both axes; ``unit``: what the reader sees the µm in."""
     curves = [(name, x, y / unit.size) for name, x, y in curves]
-    words = "; ".join(f"{name}: {plain(float(y.min()))} … {plain(float(y.max()))} {unit.sign}" for name, _, y in curves)
-    svg = Svg(WIDTH, HEIGHT, key, heading, f"{heading}. {words}.")
+    summary = "; ".join(f"{name}: {plain(float(y.min()))} … {plain(float(y.max()))} {unit.sign}" for name, _, y in curves)
+    svg = Svg(WIDTH, HEIGHT, key, heading, f"{heading}. {summary}.")
     svg.text((LEFT, 18.0), heading, "t-head")
     panel = _panel([x for _, x, _ in curves], [y for _, _, y in curves])
     panel.draw_y(svg, labels[1])

@@ -31,14 +31,14 @@ def paired_bars(pairs: Sequence[Pair], names: tuple[str, str], *, key: str, head
     names : tuple of str
         What the first and the second bar of each pair are.
     key, heading : str
-        Identifier, unique in the page; words above the picture.
+        Identifier, unique in the page; heading of the picture.
     unit : Unit, optional
         What the reader sees them in.
     """
-    pairs = [Pair(p.name, _seen(p.first, unit), _seen(p.second, unit)) for p in pairs]
+    pairs = [Pair(p.name, _in_unit(p.first, unit), _in_unit(p.second, unit)) for p in pairs]
     sides = [side for p in pairs for side in (p.first, p.second) if side is not None]
-    words = "; ".join(f"{p.name}: {_words(p.first, unit)}, {_words(p.second, unit)}" for p in pairs)
-    svg = Svg(WIDTH, TOP + ROW * len(pairs) + BOTTOM, key, heading, f"{heading}; {names[0]}, {names[1]}: {words}.")
+    summary = "; ".join(f"{p.name}: {_words(p.first, unit)}, {_words(p.second, unit)}" for p in pairs)
+    svg = Svg(WIDTH, TOP + ROW * len(pairs) + BOTTOM, key, heading, f"{heading}; {names[0]}, {names[1]}: {summary}.")
     svg.text((10.0, 18.0), heading, "t-head")
     for k, name in enumerate(names):
         svg.rect((LABELS + k * 200.0, 30.0), (14.0, 12.0), STYLES[k])
@@ -64,7 +64,7 @@ def _bar(svg: Svg, panel: Panel, side: tuple[float, float], y: float, style: str
         svg.error_bar((0.5 * (low + high), y), 0.5 * (high - low), horizontal=True)
 
 
-def _seen(side: tuple[float, float] | None, unit: Unit) -> tuple[float, float] | None:
+def _in_unit(side: tuple[float, float] | None, unit: Unit) -> tuple[float, float] | None:
     return None if side is None else (side[0] / unit.size, side[1] / unit.size)
 
 

@@ -25,14 +25,14 @@ def polar_plot(traces: Sequence[PolarTrace], *, key: str = "polar", heading: str
     key : str, optional
         Identifier, unique in the page.
     heading : str, optional
-        Words above the picture.
+        Heading of the picture.
     unit : Unit, optional
         What the reader sees the deviation in.
     """
     seen = [[float(v) / unit.size for v in t.deviation_um] for t in traces]
     low, high = data_range((v for values in seen for v in values), zero=True)
-    words = "; ".join(f"{t.label}: {_extremes(values, unit)}" for t, values in zip(traces, seen, strict=True)) or "no data"
-    svg = Svg(SIZE, SIZE + 30.0, key, heading, f"Polar plot of the radial deviation. {words}.")
+    summary = "; ".join(f"{t.label}: {_extremes(values, unit)}" for t, values in zip(traces, seen, strict=True)) or "no data"
+    svg = Svg(SIZE, SIZE + 30.0, key, heading, f"Polar plot of the radial deviation. {summary}.")
     svg.text((CENTRE[0], 18.0), heading, "t-head", anchor="middle")
     _draw_rings(svg, low, high, unit)
     for trace, values, style in zip(traces, seen, STYLES, strict=False):

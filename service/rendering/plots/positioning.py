@@ -59,5 +59,5 @@ def positioning_plot(curves: PositioningCurves, *, key: str, figures: str = "") 
                 # The two directions side by side, or one would hide the other.
                 svg.error_bar((at[0] + (3.0 if k else -3.0), at[1]), float(panel.y(0.0) - panel.y(float(half))), cap=2.5)
     panel.draw_frame(svg)
-    svg.legend((66.0, HEIGHT - 8.0), [(f"s-{role}" + (" dash" if k else ""), words) for k, (_, _, role, words) in enumerate(sides)])
+    svg.legend((66.0, HEIGHT - 8.0), [(f"s-{role}" + (" dash" if k else ""), name) for k, (_, _, role, name) in enumerate(sides)])
     return svg.render()

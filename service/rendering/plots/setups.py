@@ -31,8 +31,8 @@ def setups_picture(stroke_mm: F2, paths: Sequence[DrawnTest], *, key: str = "set
         In the order of measuring.
     """
     count = len({p.number for p in paths})
-    words = "; ".join(f"{p.number}: {p.words}" for p in paths)
-    svg = Svg(WIDTH, HEIGHT, key, f"{count} set-ups in the machine's volume", words)
+    summary = "; ".join(f"{p.number}: {p.text}" for p in paths)
+    svg = Svg(WIDTH, HEIGHT, key, f"{count} set-ups in the machine's volume", summary)
     low, high = stroke_mm[:, 0], stroke_mm[:, 1]
     paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, HEIGHT / 2.0 - 14.0), WIDTH - 150.0, HEIGHT - 130.0))
     draw_box(svg, paper, low, high)
@@ -43,7 +43,7 @@ def setups_picture(stroke_mm: F2, paths: Sequence[DrawnTest], *, key: str = "set
         svg.polyline([paper(point) for point in (*thinned, path.path_mm[-1])], f"s-{STYLES[path.kind]} thin")
     for path in {p.number: p for p in reversed(paths)}.values():
         x, y = paper(path.mount_mm)
-        svg.dot((x, y), 4.0, f"f-{STYLES[path.kind]}", path.words)
+        svg.dot((x, y), 4.0, f"f-{STYLES[path.kind]}", path.text)
         svg.text((x + 7.0, y - 5.0), path.number, "t-head t-halo")
     label_edges(svg, paper, low, high)
     used = [k for k in STYLES if any(p.kind == k for p in paths)]

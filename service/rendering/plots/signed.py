@@ -46,8 +46,8 @@ class SignedScale:
         for band in range(BANDS):
             svg.rect((x + band * cell, y), (cell, 9.0), f"f-d{band + 1}")
         for edge in range(BANDS + 1):
-            words = tick_text((edge - HALF) * self.step, self.step)
-            svg.text((x + edge * cell, y + 23.0), words + (f" {unit}" if edge == BANDS else ""), "t-small", anchor="middle")
+            label = tick_text((edge - HALF) * self.step, self.step)
+            svg.text((x + edge * cell, y + 23.0), label + (f" {unit}" if edge == BANDS else ""), "t-small", anchor="middle")
 
 
 def extremes(values: Iterable[float]) -> tuple[float, float]:

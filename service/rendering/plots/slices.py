@@ -32,17 +32,17 @@ class SlicePlane:
     grid_mm: Array
     deviation_um: Array
     expanded_um: Array
-    told: NDArray[np.bool_]
+    significant: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class SliceTexts:
     """What the picture says, in the reader's language; places and errors in the reader's units."""
 
     heading: str
     nominal: str
     actual: str
-    untold: str
+    uncertain: str
     magnified: str
     place: Unit = MM
     error: Unit = UM
@@ -62,10 +62,10 @@ def magnification(span_mm: float, longest_um: float) -> float:
     return round_down(0.1 * span_mm / (longest_um * 1e-3)) if longest_um > 0.0 and span_mm > 0.0 else 1.0
 
 
-def slice_plot(data: SlicePlane, top: float, magnified: float, words: Words, *, key: str = "slice") -> str:
+def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts, *, key: str = "slice") -> str:
     """One plane. ``top``: upper end of the colours in the reader's unit; ``magnified``: mm drawn per mm of error."""
     across, up, _ = PLANES[data.plane]
-    grid = data.grid_mm / words.place.size
+    grid = data.grid_mm / texts.place.size
     low, high = grid[0, 0], grid[-1, -1]
     size = max(float(high[across] - low[across]), float(high[up] - low[up]))
     pad = MARGIN * size
@@ -73,35 +73,35 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, words: Words, *, 
     width, height = (float(high[a] - low[a] + 2.0 * pad) * scale for a in (across, up))
     ranges = [(float(low[a] - pad), float(high[a] + pad)) for a in (across, up)]
     panel = Panel(LEFT, TOP, width, height, ranges[0], ranges[1])
-    length = np.linalg.norm(data.deviation_um, axis=2) / words.error.size
-    sizes = f"{words.heading}: {plain(float(length.min()))} … {plain(float(length.max()))} {words.error.sign}"
-    svg = Svg(WIDTH, TOP + height + BOTTOM, key, words.heading, sizes)
-    svg.text((LEFT, 18.0), words.heading, "t-head")
-    svg.text((LEFT, 36.0), words.magnified, "t-soft")
-    panel.draw_x(svg, f"{'XYZ'[across]} {words.place.sign}", count=5)
-    panel.draw_y(svg, f"{'XYZ'[up]} {words.place.sign}", count=5)
-    actual = grid + data.deviation_um * 1e-3 * magnified / words.place.size
-    known = np.where(data.told[..., None], actual, np.nan)  # a line breaks where its course is unknown
+    length = np.linalg.norm(data.deviation_um, axis=2) / texts.error.size
+    sizes = f"{texts.heading}: {plain(float(length.min()))} … {plain(float(length.max()))} {texts.error.sign}"
+    svg = Svg(WIDTH, TOP + height + BOTTOM, key, texts.heading, sizes)
+    svg.text((LEFT, 18.0), texts.heading, "t-head")
+    svg.text((LEFT, 36.0), texts.magnified, "t-soft")
+    panel.draw_x(svg, f"{'XYZ'[across]} {texts.place.sign}", count=5)
+    panel.draw_y(svg, f"{'XYZ'[up]} {texts.place.sign}", count=5)
+    actual = grid + data.deviation_um * 1e-3 * magnified / texts.place.size
+    known = np.where(data.significant[..., None], actual, np.nan)  # a line breaks where its course is unknown
     for nodes, style in ((grid, "hidden-edge"), (known, "s-c2 thin")):
         for line in (*nodes, *np.swapaxes(nodes, 0, 1)):
             svg.polyline([panel.at(float(p[across]), float(p[up])) for p in line], style)
-    _arrows(svg, panel, data, (grid, actual), top, words)
+    _arrows(svg, panel, data, (grid, actual), top, texts)
     panel.draw_frame(svg)
-    _key(svg, TOP + height + 62.0, top, words)
+    _key(svg, TOP + height + 62.0, top, texts)
     return svg.render()
 
 
-def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array], top: float, words: Words) -> None:
+def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array], top: float, texts: SliceTexts) -> None:
     """From the first ends to the second."""
     across, up, _ = PLANES[data.plane]
-    (grid, actual), unit = ends, words.error
-    for index in np.ndindex(data.told.shape):
+    (grid, actual), unit = ends, texts.error
+    for index in np.ndindex(data.significant.shape):
         node, error, expanded = grid[index], data.deviation_um[index] / unit.size, float(data.expanded_um[index]) / unit.size
         foot = panel.at(float(node[across]), float(node[up]))
         length = float(np.linalg.norm(error))
-        place = ", ".join(placed(float(v), words.place) for v in data.grid_mm[index])
-        tip = f"({place}) {words.place.sign}: {plain(length)} {unit.sign}, U = {plain(expanded, 2)} {unit.sign}"
-        if not data.told[index]:
+        place = ", ".join(placed(float(v), texts.place) for v in data.grid_mm[index])
+        tip = f"({place}) {texts.place.sign}: {plain(length)} {unit.sign}, U = {plain(expanded, 2)} {unit.sign}"
+        if not data.significant[index]:
             svg.circle(foot, 4.0, "frame")
             svg.dot(foot, 0.0, "key-head", tip)
             continue
@@ -109,16 +109,16 @@ def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array],
         svg.arrow(foot, panel.at(float(actual[index][across]), float(actual[index][up])), f"seq{colour}", tip)
 
 
-def _key(svg: Svg, y: float, top: float, words: Words) -> None:
+def _key(svg: Svg, y: float, top: float, texts: SliceTexts) -> None:
     """Colours with their numbers, and what the lines mean."""
     cell, step = 52.0, top / SEQUENCE
     for i in range(SEQUENCE):
         svg.rect((LEFT + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
         svg.text((LEFT + i * cell, y + 23.0), tidy(i * step), "t-small", anchor="middle")
-    svg.text((LEFT + SEQUENCE * cell, y + 23.0), f"{tidy(top)} {words.error.sign}", "t-small", anchor="middle")
+    svg.text((LEFT + SEQUENCE * cell, y + 23.0), f"{tidy(top)} {texts.error.sign}", "t-small", anchor="middle")
     svg.circle((LEFT + SEQUENCE * cell + 56.0, y + 4.0), 4.0, "frame")
-    svg.text((LEFT + SEQUENCE * cell + 66.0, y + 9.0), words.untold, "t-small")
-    svg.legend((LEFT, y + 40.0), [("hidden-edge", words.nominal), ("s-c2", words.actual)])
+    svg.text((LEFT + SEQUENCE * cell + 66.0, y + 9.0), texts.uncertain, "t-small")
+    svg.legend((LEFT, y + 40.0), [("hidden-edge", texts.nominal), ("s-c2", texts.actual)])
 
 
 def steps(top: float) -> list[str]:

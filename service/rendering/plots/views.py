@@ -33,7 +33,7 @@ class DrawnTest:
     number : int
         Its place in the campaign, or its set-up's, from 1.
     kind : "bar", "laser", "line" or "diagonal"
-    words : str
+    text : str
         What it is; shown when the pointer rests on it.
     path_mm : array, shape (n, 3)
         Commanded positions, in order.
@@ -47,7 +47,7 @@ class DrawnTest:
 
     number: int
     kind: str
-    words: str
+    text: str
     path_mm: F2
     mount_mm: F1
     radius_mm: float = 0.0
@@ -66,8 +66,8 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
     unit : Unit, optional
         What the reader sees places in.
     """
-    words = "; ".join(f"{t.number}: {t.words}" for t in tests)
-    svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", words)
+    summary = "; ".join(f"{t.number}: {t.text}" for t in tests)
+    svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", summary)
     size = float((stroke_mm[:, 1] - stroke_mm[:, 0]).max()) * 1.04
     for (a, b, title), corner in zip(VIEWS, CORNERS, strict=True):
         middle = stroke_mm.mean(axis=1)
@@ -82,7 +82,7 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
         for test in tests:
             if test.mounts:
                 x, y = panel.at(test.mount_mm[a], test.mount_mm[b])
-                svg.dot((x, y), 4.0, f"f-{STYLES[test.kind]}", test.words)
+                svg.dot((x, y), 4.0, f"f-{STYLES[test.kind]}", test.text)
                 svg.text((x + 6.0, y - 5.0), test.number, "t-head t-halo")
     names = {"bar": "ball-bar: path, its bar, cup", "laser": "laser: path, where it starts"}
     used = [k for k in STYLES if any(t.kind == k for t in tests)]

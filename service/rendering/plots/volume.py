@@ -57,7 +57,7 @@ def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: st
     key : str
         Identifier, unique in the page.
     heading : str
-        Words above the picture.
+        Heading of the picture.
     """
     lengths = _lengths(field)
     good = lengths[np.isfinite(lengths)]

@@ -15,7 +15,7 @@ from abbe.service.domain.results import SolutionRecord
 from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import NodeMap, StoredField, node_map, stored_field
 from abbe.service.rendering.numbers import placed, tidy
-from abbe.service.rendering.plots.slices import PLANES, SlicePlane, Words, colour_top, magnification, slice_plot, steps
+from abbe.service.rendering.plots.slices import PLANES, SlicePlane, SliceTexts, colour_top, magnification, slice_plot, steps
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 
@@ -97,7 +97,7 @@ def _screen(stored: StoredField, campaign: str, asked: VolumeQuery, found: NodeM
     length, top = found.length_um, colour_top(found.length_um / error.size)
     magnified = magnification(float(stored.known.machine.length_mm.max()), float(length.max()))
     level = placed(float(levels[at]), place)
-    words = Words(
+    words = SliceTexts(
         say("volume.slice", plane=asked.plane, axis="XYZ"[third], at=level, unit=place.sign), say("volume.nominal"), say("volume.actual"),
         say("volume.untold_key"), say("volume.magnified", n=tidy(magnified)), place, error,
     )  # fmt: skip

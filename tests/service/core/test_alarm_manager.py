@@ -38,7 +38,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
-from abbe.service.tables.push_journal import JournalView, put_right
+from abbe.service.tables.push_journal import JournalView, reconciled
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
@@ -367,8 +367,8 @@ async def test_a_push_before_this_one_says_nothing_of_it(bench: Bench) -> None:
     bench.push = push
     assert (await bench.pushed())[0] == "failed"
     journal, heard = JournalView.read(bench.store, "mill-7"), JobOutcome("failed", "")
-    assert put_right(journal.of_proposal(4), heard).word == "kept"
-    assert put_right(journal.of_proposal(5), heard).word == "failed"
+    assert reconciled(journal.of_proposal(4), heard).word == "kept"
+    assert reconciled(journal.of_proposal(5), heard).word == "failed"
 
 
 async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from abbe.service.cli import run
 from abbe.service.cli.papers import show
 from abbe.service.papers.run import results
-from abbe.service.papers.words import lines
+from abbe.service.papers.text import lines
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 

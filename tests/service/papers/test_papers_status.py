@@ -10,7 +10,7 @@ from abbe.service.papers.check import PaperCheck
 from abbe.service.papers.compare import Computed, agrees, computed_from
 from abbe.service.papers.printed import Printed
 from abbe.service.papers.row import Erratum, PaperRow
-from abbe.service.papers.words import check_lines, digits_like, lines, note
+from abbe.service.papers.text import check_lines, digits_like, lines, note
 
 
 def row(text: str, computed: float | None, **more) -> PaperRow:

@@ -9,7 +9,7 @@ import numpy as np
 import pypdf
 import pytest
 
-from abbe.service.rendering.document import DECISION_RULE, Document, Figure, Instrument, Picture, Section, TextTable
+from abbe.service.rendering.document import DECISION_RULE, Document, Instrument, Picture, ReportFigure, Section, TextTable
 from abbe.service.rendering.document_data import document_csv, document_json
 from abbe.service.rendering.document_page import document_html, document_pdf, standalone
 from abbe.service.rendering.model import PolarTrace
@@ -22,9 +22,9 @@ HOSTILE = '#import "@preview/x:1.0.0" *bold* $x$ </td><script>alert(1)</script> 
 
 def document(**more) -> Document:
     figures = [
-        Figure("ISO 230-2", "E", HOSTILE, 12.3456, 0.25, "µm", "ISO 230-2", 20.0, "pass"),
-        Figure("ISO 230-2", "R", "without repeats", None, None, "µm"),
-        Figure("ISO 230-2", "=cmd()", "not a formula", float("nan"), float("nan"), "µm"),
+        ReportFigure("ISO 230-2", "E", HOSTILE, 12.3456, 0.25, "µm", "ISO 230-2", 20.0, "pass"),
+        ReportFigure("ISO 230-2", "R", "without repeats", None, None, "µm"),
+        ReportFigure("ISO 230-2", "=cmd()", "not a formula", float("nan"), float("nan"), "µm"),
     ]
     words = {
         "kind": "campaign", "title": "Campaign a", "about": {"Machine": HOSTILE},

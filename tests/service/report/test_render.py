@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from abbe.service.rendering.document import Document, Facts, Figure, Instrument, Lines, Picture, Section, TextTable
+from abbe.service.rendering.document import Document, Facts, Instrument, Lines, Picture, ReportFigure, Section, TextTable
 from abbe.service.rendering.document_page import document_html
 from abbe.service.rendering.model import ArrowField, Contribution, ParameterRow, PolarTrace, ResidualSeries, TableCurve
 from abbe.service.rendering.plots import contribution_bars, diagonal_plot, polar_plot, table_plot, volume_pair
@@ -140,7 +140,7 @@ def test_hostile_words_stay_words(minimal_report: Document) -> None:
         verdict=("open", HOSTILE, HOSTILE),
         remarks=[HOSTILE],
         sections=[Section(HOSTILE, [*words, Section(HOSTILE, words, folded=True)]), Section("P", pictures)],
-        figures=[Figure(HOSTILE, HOSTILE, HOSTILE, 1.0, 0.1, HOSTILE, HOSTILE)],
+        figures=[ReportFigure(HOSTILE, HOSTILE, HOSTILE, 1.0, 0.1, HOSTILE, HOSTILE)],
         statements=[HOSTILE],
         not_observable=[HOSTILE],
         instruments=[Instrument(HOSTILE, HOSTILE, HOSTILE)],
@@ -179,9 +179,9 @@ def test_missing_numbers_are_named_not_drawn(minimal_report: Document) -> None:
         run_table(runs),
     ]
     figures = [
-        Figure("g", "a", "missing", nan, 1.0, "µm"),
-        Figure("g", "b", "not known", 1.0, inf, "µm"),
-        Figure("g", "c", "none", None, None, ""),
+        ReportFigure("g", "a", "missing", nan, 1.0, "µm"),
+        ReportFigure("g", "b", "not known", 1.0, inf, "µm"),
+        ReportFigure("g", "c", "none", None, None, ""),
     ]
     report = dataclasses.replace(minimal_report, sections=[Section("s", [*blocks, Picture("c", pictures)])], figures=figures)
     page = document_html(report)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from abbe.service.rendering.document import Figure
+from abbe.service.rendering.document import ReportFigure
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.compare_runs import LoadedRun, against, curve, difference, figure_rows, remarks
 
@@ -66,7 +66,7 @@ def test_a_difference_of_figures_counts_both_uncertainties(second: float, u: flo
             one.machine,
             one.run,
             one.data,
-            [Figure("g", "G", "circular deviation", value, own, "µm"), Figure("g", "n", "", 1, None, "")],
+            [ReportFigure("g", "G", "circular deviation", value, own, "µm"), ReportFigure("g", "n", "", 1, None, "")],
         )
 
     [row] = figure_rows([of(10.0, 1.0), of(second, u)])

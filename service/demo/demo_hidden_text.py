@@ -15,20 +15,20 @@ from abbe.service.rendering.numbers import plain
 FORMAT = "abbe-hidden-demo/1"
 
 
-def story(result: HiddenDemo) -> list[str]:
+def summary_lines(result: HiddenDemo) -> list[str]:
     """What happened, one line a thing to know, in the order in which it happened."""
     finding = result.finding
     _, word, text = verdict_of(finding)
     lines = [f"measured: {len(finding.runs)} runs, {sum(r.readings for r in finding.runs.values())} readings"]
     lines += [f"{word}. {text}"]
-    lines += [f"{role} runs: {_gap_words(g)}" for role, g in finding.gaps.items()]
+    lines += [f"{role} runs: {_gap_text(g)}" for role, g in finding.gaps.items()]
     for effect in finding.effects:
         lines += effect_lines(effect)
     lines += next_of(finding) + _model(result) + _anew(result) + _tables(result)
     return [*lines, *truth_lines(result)]
 
 
-def _gap_words(gap: GapUm) -> str:
+def _gap_text(gap: GapUm) -> str:
     return f"gap {plain(gap.before_um)} -> {plain(gap.after_um)} µm rms, {plain(gap.floor_um)} µm is noise"
 
 
@@ -42,8 +42,8 @@ def _model(result: HiddenDemo) -> list[str]:
 def _anew(result: HiddenDemo) -> list[str]:
     if result.anew is None:
         return []
-    runs = [f"  {label}: {_gap_words(r)}" for label, r in result.anew.runs.items()]
-    return [f"measured anew at places that no fit has used, later: {_gap_words(result.anew.gap)}", *runs]
+    runs = [f"  {label}: {_gap_text(r)}" for label, r in result.anew.runs.items()]
+    return [f"measured anew at places that no fit has used, later: {_gap_text(result.anew.gap)}", *runs]
 
 
 def _tables(result: HiddenDemo) -> list[str]:
@@ -98,12 +98,12 @@ def truth_lines(result: HiddenDemo) -> list[str]:
 def hidden_json(result: HiddenDemo) -> dict[str, Any]:
     """What `abbe demo --hidden SEED --json` prints."""
     finding, c = result.finding, result.correction
-    told = ("label", "name", "key", "strength", "u_strength", "unit", "remedy", "remedy_text")
+    fields = ("label", "name", "key", "strength", "u_strength", "unit", "remedy", "remedy_text")
     right, text = judged(result)
     doc: dict[str, Any] = {
         "format": FORMAT,
         "verdict": finding.verdict,
-        "effects": [{k: getattr(e, k) for k in told} for e in finding.effects],
+        "effects": [{k: getattr(e, k) for k in fields} for e in finding.effects],
         "where": where_doc(finding.where),
         "gaps": {role: asdict(gap) for role, gap in finding.gaps.items()},
         "model_version": None if result.journal is None else result.journal.version,

@@ -14,7 +14,7 @@ from abbe.service.verification.verified_by import VerifiedBy, verified_by
 NOT_JUDGED = "Not judged"
 
 
-def of_then(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[dict[str, Any]]) -> Document:
+def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[dict[str, Any]]) -> Document:
     """The report, and where its table is not the one in force now, that: as headline if nothing has measured the machine since.
 
     Parameters
