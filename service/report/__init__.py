@@ -1,1 +1,1 @@
-"""What the report of a run, campaign, solution, discovery, verification or push says."""
+"""Contents of the reports of runs, campaigns, solutions, discoveries, verifications and pushes."""

@@ -39,7 +39,7 @@ class SummaryRow:
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """One run of a solution: rms of its residuals, and the rms that its noise lets expect, µm."""
+    """One run of a solution: rms of its residuals, and the rms expected from its noise, µm."""
 
     label: str
     test: str
@@ -57,7 +57,7 @@ def stated(value: float | None, u: float | None) -> str:
 
 
 def summary_table(rows: Sequence[SummaryRow]) -> TextTable:
-    """Figures before and after."""
+    """Table of figures before and after."""
     head = ("Figure", "Before", "After", "Unit", "Smaller by", "Source")
     return TextTable(head, [(r.name, stated(r.before, r.u_before), stated(r.after, r.u_after), r.unit, _times(r), r.source) for r in rows])
 
@@ -67,13 +67,13 @@ def _times(row: SummaryRow) -> str:
 
 
 def parameter_table(rows: Sequence[ParameterRow]) -> TextTable:
-    """Parameters with U."""
+    """Table of parameters with U."""
     cells = [(r.name, *with_uncertainty(r.value, r.u), r.unit, r.note) for r in rows]
     return TextTable(("Parameter", "Value", U_OF, "Unit", "Note"), cells)
 
 
 def parameter_pictures(rows: Sequence[ParameterRow], ranked: Sequence[Contribution]) -> list[Block]:
-    """What contributes most, and how well each parameter of the machine is known."""
+    """Pictures of the largest contributions and of the uncertainty of each machine parameter."""
     caption = (
         f"What contributes most, and how well each parameter is known. Whiskers: {U_OF}. A whisker that crosses zero: the data do not show "
         "that this error differs from zero."
@@ -84,7 +84,7 @@ def parameter_pictures(rows: Sequence[ParameterRow], ranked: Sequence[Contributi
 
 
 def setup_section(rows: Sequence[ParameterRow]) -> list[Block]:
-    """Parameters of cups, bars and mirrors, folded; nothing where there are none."""
+    """Parameters of cups, bars and mirrors as a folded section; empty without any."""
     setup = [r for r in rows if r.note == SETUP_NOTE]
     if not setup:
         return []
@@ -95,7 +95,7 @@ def setup_section(rows: Sequence[ParameterRow]) -> list[Block]:
 
 
 def picture_section(pictures: Sequence[Picture]) -> list[Section]:
-    """The pictures of a report under their heading; nothing where there are none."""
+    """The pictures of a report as a section; empty without any."""
     return [Section("Pictures", pictures)] if pictures else []
 
 
@@ -112,7 +112,7 @@ def residual_picture(series: Sequence[ResidualSeries], runs: Sequence[RunRow]) -
 
 
 def run_table(rows: Sequence[RunRow]) -> TextTable:
-    """Runs of a solution."""
+    """Table of the runs of a solution."""
     head = ("Run", "Test", "Role", "Values", "Residual rms (µm)", "Expected (µm)", "Outliers")
     cells = [(r.label, r.test, r.role, str(r.values), plain(r.residual_rms_um), plain(r.expected_um), str(r.outliers)) for r in rows]
     return TextTable(head, cells)

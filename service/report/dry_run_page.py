@@ -1,4 +1,4 @@
-"""A dry run as a document: paths in three views, and what each test takes."""
+"""A dry run as a document: paths in three views, and the time and travel of each test."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _drawn(order: int, test: TestPlan) -> DrawnTest:
 
 
 def _read_places(test: TestPlan) -> list[Point]:
-    """Where something is read, in order: the paths that are recorded, the places of single readings."""
+    """Positions of all readings, in order: recorded paths and places of single readings."""
     out: list[Point] = []
     here: Point | None = None
     for step in test.steps:

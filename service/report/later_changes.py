@@ -1,4 +1,4 @@
-"""A report is of the table that was in force then: what came into force since stands on it, so that no old verdict is taken for today's."""
+"""Note in a report that another table came into force after the measurement, so that an old verdict is not read as the current one."""
 
 from __future__ import annotations
 
@@ -15,16 +15,9 @@ NOT_JUDGED = "Not judged"
 
 
 def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[dict[str, Any]]) -> Document:
-    """The report, and where its table is not the one in force now, that: as headline if nothing has measured the machine since.
+    """Return the report with a note if its table is not in force now, in the headline if nothing has measured the machine since.
 
-    Parameters
-    ----------
-    machine : str
-        Whose report it is.
-    begun_utc : str
-        When it was measured, or when the push ended.
-    runs : sequence of dict
-        ``abbe-run/1`` objects that it rests on; empty: only the time counts.
+    ``begun_utc``: time of the measurement, or end of the push. ``runs``: ``abbe-run/1`` objects of the report; empty: only the time counts.
     """
     known = verified_by(store, machine)
     if document.verdict is None or _same(known, begun_utc, runs):
@@ -41,11 +34,11 @@ def with_later_changes(document: Document, store: Store, machine: str, begun_utc
 
 
 def _same(known: VerifiedBy, begun_utc: str, runs: Sequence[dict[str, Any]]) -> bool:
-    """Whether what was measured then was measured with the table in force now."""
+    """Whether the report was measured with the table in force now."""
     if known.why in ("changed", "open", "journal"):
         return False
     tables = {int(r["table"]["crc"]) for r in runs if (r.get("table") or {}).get("crc") is not None}
-    if known.why == "push" and tables == {known.crc}:  # measured on the way, before it was kept
+    if known.why == "push" and tables == {known.crc}:  # measured during the push, before it was kept
         return True
     if known.since is not None and datetime.fromisoformat(begun_utc) < known.since:
         return False

@@ -1,4 +1,4 @@
-"""One report of anything that is stored, of a campaign folder, or of a solution just made: which one is meant."""
+"""Reports of stored objects, of campaign folders and of new solutions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NUMBERED = ("push", "discovery", "verification")
 
 
 def rules_of(config: MachineFile | None) -> Rules:
-    """What a machine file adds: limits of the check, certificates, allowed temperature. Nothing without a file."""
+    """Limits of the check, certificates and allowed temperature from a machine file; empty without a file."""
     if config is None:
         return Rules()
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
@@ -37,7 +37,7 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
     Raises
     ------
     NotStored
-        There is none.
+        The number does not exist.
     StoreError
         Several machines have a push of this number.
     """
@@ -60,7 +60,7 @@ def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules
     if isinstance(record, CampaignRecord):
         return _with_later_changes(store, _measured(store, record.name), record.created_utc, rules)
     campaign = from_store(store, record.campaign)
-    if all(r["run_id"] != record.label for r in campaign.runs):  # incomplete: what is there is reported and said to be so
+    if all(r["run_id"] != record.label for r in campaign.runs):  # an incomplete run is reported as such
         campaign = Campaign(campaign.name, campaign.site, [*campaign.runs, load_run(store, record.id)], None, campaign.doc)
     facts = {"Started": record.started_utc, "Ended": record.ended_utc or "not ended"}
     runs = [r for r in campaign.runs if r["run_id"] == record.label]
@@ -70,16 +70,10 @@ def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules
 
 
 def solution_report(store: Store | None, campaign: Campaign, solution: SolutionResult, made_utc: str, rules: Rules) -> Document:
-    """Report of a campaign with the solution just made of it, and everything that is drawn of it.
+    """Report of a campaign with a new solution and its pictures.
 
-    Parameters
-    ----------
-    store : Store or None
-        Where the campaign is stored; the report then names its unfinished runs and its table.
-    campaign : Campaign
-        The runs that were solved.
-    made_utc : str
-        When it was solved.
+    ``store``: database of the campaign; the report then names unfinished runs and the table in force. ``campaign``: the solved runs.
+    ``made_utc``: time of the solution.
     """
     solved = {"Solved": made_utc}
     if store is None or campaign.folder is not None:
@@ -96,7 +90,7 @@ def _with_later_changes(store: Store, found: Measured, created_utc: str, rules: 
 
 
 def folder_report(folder: Path, rules: Rules) -> Document:
-    """Report of a campaign folder that is not imported: figures of the standards, without a solution."""
+    """Report of a campaign folder: figures by ISO 230, without a solution."""
     return campaign_report(Measured(from_folder(folder)), rules)
 
 

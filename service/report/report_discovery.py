@@ -1,4 +1,4 @@
-"""A discovery as a report: what the model lacks, how large it is, what proves it, what else it could be, what to do."""
+"""A discovery as a report: missing effects, their size, evidence, rival explanations and remedies."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ AXES = "XYZ"
 CELLS = 24
 """Cells of the map along the longer side of what was measured."""
 FEWEST = 3
-"""Readings that a cell needs."""
+"""Fewest readings of a cell."""
 REJECTED = 40
 DECIDED = "How it was decided"
 SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
@@ -55,7 +55,7 @@ STATEMENTS = (
 
 @dataclass(frozen=True)
 class _Found:
-    """A finding with the runs that were searched, what is odd about them, and the states of the search with their reasons."""
+    """A finding with the searched runs, their flags, and the states of the search with their reasons."""
 
     finding: Finding
     campaign: Campaign
@@ -65,17 +65,17 @@ class _Found:
 
     @property
     def measured(self) -> dict[str, dict[str, Any]]:
-        """Runs whose readings are known, by name."""
+        """Runs with readings (not sealed), by name."""
         return {r["run_id"]: r for r in self.runs if r["columns"]["deviation_mm"] is not None}
 
 
 def discovery_report(store: Store, number: int, rules: Rules) -> Document:
-    """A discovery as it was stored; nothing is searched again.
+    """Report of a stored discovery, without a new search.
 
     Raises
     ------
     StoreError
-        There is no such discovery, or it has not found anything yet.
+        The discovery does not exist or has not ended.
     """
     record = store.discoveries.get(number)
     steps = stored_steps(store, number)
@@ -94,13 +94,13 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
 
 
 def found_report(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, made_utc: str) -> Document:
-    """A discovery just made, stored or not; a working paper without signatures."""
+    """Report of a new discovery, stored or not: a working paper without signatures."""
     title = f"Campaign {job.campaign.name} - what the simulation of {job.campaign.site.name} lacks"
     return _document(_of_job(job, journal, finding), title, _about(job, made_utc), _provenance(job, journal), Rules(), signed=False)
 
 
 def simulation_report(job: DiscoveryJob, finding: Finding, verdict: tuple[str, str, str], made_utc: str) -> Document:
-    """Measured against simulated, nothing looked for. ``verdict``: sign, word and sentence."""
+    """Report of measured against simulated readings, without a search. ``verdict``: sign, word and sentence."""
     title = f"Campaign {job.campaign.name} - measured against simulated"
     found = _of_job(job, DiscoveryJournal(), finding)
     made = _provenance(job, DiscoveryJournal())
@@ -155,7 +155,7 @@ def _document(
 
 
 def _verdict(finding: Finding) -> tuple[str, str, str]:
-    """The finding's, with what has changed where an earlier solution could be compared."""
+    """Verdict of the finding, with the changes since an earlier solution, if one could be compared."""
     sign, word, text = verdict_of(finding)
     changes = changed_words(finding.changed)
     return sign, word, f"{text} {changes[:1].upper()}{changes[1:]}." if changes else text
@@ -177,7 +177,7 @@ def _sections(found: _Found) -> list[Section]:
 
 
 def _card(effect: EffectFound) -> dict[str, str]:
-    """What to do about a named effect, how it looks, what else it could be."""
+    """Remedy, signature, rivals and parameters of a named effect."""
     there = "; ".join(where_lines(effect.where))
     out = {"What to do": effect.remedy_text, "Who takes it out": REMEDIES[effect.remedy]}
     out |= ({"Where": there} if there else {}) | {"How it looks": effect.signature, "What else it could be": "; ".join(rival_lines(effect))}
@@ -189,8 +189,8 @@ def _card(effect: EffectFound) -> dict[str, str]:
 
 
 def gap_table(finding: Finding) -> TextTable:
-    """The gap by role; sealed runs are only counted: their readings are unknown here."""
-    only_scatter = bool(finding.effects) and not entering(finding)  # closes no gap, and need not
+    """Table of the gap by role. Sealed runs are only counted, because their readings are unknown here."""
+    only_scatter = bool(finding.effects) and not entering(finding)  # explained scatter closes no gap
     by = "" if finding.effects or not _what(finding) else f" by {_what(finding)}"
     head = ("Runs", "Before (µm)", "After (µm)", "Noise floor (µm)", f"Gap closed{by}", "What they are for")
     rows: list[tuple[str, ...]] = []
@@ -204,7 +204,7 @@ def gap_table(finding: Finding) -> TextTable:
 
 
 def _what(finding: Finding) -> str:
-    """What the gap after is with; empty where before and after are one."""
+    """What was added to the model for the gap after; empty if nothing was."""
     return {"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict]
 
 
@@ -264,7 +264,7 @@ def _appendix(found: _Found) -> list[Section]:
 
 
 def telling_run(finding: Finding) -> str | None:
-    """The run in which most of the gap closes, against its noise; where nothing was found, the one with the largest gap."""
+    """The run in which most of the gap over its noise closes; without a finding, the run with the largest gap."""
     shows = {}
     for label, run in finding.runs.items():
         if run.rms_before_um is not None and run.rms_after_um is not None:
@@ -274,7 +274,7 @@ def telling_run(finding: Finding) -> str | None:
 
 
 def _traces(found: _Found) -> list[Trace]:
-    """The run that shows most: along time and, where an axis is named, against its position."""
+    """Traces of the telling run: against time and, if an axis is named, against its position."""
     finding, label = found.finding, telling_run(found.finding)
     if label is None:
         return []
@@ -294,7 +294,7 @@ def _traces(found: _Found) -> list[Trace]:
 
 
 def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
-    """Cells of one plane with the rms of the gap before over its noise."""
+    """Cells of one plane with the rms of the gap (before) divided by its noise."""
     points, ratio = _points(found)
     if not len(points):
         return None
@@ -314,7 +314,7 @@ def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
 
 
 def _points(found: _Found) -> tuple[F1, F1]:
-    """Where every judged reading was taken, shape (n, 3), and its gap over the noise, shape (n,)."""
+    """Positions of all judged readings, shape (n, 3), and their gap over the noise, shape (n,)."""
     places, ratios = [np.zeros((0, 3))], [np.zeros(0)]
     for label, run in found.measured.items():
         columns, before = run["columns"], found.finding.series[label].before

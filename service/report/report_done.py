@@ -1,4 +1,4 @@
-"""Reports of what was done: a stored verification, and a push with its whole journal."""
+"""Reports of a stored verification, and of a push with its whole journal."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ ENDS: dict[PushState, tuple[Sign, str]] = {
 
 
 def verification_report(store: Store, number: int, rules: Rules) -> Document:
-    """A stored verification with the runs that it rests on.
+    """Report of a stored verification with its runs.
 
     Raises
     ------
     NotStored
-        There is none of this number.
+        The number does not exist.
     """
     record = next((v for v in store.verifications.latest(limit=MANY) if v.id == number), None)
     if record is None:
@@ -64,7 +64,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     about |= _occasion(record.doc)
     sign, word = VERDICTS.get(record.verdict, ("open", record.verdict[:1].upper() + record.verdict[1:]))
     verdict = (sign, word, str(record.doc.get("text", "")))
-    verdict = verdict if record.verdict == "fail" else table.verdict(verdict)  # a no needs no other
+    verdict = verdict if record.verdict == "fail" else table.verdict(verdict)  # a failed verification needs no other reason
     document = Document(
         kind="verification",
         title=f"Verification {number} of {machine.name}",
@@ -83,14 +83,14 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
 
 
 def verification_figures(record: VerificationRecord, rules: Rules) -> list[ReportFigure]:
-    """The figures that a verification was decided by, with limits: those stored with it, else the machine file's."""
+    """The figures that decided a verification, with the limits stored with it, else those of the machine file."""
     rows = _stored_rows(record.doc)
     limits = record.doc.get("limits") or rules.limits_um
     return parts.judged(rows, Rules({k: float(v) for k, v in limits.items() if v is not None}), f"Verification {record.id}")[0]
 
 
 def _stored_rows(doc: Doc) -> dict[str, tuple[float, float]]:
-    """Figures and standard uncertainties, µm: as a correction stores them, or as a scheduled check does (with expanded ones)."""
+    """Figures and standard uncertainties, µm, as stored by a correction or by a scheduled check (which stores expanded ones)."""
     if "figures" in doc:
         return {k: (float(v["value"]), float(v["u"])) for k, v in doc["figures"].items()}
     expanded = doc.get("uncertainties") or {}
@@ -99,7 +99,7 @@ def _stored_rows(doc: Doc) -> dict[str, tuple[float, float]]:
 
 
 def _occasion(doc: Doc) -> dict[str, str]:
-    """Why it was measured: after a push, or because a schedule said so."""
+    """Occasion of the measurement: a push or a schedule."""
     names = {"push": "Of push", "schedule": "Schedule", "recipe": "Recipe", "slot_utc": "Due"}
     return {name: str(doc[key]) for key, name in names.items() if doc.get(key) is not None}
 
@@ -109,7 +109,7 @@ def _instruments(campaign: Campaign | None, rules: Rules) -> Any:
 
 
 def push_report(store: Store, machine: str, number: int, rules: Rules) -> Document:
-    """A push: which table on which base, who agreed, every transition of its journal, and the verification that decided.
+    """Report of a push: new and old table, approval, every transition of its journal, and the deciding verification.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     if not journal:
         raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
     known = facts(journal)
-    machine = known.machine or machine  # as it was called then
+    machine = known.machine or machine  # name of the machine at the time of the push
     doc = _machine_doc(store, machine)
     verified = [v for v in store.verifications.latest(limit=MANY) if _is_of(store, v, machine, number)]
     campaigns = [from_store(store, store.campaigns.find(v.campaign_id).name) for v in verified if v.campaign_id is not None]

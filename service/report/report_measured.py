@@ -37,7 +37,7 @@ NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine
 
 @dataclass(frozen=True)
 class SolutionResult:
-    """A solution's document. ``number``: of the stored one; ``account``: of one that was solved just now, with all that is drawn of it."""
+    """A solution's document. ``number``: of a stored solution; ``account``: of a new one, the source of its pictures."""
 
     doc: Doc
     number: int | None = None
@@ -45,16 +45,16 @@ class SolutionResult:
 
     @property
     def name(self) -> str:
-        """As the report calls it."""
+        """Name in the report."""
         return "solution" if self.number is None else f"solution {self.number}"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What a report of a measurement is made of.
+    """Content of a report of a measurement.
 
-    ``facts``: further lines for the head; ``states``: run, test, role, state and why of every run, also of incomplete ones;
-    ``solution``: the one just made, or the latest stored one; ``table``: what is known of the tables in force.
+    ``facts``: further lines for the head; ``states``: run, test, role, state and reason of every run, also of incomplete ones;
+    ``solution``: the new one or the latest stored one; ``table``: remarks about the tables in force.
     """
 
     campaign: Campaign
@@ -65,7 +65,7 @@ class Measured:
 
 
 def campaign_report(found: Measured, rules: Rules) -> Document:
-    """Everything a campaign says: figures of the standards, figures of a verification, the solution."""
+    """Report of a campaign: figures by ISO 230, figures of a verification, the solution."""
     campaign = found.campaign
     evaluated = evaluate(campaign.runs, campaign.doc.get("instruments"))
     checked, verdict = _verification(campaign.runs, rules)
@@ -95,7 +95,7 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
 
 
 def run_report(found: Measured, label: str, rules: Rules) -> Document:
-    """One run: what its standard says of it, and its readings."""
+    """Report of one run: figures by ISO 230, and its readings."""
     run = next(r for r in found.campaign.runs if r["run_id"] == label)
     evaluated = evaluate([run], found.campaign.doc.get("instruments"))
     condition, remarks = parts.conditions([run], rules)
@@ -121,14 +121,14 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
 
 
 def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[ReportFigure], Verdict | None]:
-    """Figures that the machine file has limits for, where these runs hold the four body diagonals, once out and back."""
+    """Figures of a verification and their verdict, if these runs hold the four body diagonals, once out and back."""
     known = [r for r in runs if r["columns"].get("deviation_mm") is not None and r["setup"].get("cycles", 1) == 1 and not not_judged(r)]
     body = {r["setup"].get("diagonal") for r in known if r["test"] == "laser_diagonal" and not r["setup"].get("order")}
     if not body >= DIAGONALS:
         return [], None
     try:
         return parts.judged(figure_rows(figures(known)), rules, "Verification")
-    except MeasurementFault:  # too few readings in one of them: the figures of the standards say which
+    except MeasurementFault:  # too few readings: the figures by ISO 230 name the run
         return [], None
 
 
@@ -148,7 +148,7 @@ def _solution(solution: SolutionResult | None) -> Evaluated:
     )
     figures = _parameters(doc, f"Linear errors, mean over the volume ({solution.name}, {doc['model']})")
     rows = [ParameterRow(f.symbol, f.value, f.u, f.unit) for f in figures]
-    drawn = solution.account is None  # else they stand in the section of the parameters
+    drawn = solution.account is None  # otherwise the section of the parameters draws them
     return Evaluated(
         figures=figures,
         pictures=[Picture(f"{name}: linear errors with U.", [svg]) for svg in uncertainty_bars(rows)] if drawn else [],
@@ -159,7 +159,7 @@ def _solution(solution: SolutionResult | None) -> Evaluated:
 
 
 def _parameters(doc: Doc, group: str) -> list[ReportFigure]:
-    """Scales, squareness and lost motion; one that the runs do not show by itself says so."""
+    """Scales, squareness and lost motion; parameters that are not observable by themselves carry a note."""
     figures = []
     for name, p in doc["mean_over_volume"].items():
         text, unit = ("scale error", "µm/m") if name[0] == "E" else ("squareness", "µrad")
@@ -222,7 +222,7 @@ def _run_table(found: Measured) -> TextTable:
 
 
 def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[str]:
-    """Runs that are in no figure; for a resumed one, the run that holds its readings."""
+    """Remarks about runs that no figure uses; for a resumed run, the run that holds its readings."""
     whole = {piece["run"]: r["run_id"] for r in runs for piece in (r.get("timing") or {}).get("pieces", [])}
     short = {r["run_id"]: why for r in runs if (why := not_judged(r))}
     out = []
@@ -238,7 +238,7 @@ def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[st
 
 
 def _own(run: Doc) -> Evaluated:
-    """What can be said of any run: its readings along it, noise and rms; of a helix its figure."""
+    """Figures and pictures of any run: its readings and their range; for a helix also its rms."""
     if run["columns"].get("deviation_mm") is None:
         return Evaluated(not_observable=["its readings: the run is sealed"])
     try:

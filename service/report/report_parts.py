@@ -1,4 +1,4 @@
-"""What every report says: machine, instruments with their certificates, conditions, where the data come from, and what was judged."""
+"""Parts of every report: machine, instruments with certificates, conditions, provenance of the data, and verdicts."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SENSORS = (
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What a machine file adds to the data: limits of figures (µm, by their names in `figure_rows`), certificates, allowed temperature."""
+    """Rules from a machine file: limits of figures (µm, named as in `figure_rows`), certificates, allowed temperature."""
 
     limits_um: Mapping[str, float] = field(default_factory=dict)
     calibrated_until: Mapping[str, date] | None = None
@@ -49,7 +49,7 @@ class Rules:
 
 
 def machine_facts(machine: Doc) -> dict[str, str]:
-    """Head of the report: which machine, and its geometry."""
+    """Head of the report: machine and geometry."""
     strokes = "; ".join(f"{a} {tidy(float(lo))} to {tidy(float(hi))} mm" for a, (lo, hi) in machine["stroke_mm"].items())
     out = {"Machine": str(machine.get("name", "")), "Chain": str(machine["chain"]), "Strokes": strokes}
     tool = machine.get("tool_mm")
@@ -57,7 +57,7 @@ def machine_facts(machine: Doc) -> dict[str, str]:
 
 
 def instruments(runs: Sequence[Doc], campaign: Doc, rules: Rules) -> list[Instrument]:
-    """Instruments that these runs used."""
+    """Instruments used in these runs."""
     kinds = {"ballbar" if r["test"].startswith("ballbar") else "laser" for r in runs}
     return [Instrument(NAMES[k], _certificate(k, rules), _known(k, runs, campaign)) for k in NAMES if k in kinds]
 
@@ -85,7 +85,7 @@ def _known(kind: str, runs: Sequence[Doc], campaign: Doc) -> str:
 
 
 def conditions(runs: Sequence[Doc], rules: Rules) -> tuple[dict[str, str], list[str]]:
-    """Conditions in words, and what about them the reader has to know."""
+    """Conditions as text, and remarks about them."""
     out, remarks = {}, []
     for column, name, unit in SENSORS:
         read = [float(v) for r in runs for v in r["columns"].get(column) or [] if v is not None and np.isfinite(v)]
@@ -111,20 +111,20 @@ def conditions(runs: Sequence[Doc], rules: Rules) -> tuple[dict[str, str], list[
 
 
 def data_digest(runs: Sequence[Doc]) -> str:
-    """SHA-256 over the runs' digests, by name: one changed reading changes it."""
+    """SHA-256 over the runs' digests, sorted by name; it changes with any reading."""
     lines = sorted(f"{r['run_id']} {run_digest(r)}" for r in runs)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def doc_digest(value: Any) -> str:
-    """SHA-256 of a JSON value in its one canonical form."""
+    """SHA-256 of a JSON value in canonical form."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
 
 def provenance(digest: str, made: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Hash of the data and versions: of the program that computed the result (``made``), if it is on record, and of this one.
+    """Hash of the data, and versions of this program and of the one that computed the result (``made``), if recorded.
 
-    No time: a report says when was measured, and the same data give the same report tomorrow.
+    It has no time stamp, so that equal data give equal reports.
     """
     out = {"Data (SHA-256)": digest}
     if made:
@@ -134,11 +134,11 @@ def provenance(digest: str, made: Mapping[str, str] | None = None) -> dict[str, 
 
 
 def judged(rows: Mapping[str, tuple[float, float]], rules: Rules, group: str) -> tuple[list[ReportFigure], Verdict | None]:
-    """Figures of a verification (of `figure_rows`) with their limits, and the verdict on all that have one."""
+    """Figures of a verification (from `figure_rows`) with their limits, and the overall verdict on those with a limit."""
     figures, verdicts = [], []
     for key, (value, u) in rows.items():
         limit = rules.limits_um.get(key)
-        # Without an uncertainty nothing can be stated about a limit.
+        # A figure without an uncertainty cannot be judged against a limit.
         word: Verdict | None = None if limit is None else judge(value, u, limit) if finite(u) else "cannot tell"
         if word is not None:
             verdicts.append(word)
@@ -158,7 +158,7 @@ def figure_names(key: str) -> tuple[str, str, str]:
 
 
 def verdict_of(found: Verdict | None, remarks: Sequence[str], otherwise: tuple[Sign, str, str]) -> tuple[Sign, str, str]:
-    """The verdict by limits; figures that were measured outside of the allowed temperature are not judged."""
+    """The verdict by limits. Figures measured outside the allowed temperature are not judged."""
     if found is None:
         return otherwise
     if any("cannot be judged" in r for r in remarks):

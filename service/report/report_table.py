@@ -1,4 +1,4 @@
-"""What a report says of the table that its runs were measured with: never verified, verified on another machine, not of this database."""
+"""Remarks about the table that the runs of a report were measured with: unverified, verified elsewhere, or unknown to this database."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ WORD = "Unverified table"
 
 @dataclass(frozen=True, slots=True)
 class TableRemarks:
-    """``unverified``: why the verdict cannot be what the limits alone say, empty if it can; ``remarks``: what the reader has to know."""
+    """``unverified``: why the verdict by the limits does not count, empty if it does; ``remarks``: for the reader."""
 
     unverified: str = ""
     remarks: tuple[str, ...] = ()
 
     def verdict(self, by_limits: tuple[Sign, str, str]) -> tuple[Sign, str, str]:
-        """The verdict, which no figure gives to a table that nothing has verified."""
+        """The verdict by the limits, replaced by "bad" for an unverified table."""
         if not self.unverified:
             return by_limits
         _, word, text = by_limits
@@ -34,7 +34,7 @@ NO_TABLE_REMARKS = TableRemarks()
 
 
 def table_remarks(store: Store, machine: str, runs: Sequence[Doc]) -> TableRemarks:
-    """Hold the tables that runs of a machine were measured with against the journals of this database, as they stand now."""
+    """Compare the tables that runs of a machine were measured with to the current journals of this database."""
     used = {int(t["crc"]): t for r in runs if (t := r.get("table")) and t.get("crc") is not None}
     if not used:
         return TableRemarks()
@@ -49,13 +49,13 @@ def table_remarks(store: Store, machine: str, runs: Sequence[Doc]) -> TableRemar
 
 
 def _corrects(crc: int, table: Doc, images: Images) -> bool:
-    """As far as is known: by its image, else by what the control said."""
+    """Whether a table corrects anything: by its image, else by the statement of the control."""
     image = images(crc)
     return bool(table.get("acting")) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
 
 
 def _remark(crc: int, known: KnownTables, chain: str) -> str:
-    """Whose table it is and who accepted it for this machine; empty where its own journal says that it is right."""
+    """Origin of the table and who accepted it for this machine; empty if this machine's journal endorses it."""
     elsewhere, here, push = known.elsewhere(crc, chain), known.endorsed.get(crc, {}).get(chain), known.pushed.get(crc)
     if elsewhere is not None:
         return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: nobody has accepted it"

@@ -38,13 +38,9 @@ PLANES = ((0, 1, 2), (0, 2, 1))
 
 
 def solution_sections(found: Account, doc: dict[str, Any]) -> list[Section]:
-    """What a solution says, before the figures of the report.
+    """Sections of a solution, printed before the figures of the report.
 
-    Parameters
-    ----------
-    found : Account
-    doc : dict
-        `abbe.service.identification.solve_report.solution_doc` of it, with what was asked for beside it (tables, Monte Carlo).
+    ``doc``: its `abbe.service.identification.solve_report.solution_doc`, with tables and Monte Carlo if requested.
     """
     shares = [MotionShare(m.name, m.share, m.status) for m in found.observability.motions]
     return [
@@ -57,7 +53,7 @@ def solution_sections(found: Account, doc: dict[str, Any]) -> list[Section]:
 
 
 def residual_sections(found: Account) -> list[Section]:
-    """What a solution leaves unexplained, run by run."""
+    """Sections of the residuals of a solution, run by run."""
     return [Section("Residuals", _residuals(found)), Section("Runs of the solution", [run_table(solution_runs(found.joint))])]
 
 
@@ -73,7 +69,7 @@ def _parameters(found: Account) -> list[Block]:
 
 
 def solution_rows(found: Account) -> list[ParameterRow]:
-    """Parameters; one of a motion that the runs do not show by itself says so, and that its value is right for this tool only."""
+    """Rows of parameters; those of motions that are not observable carry a note (valid for this tool only)."""
     status = {m.name: m.status for m in found.observability.motions}
     rows = parameter_rows(found.joint)
     return [replace(r, note=f"{r.note}; {HIDDEN_NOTE}") if status.get(r.name) == "not observable" else r for r in rows]
@@ -186,7 +182,7 @@ def _gain(found: Account, fixed: int) -> Slice:
 
 
 def _correlations(found: Account) -> Correlations:
-    """The parameters of the strongest pairs, in the order of the model."""
+    """Correlations of the most correlated parameters, in the order of the model."""
     e = found.joint.estimate
     chosen: list[str] = []
     for pair in found.observability.correlations:
@@ -202,12 +198,12 @@ def _correlations(found: Account) -> Correlations:
 
 
 def residual_series(joint: JointSolution) -> list[ResidualSeries]:
-    """Residuals of every run, reading by reading."""
+    """Residuals of every run against the number of the reading."""
     return [ResidualSeries(r.label, "reading", np.arange(float(r.residual_mm.size)), r.residual_mm * 1e3) for r in joint.runs]
 
 
 def solution_runs(joint: JointSolution) -> list[RunRow]:
-    """Runs that a solution rests on."""
+    """Runs used by a solution."""
     counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
     return [
         RunRow(r.label, r.kind, "identify", r.residual_mm.size, r.rms_mm * 1e3, r.expected_mm * 1e3, counts[r.label]) for r in joint.runs
@@ -215,7 +211,7 @@ def solution_runs(joint: JointSolution) -> list[RunRow]:
 
 
 def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
-    """The parameters people ask for, with standard uncertainty: scales, squareness, lost motion, then the cups, bars and mirrors."""
+    """Parameters with standard uncertainty: scales, squareness, lost motion, then cups, bars and mirrors."""
     e = joint.estimate
     rows = []
     for p in mean_linear(joint):
@@ -234,7 +230,7 @@ def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
 
 
 def contributions(joint: JointSolution) -> list[Contribution]:
-    """Rms over its stroke of every translation and squareness, largest first (angles act through levers and are left to the map)."""
+    """Rms over its stroke of every translation and squareness, largest first. Angles act through levers and appear in the map only."""
     weights: dict[str, list[tuple[int, float]]] = {}
     for k, term in enumerate(joint.terms):
         if term.order == 0:

@@ -1,1 +1,1 @@
-"""Signed compensation files: what is in them, for which machine, on which base, under which limits, until when, and who says so."""
+"""Signed compensation files: contents, machine, base table, limits, expiry and signer."""

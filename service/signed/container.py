@@ -19,7 +19,7 @@ from abbe.service.signed.keys import public_of
 
 FORM = "abbe-signed/1"
 PURPOSE = b"abbe compensation files\x00"
-"""Stands before the signed bytes: a signature made for something else is none here."""
+"""Prefix of the signed bytes, so that a signature made for another purpose is invalid here."""
 LARGEST = 1_000_000
 NO_BASE = "none"
 FILE_REMEDY = "get the files and their .sig again from who signed them; nothing was taken in"
@@ -27,22 +27,11 @@ FILE_REMEDY = "get the files and their .sig again from who signed them; nothing 
 
 @dataclass(frozen=True, slots=True)
 class Claims:
-    """What is signed.
+    """The signed claims.
 
-    Parameters
-    ----------
-    machine : str
-        Name of the machine.
-    form : str
-        Format or control that the files are for.
-    files : dict of str to str
-        SHA-256 of each file's bytes, by name.
-    base : str
-        Fingerprint of the table that was active while measuring; `NO_BASE` for none.
-    limits : str
-        SHA-256 of the limits of the machine under which the tables were found good.
-    signed_utc, expiry_utc : str
-        When; until when they may be taken in.
+    ``form``: format or control of the files. ``files``: SHA-256 of each file's bytes, by name. ``base``: fingerprint of the table that was
+    active while measuring, `NO_BASE` for none. ``limits``: SHA-256 of the machine's limits that the tables passed. ``expiry_utc``: end of
+    the time in which the files may be imported.
     """
 
     machine: str
@@ -56,7 +45,7 @@ class Claims:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedContent:
-    """What the machine at hand is: the claims have to be about it. ``base`` None: not known here, then it is only reported."""
+    """This machine, which the claims must match. ``base`` None: unknown here, so the claimed base is only reported."""
 
     machine: str
     limits: str
@@ -66,7 +55,7 @@ class ExpectedContent:
 
 
 def claims_of(machine: str, form: str, files: Mapping[str, bytes], base: str, limits: str, span: tuple[datetime, datetime]) -> Claims:
-    """The claims about files; ``span``: now, and when they expire."""
+    """The claims about files; ``span``: time of signing and of expiry."""
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     return Claims(machine, form, digests, base, limits, utc_text(span[0]), utc_text(span[1]))
 
@@ -81,23 +70,13 @@ def sign(claims: Claims, key: Ed25519PrivateKey) -> bytes:
 
 
 def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, now: datetime) -> Claims:
-    """The claims, if all of them hold here and now.
-
-    Parameters
-    ----------
-    sealed : bytes
-        Content of FILE.sig.
-    files : mapping of str to bytes
-        Names and bytes of the files as they lie there.
-    expected : ExpectedContent
-        This machine.
-    now : datetime
-        With time zone.
+    """Return the claims of FILE.sig (``sealed``) if all of them hold for these files, this machine and ``now`` (with time zone).
 
     Raises
     ------
     SignatureRefused
-        Not as signed, by a key that is not trusted, for another machine, base, limits or format, or expired.
+        The files differ from the signed ones, the key is not trusted, the claims are for another machine, base, limits or format, or they
+        have expired.
     """
     key, claims, signature = _parts(sealed)
     if key not in expected.trusted:
@@ -134,7 +113,7 @@ def _check_files(claims: Claims, files: Mapping[str, bytes]) -> None:
 
 
 def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
-    """Key, claims and signature. Only the one way of writing them is taken: no second file says the same."""
+    """Key, claims and signature. Only the canonical encoding is accepted, so no two files carry the same claims."""
     try:
         if len(sealed) > LARGEST:
             raise ValueError

@@ -1,4 +1,4 @@
-"""Ed25519 keys in files: the private one for its owner only (0600), the public one to be shown."""
+"""Ed25519 keys in files, readable by their owner only (0600)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def new_key(path: Path) -> str:
     Raises
     ------
     KeyRefused
-        There is a file of this name, or none can be written.
+        The file exists or cannot be written.
     """
     key = Ed25519PrivateKey.generate()
     text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
@@ -42,7 +42,7 @@ def read_key(path: Path) -> Ed25519PrivateKey:
     Raises
     ------
     KeyRefused
-        It cannot be read, is no Ed25519 key, or others may read it as well.
+        The file cannot be read, is no Ed25519 key, or is readable by others.
     """
     try:
         if os.name == "posix" and path.stat().st_mode & 0o077:

@@ -35,7 +35,7 @@ async def read_base(controller: TableController) -> Base:
     Raises
     ------
     TableMismatch
-        The bytes do not have the CRC the controller states.
+        The CRC of the bytes differs from the one the controller states.
     """
     status = await controller.comp_status()
     base = Base(status, await controller.read_bank(status.active_bank))

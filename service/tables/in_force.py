@@ -1,6 +1,7 @@
-"""Which table a controller should have in force, as the push journals tell it: what somebody else has put there is seen against that.
+"""Compare the table in force in a controller with the one its push journal expects, to detect tables written by others.
 
-The look is the one of the gate (`abbe.service.tables.table_gate`): what is refused before motion is what the service alarms.
+The check is that of the gate (`abbe.service.tables.table_gate`): the service raises an alarm for exactly what the gate refuses before
+motion.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from abbe.service.tables.unverified import KnownTables, known_tables
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """One look at a controller, and what its journal says.
+    """The table in force at one time, and what the journal expects.
 
     Parameters
     ----------
@@ -32,11 +33,11 @@ class InForce:
     wanted : int or None
         CRC of the table that was kept or accepted last, else of the one that the first push found; None: not known.
     settled : bool
-        False: a push is on its way, or a person has to look at one; comparing says nothing.
+        False while a push is under way or waits for a person; a comparison then means nothing.
     unverified : str
-        Which push brought it, where nothing has verified it; else empty.
+        The push that wrote the table, if nothing has verified it; else empty.
     strange : bool
-        It corrects something, or cannot be read, and no journal of the database has it, or only those of other controls.
+        The table corrects something or cannot be read, and no journal of this control knows it.
     """
 
     bank: int
@@ -51,18 +52,18 @@ LookAtTable = Callable[[], Awaitable[InForce]]
 
 
 def look_at_table(site: Site, store: Store) -> LookAtTable:
-    """Return how to look. It reads registers only; it is refused (`UnsafeToMove`) while a job of any process has the machine."""
+    """Return a reader of the table in force. It reads registers only and raises `UnsafeToMove` while any process uses the machine."""
 
-    corrects: dict[int, bool] = {}  # what was read of tables that no journal has: the same bytes are not read every ten seconds
+    corrects: dict[int, bool] = {}  # cache for tables that no journal knows: their bytes are read once, not every ten seconds
 
     async def look() -> InForce:
         with lock_machine(site.urls.cnc):
-            pass  # not held, as for preconditions: who comes to measure is not turned away by somebody who only looks
+            pass  # released at once: reading must not block a measurement
         async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
             known = await asyncio.to_thread(known_tables, store)
             chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
             now = await _look_or_strange(session.controller, known, chain, corrects)
-        # After the controller: a push that ended in between is known to the journal before it can be missed here.
+        # Read the journal after the controller: a push that ended in between is then already in the journal.
         wanted, settled = (await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)).wanted
         push = now.unverified
         whose = "" if push is None else f"push {push.push} of machine {push.machine!r}"
@@ -72,7 +73,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
 
 
 async def _look_or_strange(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool]) -> InForceNow:
-    """The gate's look. A table without the CRC that is stated for it is strange."""
+    """Check as the gate does. A table whose bytes do not match the stated CRC is strange."""
     try:
         return await table_gate.look(controller, known, chain, corrects)
     except TableMismatch:

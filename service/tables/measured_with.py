@@ -1,7 +1,7 @@
-"""With which compensation tables the runs of a solution were measured: files for a control hold only for a machine without any.
+"""Compensation tables that were in force while the runs of a solution were measured. Exported files need runs without any.
 
-A machine that is measured while a table is in force shows what that table has left. Files made of that alone, put in its place, take the
-old correction away and leave the machine worse. They are refused; where Abbe writes the tables itself, it adds them (`abbe correct`).
+A machine that is measured with a table in force shows only the error that the table leaves. Files made from that error alone would replace
+the old correction and make the machine worse, so they are refused. `abbe correct` adds the old and the new correction instead.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0
-"""Bytes of an image that say its kind (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
+"""Bytes of an image that hold its kind (docs/protocols/cnc.md, word 2), and the kind without correction."""
 Images = Callable[[int], bytes | None]
 REMEDY = "measure again without a table in force; or, where the control has Abbe's register map, let abbe correct add the tables"
 CONFIRM_REMEDY = "if none was, say so: --without-table"
 
 
 def distinct(tables: Iterable[Doc]) -> list[Doc]:
-    """Tables by their CRC, with what the controller said about whether one acts (``acting``; missing in runs of older versions)."""
+    """Tables sorted by CRC, with the controller's statement whether each one acts (``acting``; missing in runs of older versions)."""
     found: dict[int, Doc] = {}
     for table in tables:
         one = {"crc": int(table["crc"])} | ({} if table.get("acting") is None else {"acting": bool(table["acting"])})
@@ -31,12 +31,12 @@ def distinct(tables: Iterable[Doc]) -> list[Doc]:
 
 
 def tables_of(doc: dict[str, Any]) -> list[Doc]:
-    """Tables that a solution's document names."""
+    """Tables named in a solution's document."""
     return distinct(doc.get("inputs", {}).get("tables", []))
 
 
 def stored_tables(store: Store, solution_id: int) -> list[Doc]:
-    """Tables of a stored solution's runs, also where its document is older than that it names them."""
+    """Tables of a stored solution's runs, also for older documents that do not name them."""
     solution = store.solutions.get(solution_id)
     runs = [r.start_doc for r in store.runs.all(solution.campaign_id) if r.id in set(solution.run_ids)]
     found = [start.get("imported", start).get("table", {}) for start in runs]
@@ -44,7 +44,7 @@ def stored_tables(store: Store, solution_id: int) -> list[Doc]:
 
 
 def images_of(store: Store) -> Images:
-    """Images by their CRC, as far as this database has met them: written by a push, or in force before one."""
+    """Look-up from CRC to the images in this database: written by a push, or in force before one."""
     found = {t.crc: t.image for t in store.tables.all()}
     for name in {store.machines.get(t.machine_id).name for t in store.tables.all()}:
         found |= {push.base_crc: push.base_image for push in JournalView.read(store, name, origins=False).bases() if push.base_image}
@@ -52,21 +52,21 @@ def images_of(store: Store) -> Images:
 
 
 def no_images(crc: int) -> bytes | None:
-    """For a solution that comes from no database."""
+    """Look-up for a solution without a database: finds nothing."""
     return None
 
 
 def check_fresh(tables: list[Doc], images: Images, *, confirmed_none: bool = False) -> bool:
-    """Refuse a solution that was measured with a correction in force; gives whether it is known that there was none.
+    """Refuse a solution that was measured with a correction in force; return whether it is known that none was.
 
     Parameters
     ----------
     tables : list of dict
         From `distinct`.
     images : callable
-        Image of a CRC, or None.
+        Returns the image of a CRC, or None.
     confirmed_none : bool
-        A person says that no correction was in force: believed where nothing else is known, never against what is known.
+        A person states that no correction was in force. Counts only where nothing else is known.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Nine tables as bytes and back: encoding, limits that refuse, comparison of what was sent with what is held, adding to what is active."""
+"""Nine tables as bytes and back: encoding, decoding, limits, and adding a change to the active tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KIND_NINE = 1
 
 
 def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
-    """Nine tables as the controller stores them: for each input axis X, Y, Z, for each output X, Y, Z, corrections in LSB (cnc.md).
+    """Nine tables as the controller stores them: corrections in LSB, input axis X, Y, Z outermost, then output X, Y, Z (cnc.md).
 
     Raises
     ------
@@ -48,12 +48,12 @@ def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
 
 def check_limits(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
     """Refuse, never clamp, the tables of a test step: size, change against the active table, steps, zero at the reference
-    (reliability.md 3.3). They may bend as they like.
+    (reliability.md 3.3). Their curvature is not limited.
 
     Raises
     ------
     TableRefused
-        Which table, where, how much over which limit. Nothing has been written.
+        The message names table, place, excess and limit. Nothing has been written.
     """
     against, limits = [], replace(limits, second_mm=np.inf)
     for a in range(3):
@@ -82,7 +82,7 @@ def tables_from_image(image: bytes) -> NineTables | None:
     Raises
     ------
     TableMismatch
-        The bank holds a kind of table that this version cannot read.
+        The bank holds a kind of table that this version does not read.
     """
     try:
         curves = read_axis_tables(image)
@@ -103,10 +103,7 @@ def tables_from_image(image: bytes) -> NineTables | None:
 
 
 def added(active: NineTables | None, change: NineTables) -> NineTables:
-    """The absolute tables that follow from a change measured while ``active`` was in force, on the grid of the change.
-
-    A machine that is measured with a table shows what the table has left: what to write is the old correction plus the new one.
-    """
+    """Absolute tables, on the grid of the change: the change was measured with ``active`` in force, so the two corrections add up."""
     if active is None:
         return change
     curves = []

@@ -1,6 +1,6 @@
-"""The pushes of one machine as their journal and the stored tables tell them: how each ended, which table is in force, what can go back.
+"""The pushes of one machine from journal and stored tables: how each ended, which table is in force, what can be rolled back.
 
-For readers without a way to a control: what a controller holds is not asked here. Read once (`JournalView.read`), asked often.
+Nothing here talks to a controller. `JournalView.read` reads the database once; its properties need no further reads.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.unverified import PushedTable, known_tables
 
 KIND = "rollback"
-"""Kind of a table that a person ordered back."""
+"""Kind of a table that a person restored by an ordered rollback."""
 STILL_ACTIVE = "the unverified table is STILL ACTIVE"
 OPEN, STOPPED = "open", "stopped"
 NOTHING = "nothing was written"
@@ -28,7 +28,7 @@ NOTHING = "nothing was written"
 
 @dataclass(frozen=True, slots=True)
 class TableOrigin:
-    """Why a stored table was pushed: a proposal (0: none), or a person's order (``order``: its number) with a reason."""
+    """Why a stored table was pushed: for a proposal (0: none), or on a person's order (``order``: its number) with a reason."""
 
     kind: str = "push"
     proposal: int = 0
@@ -37,7 +37,7 @@ class TableOrigin:
 
     @classmethod
     def of(cls, doc: Mapping[str, Any]) -> TableOrigin:
-        """From the document of a stored table."""
+        """Read the origin from the document of a stored table."""
         proposal = doc.get("proposal")
         number = proposal if isinstance(proposal, int) else 0
         return cls(str(doc.get("kind", "push")), number, str(doc.get("order", "")), str(doc.get("reason", "")))
@@ -45,7 +45,7 @@ class TableOrigin:
 
 @dataclass(frozen=True, slots=True)
 class TableNames:
-    """What the two tables of a push are called in its sentence: the one that comes, the same again in short, and the one that goes."""
+    """Names of a push's two tables in its message: the new one, the new one in short, and the old one."""
 
     new: str = "the new table"
     it: str = "the new one"
@@ -57,7 +57,7 @@ BACK = TableNames("the table ordered back", "the one ordered back", "the table f
 
 @dataclass(frozen=True, slots=True)
 class PushSummary:
-    """One push. ``proposal``: 0 for none; ``why``: the reason that a person gave for a rollback; ``by``: who approved or ordered it."""
+    """One push. ``proposal``: 0 for none; ``why``: a person's reason for a rollback; ``by``: who approved or ordered the push."""
 
     push: int
     kind: str
@@ -77,8 +77,8 @@ class PushSummary:
 class CurrentTable:
     """The table in force by the journal.
 
-    ``crc``: None where it is not known, ``text`` says why. ``how``: "verified" by a measurement, "ordered" back by a person without one,
-    "accepted" by a person who looked, "before": it was there before the first push. ``push``: which brought it, 0 for none.
+    ``crc``: None if unknown, for the reason in ``text``. ``how``: "verified" by a measurement; "ordered": restored by a person without one;
+    "accepted" by a person; "before": in force before the first push. ``push``: the push that wrote it, 0 for none.
     """
 
     crc: int | None
@@ -90,7 +90,7 @@ class CurrentTable:
 
 @dataclass(frozen=True, slots=True)
 class RollbackOffer:
-    """What can be ordered back: the table of ``push`` (CRC ``crc``) goes, the one with ``to_crc`` comes."""
+    """A possible rollback: ``to_crc`` replaces the table of ``push`` (CRC ``crc``)."""
 
     push: int
     crc: int
@@ -99,7 +99,7 @@ class RollbackOffer:
 
 @dataclass(frozen=True, slots=True)
 class TableHistory:
-    """Everything of a machine's tables. ``offer``: None where nothing can be taken back, ``refusal`` says why."""
+    """History of a machine's tables. ``offer``: None if no rollback is possible, for the reason in ``refusal``."""
 
     now: CurrentTable
     pushes: tuple[PushSummary, ...]
@@ -109,9 +109,9 @@ class TableHistory:
 
 @dataclass(frozen=True)
 class JournalView:
-    """All entries of a machine's pushes, in the order of writing, and the origins of the stored tables by their number.
+    """All journal entries of a machine's pushes, in the order of writing, and the origins of the stored tables by number.
 
-    `pushes`, and whatever needs them, raises `JournalChanged` where an entry was changed, removed or swapped.
+    `pushes`, and everything that uses it, raises `JournalChanged` if an entry was changed, removed or swapped.
     """
 
     entries: tuple[JournalEntry, ...] = ()
@@ -119,25 +119,25 @@ class JournalView:
 
     @classmethod
     def read(cls, store: Store, machine: str, control: str = "", *, origins: bool = True) -> JournalView:
-        """Read the journal of a machine's control, whatever the machine was called.
+        """Read the journal of a machine's control under any name the machine had.
 
         Parameters
         ----------
         control : str
-            Identity of the control; empty: by the name alone.
+            Identity of the control; empty: find the journal by the name alone.
         origins : bool
-            Whether to read the origins of the tables as well; without them a push is none of a proposal and none of an order.
+            Also read the origins of the tables. Without them no push belongs to a proposal or an order.
 
         Raises
         ------
         StoreError
-            It cannot be read.
+            The database cannot be read.
         """
         return cls(tuple(read_entries(store, machine, control)), origins_of(store) if origins else {})
 
     @property
     def sound(self) -> bool:
-        """Whether the journal is what was written."""
+        """Whether the hash chain of the journal is intact."""
         try:
             check_chain(self.entries)
         except JournalBroken:
@@ -146,7 +146,7 @@ class JournalView:
 
     @cached_property
     def pushes(self) -> dict[int, Journal]:
-        """Journals of all pushes, by number; a person's word before the first is none."""
+        """Journals of all pushes, by number, without an acceptance before the first push."""
         try:
             check_chain(self.entries)
         except JournalBroken as error:
@@ -158,7 +158,7 @@ class JournalView:
         return tuple(e for e in self.entries if e.push == push)
 
     def facts(self, push: int) -> PushFacts:
-        """What the journal says of a push."""
+        """Facts recorded about a push."""
         return facts(self._of(push))
 
     def origin(self, journal: Journal) -> TableOrigin:
@@ -167,14 +167,14 @@ class JournalView:
 
     @property
     def last_push(self) -> int:
-        """Number of the last push; 0: there was none."""
+        """Number of the last push; 0 for none."""
         return max((entry.push for entry in self.entries), default=0)
 
     @property
     def wanted(self) -> tuple[int | None, bool]:
-        """The CRC that should be in force, and whether the last push has come to its end. None: no push yet, or it is under way.
+        """The CRC that should be in force, and whether the last push has ended. None: no push yet, or one is under way.
 
-        A push that came to nothing vouches for nothing: the table that it found in force may be a strange one.
+        A push without effect does not confirm the table that it found in force.
         """
         if not self.entries:
             return None, True
@@ -191,30 +191,30 @@ class JournalView:
 
     @property
     def changes(self) -> list[JournalEntry]:
-        """Entries that brought a table into force for good: kept, or vouched for by a person. A push that came back is none."""
+        """Entries that put a table into force permanently: kept, or accepted by a person. Pushes that were rolled back do not count."""
         return [e for e in self.entries if e.state in (PushState.KEEP, PushState.ACCEPTED)]
 
     def kept(self, before: datetime | None = None) -> list[PushFacts]:
-        """The pushes that were kept, oldest first; ``before``: up to then."""
+        """Kept pushes, oldest first, up to the time ``before``."""
         keeps = [e for e in self.entries if e.state is PushState.KEEP]
         return [self.facts(e.push) for e in keeps if before is None or datetime.fromisoformat(e.utc) <= before]
 
     @property
     def last_kept_s(self) -> float:
-        """When a push was kept last, UTC; minus infinity for never."""
+        """Time of the last kept push, seconds since the epoch; minus infinity for never."""
         keeps = [e.utc for e in self.entries if e.state is PushState.KEEP]
         return datetime.fromisoformat(keeps[-1]).timestamp() if keeps else float("-inf")
 
     def bases(self) -> Iterator[PushFacts]:
-        """What each push found in force."""
+        """The table that each push found in force."""
         return (facts((e,)) for e in self.entries if e.state is PushState.SNAPSHOT)
 
     def of_proposal(self, proposal: int, after: int = 0) -> JobOutcome | None:
-        """How the last push of a proposal stands, of those later than push ``after``; None: the journal has none, nothing was written."""
+        """Outcome of the proposal's last push later than push ``after``; None: the journal has none, nothing was written."""
         return self._last_own(lambda number, origin: number > after and origin.proposal == proposal, TableNames())
 
     def of_order(self, order: str) -> JobOutcome | None:
-        """How the push of an ordered rollback stands; None: the journal has none, nothing was written."""
+        """Outcome of an ordered rollback; None: the journal has none, nothing was written."""
         return self._last_own(lambda _, origin: origin.order == order, BACK)
 
     def _last_own(self, own: Callable[[int, TableOrigin], bool], names: TableNames) -> JobOutcome | None:
@@ -223,17 +223,17 @@ class JournalView:
 
     @property
     def open_push(self) -> str:
-        """What is open of the last push, as a sentence; empty if nothing is."""
+        """The open state of the last push as a sentence; empty if it has ended."""
         found = outcome_of(self.pushes[max(self.pushes)]) if self.pushes else None
         return found.text if found is not None and found.word == OPEN else ""
 
     def last_kept(self) -> Journal:
-        """The last push that was kept and can be taken back.
+        """The last kept push, if it can be rolled back.
 
         Raises
         ------
         TableRefused
-            None was kept, or it was a rollback itself.
+            No push was kept, or the last kept push was a rollback.
         """
         kept = [j for j in self.pushes.values() if ended_as(j) is PushState.KEEP]
         if not kept:
@@ -246,12 +246,12 @@ class JournalView:
         return kept[-1]
 
     def offer(self) -> RollbackOffer:
-        """What can be ordered back now.
+        """The rollback that is possible now.
 
         Raises
         ------
         TableRefused
-            Nothing, and why.
+            None is possible; the message gives the reason.
         """
         if not self.entries:
             raise TableRefused("no push of this machine is in the journal: there is nothing to take back", NOTHING)
@@ -269,7 +269,7 @@ class JournalView:
         return RollbackOffer(last[-1].push, crc, known.base_crc)
 
     def history(self) -> TableHistory:
-        """Everything of the machine's tables, newest push first."""
+        """History of the machine's tables, newest push first."""
         summaries = tuple(self._summary(journal) for journal in self.pushes.values())
         try:
             offer, refusal = self.offer(), ""
@@ -280,7 +280,7 @@ class JournalView:
     def _summary(self, journal: Journal) -> PushSummary:
         last, known, origin = journal[-1], facts(journal), self.origin(journal)
         outcome = outcome_of(journal, BACK if origin.kind == KIND else TableNames())
-        # What was in force when it ended need not be now: of a push that has ended only the cause is given.
+        # The table that was in force at the end of a push need not be in force now: an ended push shows only its cause.
         ended = {PushState.KEEP: known.verify, PushState.ROLLED_BACK: known.why, PushState.ABORTED: known.why}
         return PushSummary(
             last.push, origin.kind, origin.proposal, known.crc, known.base_crc, journal[0].utc, last.utc, str(last.state),
@@ -305,13 +305,14 @@ class JournalView:
 
 
 def origins_of(store: Store) -> dict[int, TableOrigin]:
-    """Why each stored table was pushed, by its number."""
+    """Origin of each stored table, by number."""
     return {table.id: TableOrigin.of(table.doc) for table in store.tables.all()}
 
 
 def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
-    """What is open of a machine's last push, and of every push of another journal whose table nothing has verified and may be in force:
-    it may be that of this control, under another name or address.
+    """Open pushes: the machine's own last one, and those of other journals whose unverified table may be in force.
+
+    Another journal may belong to the same control under another name or address.
     """
     chain, own = store.pushes.chain(machine, control), JournalView.read(store, machine, control).open_push
     others = [p for p in known_tables(store).unverified.values() if p.may_be_active and p.chain != chain]
@@ -325,7 +326,7 @@ def _other(push: PushedTable) -> str:
 
 
 def ended_as(journal: Journal) -> PushState:
-    """The state in which a push stands or came to its end: a person's word for a table, given later, changes nothing of that."""
+    """Current or final state of a push, ignoring a later acceptance by a person."""
     return next((e.state for e in reversed(journal) if e.state is not PushState.ACCEPTED), PushState.ACCEPTED)
 
 
@@ -342,7 +343,7 @@ def push_log(journal: Journal) -> tuple[str, ...]:
 
 
 def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome:
-    """How a push stands by its journal."""
+    """Outcome of a push from its journal."""
     last, known = journal[-1], facts(journal)
     name, why = f"push {last.push}", known.why
     match last.state:
@@ -368,7 +369,7 @@ def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome
 
 
 def reconciled(found: JobOutcome | None, reported: JobOutcome) -> JobOutcome:
-    """What was reported of a push, put right by the journal (None: it says nothing): the journal says what is in force."""
+    """Correct the reported outcome of a push by that of the journal (None: no entry), which decides what is in force."""
     if found is None:
         return reported if reported.word in ("refused", STOPPED) else JobOutcome("failed", reported.text)
     if found.word == reported.word:
@@ -378,7 +379,7 @@ def reconciled(found: JobOutcome | None, reported: JobOutcome) -> JobOutcome:
 
 
 def operator_needed(journal: Journal, detail: str = "") -> TableMismatch:
-    """What a person has to know whom the machine calls: why, and whether the table that nothing has verified is the one in force."""
+    """Error for a push that needs a person: the cause, and whether the unverified table is in force."""
     known = facts(journal)
     cause = f"{detail}; {known.why}" if detail and detail != known.why else known.why
     if known.controller.in_force == known.crc != NOT_YET:

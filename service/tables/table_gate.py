@@ -1,4 +1,4 @@
-"""The one gate before anything moves or is built on a table: what is in force is verified here, vouched for, or no correction at all."""
+"""The gate before any motion or use of a table: the table in force must be verified, accepted by a person, or correct nothing."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ ACCEPT = (
 
 @dataclass(frozen=True, slots=True)
 class InForceNow:
-    """A table in force as all journals of the database know it.
+    """The table in force, judged by all journals of the database.
 
-    ``unverified``: the push that brought it, if nothing has verified it; ``strange``: it corrects something, and no journal has it;
-    ``elsewhere``: it corrects something, and only the journals of other controls say that it is right.
+    ``unverified``: the push that wrote it, if nothing has verified it; ``strange``: it corrects something and is in no journal;
+    ``elsewhere``: it corrects something and is endorsed for other controls only.
     """
 
     status: CompStatus
@@ -46,13 +46,14 @@ class InForceNow:
 
 
 async def look(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
-    """Ask the controller which table acts, and the journals which that is. Its content is read only where ``chain``, the journal of this
-    control, does not say that it is right, and once for each CRC where ``corrects`` keeps what was read.
+    """Identify the active table by the journals. Its content is read only if ``chain``, the journal of this control, does not endorse it.
+
+    ``corrects`` caches by CRC whether a table corrects anything.
 
     Raises
     ------
     TableMismatch
-        A table that no journal has does not have the CRC that the controller states.
+        The content of an unknown table does not match the CRC that the controller states.
     """
     now = await controller.comp_status()
     crc = now.bank_crc[now.active_bank]
@@ -66,7 +67,7 @@ async def look(controller: TableController, known: KnownTables, chain: str, corr
 
 
 async def _corrects(controller: TableController, now: CompStatus) -> bool:
-    """Whether the active bank holds any correction. What cannot be read is taken for one."""
+    """Whether the active bank holds any correction. An unreadable table counts as one."""
     if now.bank_state[now.active_bank] is not BankState.SEALED:
         return False
     base = await read_base(controller)
@@ -78,12 +79,12 @@ async def _corrects(controller: TableController, now: CompStatus) -> bool:
 
 
 async def check_in_force(controller: TableController, store: Store, site: Site) -> None:
-    """Refuse a table in force that no measurement has verified and no person has vouched for, under whatever name it was pushed.
+    """Refuse a table in force that is neither verified by a measurement nor accepted by a person.
 
     Raises
     ------
     TableMismatch
-        Whose table it is, or that this database did not push it; and what to do.
+        The message names the origin of the table and the remedy.
     """
     now = await look(controller, *await asyncio.to_thread(_journals, store, site))
     if now.unverified is not None:
@@ -115,9 +116,9 @@ def _remedy(site: Site, push: PushedTable) -> str:
 
 
 async def accept_strange(controller: TableController, store: Store, site: Site, by: str) -> str | None:
-    """Vouch for the table in force if this database did not push it, or only into other controls; returns what was done.
+    """Accept the table in force if this database did not push it into this control; return what was done.
 
-    A table that a push of this database brought and did not verify is not accepted in passing: that is `abbe accept-table`.
+    An unverified table of a push of this database is not accepted here: that takes `abbe accept-table`.
     """
     now = await look(controller, *await asyncio.to_thread(_journals, store, site))
     if not now.strange and now.elsewhere is None:
@@ -128,7 +129,7 @@ async def accept_strange(controller: TableController, store: Store, site: Site, 
 
 
 async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
-    """Write a person's word for the table in force into the journal of the control, whose last push has come to its end."""
+    """Record in the journal of the control that a person accepts the table in force. The last push must have ended."""
     book = await StoreBook.word(store, site.name, SystemClock(), site.control)
     journal = await book.entries()
     await book.append(
@@ -137,5 +138,5 @@ async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
 
 
 def acceptance_doc(now: CompStatus, by: str) -> Doc:
-    """What a journal keeps of a person's word."""
+    """Document of a journal entry by which a person accepts a table."""
     return {"accepted_bank": now.active_bank, "accepted_crc": now.bank_crc[now.active_bank], "by": by}

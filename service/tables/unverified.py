@@ -1,8 +1,8 @@
-"""Which tables the journals of a database know, and which of them nothing has verified, whatever a machine is called.
+"""Tables in the journals of a database, under any machine name, and which of them nothing has verified.
 
-A control is known by its address alone (`abbe.service.devices.urls.control_of`), and a table carries a number drawn by lot: so the CRC in
-force is held against all journals, and nothing is built on a table that a push brought and that was neither kept nor vouched for. What is
-kept or vouched for on one control is so there only: the errors of another machine are others.
+A control is known by its address alone (`abbe.service.devices.urls.control_of`), and each table carries a random number. The CRC is
+therefore looked up in all journals, and a pushed table that was neither kept nor accepted is never built upon. An endorsement holds for
+one control only, because another machine has other errors.
 """
 
 from __future__ import annotations
@@ -19,15 +19,12 @@ from abbe.service.storage.store import Store
 
 How = Literal["verified", "accepted", "found in force"]
 Row = tuple[Hashable, str, Doc]
-"""Push, state, and what became known with it."""
+"""Push, state, and the document of the entry."""
 
 
 @dataclass(frozen=True, slots=True)
 class PushedTable:
-    """A push as all journals tell it: under which machine's name, into which control (empty: not noted), and where it stands.
-
-    ``chain``: name of its journal.
-    """
+    """A push: name of its journal (``chain``), machine name, control (empty: not recorded), and last state."""
 
     chain: str
     push: int
@@ -37,20 +34,20 @@ class PushedTable:
 
     @property
     def open(self) -> bool:
-        """It has not come to its end, or a person has to look."""
+        """Whether the push has not ended or waits for a person."""
         return self.state not in TERMINAL or self.state == PushState.OPERATOR
 
     @property
     def may_be_active(self) -> bool:
-        """Its table may be in force."""
+        """Whether the table of the push may be in force."""
         return self.open and self.state not in BEFORE_ACTIVATION
 
 
 @dataclass(frozen=True, slots=True)
 class Endorsement:
-    """Why a table is right on one control: a push kept it there, a person vouched for it, or the first push found it in force.
+    """Why a table is valid on one control: a push kept it, a person accepted it, or the first push found it in force.
 
-    ``push``: 0 for a person's word before the first; ``by``: who vouched, empty for no person.
+    ``push``: 0 for an acceptance before the first push; ``by``: who accepted it, empty for no person.
     """
 
     how: How
@@ -61,7 +58,7 @@ class Endorsement:
 
     @property
     def not_here(self) -> str:
-        """The same said of another machine."""
+        """Text for another machine, on which the endorsement does not hold."""
         push = f" (push {self.push})" if self.push and self.how == "verified" else ""
         return f"{self.how} on machine {self.machine!r}{push}, not on this one"
 
@@ -70,8 +67,8 @@ class Endorsement:
 class KnownTables:
     """Tables by their CRC, over all journals of a database.
 
-    ``unverified``: which push brought it; ``known_crcs``: every table that a push brought or found in force, or that a person vouched for;
-    ``pushed``: the last push of each; ``endorsed``: in which journals it is right, and why.
+    ``unverified``: the push that wrote it; ``known_crcs``: every table that a push wrote or found in force, or that a person accepted;
+    ``pushed``: the last push of each; ``endorsed``: endorsements by journal.
     """
 
     unverified: dict[int, PushedTable]
@@ -80,9 +77,9 @@ class KnownTables:
     endorsed: dict[int, dict[str, Endorsement]]
 
     def elsewhere(self, crc: int, chain: str) -> Endorsement | None:
-        """Where a table is right that is not known to be so in this journal; None if it is, or is nowhere."""
-        where = self.endorsed.get(crc, {})
-        return None if chain in where else max(where.values(), key=lambda one: (one.how == "verified", one.utc), default=None)
+        """Best endorsement of a table in other journals; None if this journal endorses it, or none does."""
+        journals = self.endorsed.get(crc, {})
+        return None if chain in journals else max(journals.values(), key=lambda one: (one.how == "verified", one.utc), default=None)
 
 
 def known_tables(store: Store) -> KnownTables:
@@ -112,21 +109,21 @@ def known_tables(store: Store) -> KnownTables:
 
 
 def _add(endorsed: dict[int, dict[str, Endorsement]], crc: int, how: How, push: PushedTable, mark: PushEntryRecord) -> None:
-    """Note why a table is right in a journal; that a later push found it in force says less than what is there."""
+    """Add an endorsement to a journal; "found in force" never replaces an earlier one."""
     one = Endorsement(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
-    where, chain = endorsed.setdefault(crc, {}), push.chain
-    if how != "found in force" or chain not in where:
-        where[chain] = one
+    journals, chain = endorsed.setdefault(crc, {}), push.chain
+    if how != "found in force" or chain not in journals:
+        journals[chain] = one
 
 
 def unverified_crcs(entries: Sequence[JournalEntry]) -> dict[int, int]:
-    """Which tables of one journal were neither kept nor vouched for: CRC -> number of the push."""
+    """Tables of one journal that were neither kept nor accepted: CRC -> number of the push."""
     found = _unverified([(e.push, e.state, e.doc) for e in entries])
     return {crc: push for crc, push in found.items() if isinstance(push, int)}
 
 
 def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
-    """A table that was in force before a push was put there by a person, unless an earlier push had brought it and not kept it."""
+    """Unverified tables. A table found in force before a push is a person's, unless an earlier push wrote it and did not keep it."""
     candidates: dict[int, Hashable] = {}
     pushed: dict[Hashable, int] = {}
     endorsed: set[int] = set()

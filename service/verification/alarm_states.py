@@ -1,8 +1,8 @@
-"""Alarms as a pure state machine: raised, held, acknowledged, cleared; and how far what was done about one has come.
+"""Alarms as a pure state machine: raised, held, acknowledged, cleared; and the progress of the work on them.
 
-An alarm belongs to one recipe of one machine and is the sum of its lines, which are only ever appended. It is raised by a check with a
-signal, held by every check that does not clear it, and cleared by a check without a signal whose verdict is "pass": one that cannot tell
-clears nothing. Whether a person acknowledged it is another question: a cleared alarm stays to be seen until somebody has.
+An alarm belongs to one recipe of one machine and is the sum of its append-only lines. A check with a signal raises it, every check that does
+not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not). Acknowledging is
+independent: a cleared alarm remains visible until a person acknowledges it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Doc = dict[str, Any]
 
 
 class AlarmKind(StrEnum):
-    """What a line says. The first four are of the alarm itself, the others of what the service does about it."""
+    """Kind of a line. The first four change the alarm itself, the others record the service's work on it."""
 
     RAISED = "raised"
     HELD = "held"
@@ -43,9 +43,9 @@ OF_WORK = (
     AlarmKind.PUSHED,
 )
 TRIES = 2
-"""How often a step of an investigation may fail, or a campaign not come to its end, before a person takes over."""
+"""Failures of a step, or unfinished campaigns, after which a person takes over."""
 NO_ALARM = 0
-"""Number under which pushes are noted that no alarm has asked for."""
+"""Number under which pushes without an alarm are recorded."""
 
 
 class AlarmLine(Protocol):
@@ -53,7 +53,7 @@ class AlarmLine(Protocol):
 
     @property
     def alarm(self) -> int:
-        """Which alarm."""
+        """Number of the alarm."""
         ...
 
     @property
@@ -63,17 +63,17 @@ class AlarmLine(Protocol):
 
     @property
     def kind(self) -> str:
-        """What it says."""
+        """Kind of the line."""
         ...
 
     @property
     def doc(self) -> Doc:
-        """What is known."""
+        """Document of the line."""
         ...
 
     @property
     def utc(self) -> str:
-        """When."""
+        """Time of the line, UTC."""
         ...
 
 
@@ -81,8 +81,8 @@ class AlarmLine(Protocol):
 class Signal:
     """Why a check raises an alarm: one figure and one reason, with the figures behind it.
 
-    ``kind``: ``limit`` (above its limit by more than U), ``jump``, ``drift``, ``days``. ``baseline``, ``baseline_u``: what the figure is
-    compared with by ``jump`` and its standard uncertainty.
+    ``kind``: ``limit`` (above its limit by more than U), ``jump``, ``drift``, ``days``. ``baseline``, ``baseline_u``: reference value of
+    ``jump`` and its standard uncertainty.
     """
 
     figure: str
@@ -97,7 +97,7 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class FiredRule:
-    """What a check says of alarms. ``judged``: whether its figures can be judged at all (it was measured, and in its air)."""
+    """Result of a check for the alarms. ``judged``: whether its figures can be judged (measured, and within the allowed temperature)."""
 
     judged: bool
     verdict: str
@@ -121,7 +121,7 @@ class AlarmStep:
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """An alarm as its lines leave it. ``signals``: of the check that said something last; ``first``: of the one that raised it."""
+    """An alarm after all its lines. ``signals``: of the last check that raised or held it; ``first``: of the check that raised it."""
 
     number: int
     recipe: str
@@ -153,12 +153,12 @@ class Alarm:
 
     @property
     def outcome(self) -> str:
-        """What the work on it came to so far, as a sentence; empty if there is none."""
+        """Latest result of the work on the alarm as a sentence; empty without any."""
         return str(self.work[-1].doc.get("text", "")) if self.work else ""
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
-    """What a check does to the active alarm of its recipe (None: there is none); None: nothing."""
+    """Effect of a check on the active alarm of its recipe (None: no alarm); None: no effect."""
     if not found.judged:
         return None
     if now is None or not now.active:
@@ -167,7 +167,7 @@ def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
 
 
 def folded(lines: Iterable[AlarmLine]) -> list[Alarm]:
-    """All alarms from their lines, oldest first. Lines that cannot follow (an alarm that was never raised) are left out."""
+    """All alarms from their lines, oldest first. Lines of an alarm that was never raised are ignored."""
     found: dict[int, Alarm] = {}
     for line in lines:
         if line.kind == AlarmKind.RAISED:
@@ -210,14 +210,14 @@ def _followed(alarm: Alarm, line: AlarmLine) -> Alarm:
 
 
 def is_open(alarm: Alarm) -> bool:
-    """Whether a person should see it: active, or not acknowledged."""
+    """Whether an alarm needs attention: active, or not acknowledged."""
     return alarm.word != "closed"
 
 
 def next_step(alarm: Alarm) -> AlarmKind | None:
-    """What the service has to do next about an alarm that is to be investigated; None: nothing now.
+    """Next step of the service in the investigation of an alarm; None: nothing to do now.
 
-    A try that failed is made once more, after the next check that holds the alarm; a try that was interrupted goes on where its lines end.
+    A failed step is retried once, after the next check that holds the alarm. An interrupted step resumes from its lines.
     """
     if not alarm.active or alarm.last(AlarmKind.PROPOSED, AlarmKind.ENDED) is not None:
         return None

@@ -1,4 +1,4 @@
-"""Alarms in the store: looked at after each check, read for pages and commands, acknowledged by a person."""
+"""Alarms in the store: evaluated after each check, read by pages and commands, acknowledged by people."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, 
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
 from abbe.service.verification.verify import judge
 
-# Which signals a machine's checks give: above a limit, a jump, a drift, few days until the limit. From stored verifications alone.
+# Signals of a machine's checks, from stored verifications alone: above a limit, a jump, a drift, few days until the limit.
 
 
 NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
@@ -27,9 +27,9 @@ NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
 
 @dataclass(frozen=True, slots=True)
 class AlarmTerms:
-    """What counts: checks of ``recipe`` after ``begins_utc``; ``warn_days``: 0 for no warning ahead.
+    """Terms of an evaluation: checks of ``recipe`` after ``begins_utc``; ``warn_days``: 0 for no warning ahead of the limit.
 
-    ``compare``: figure -> value and standard uncertainty before the alarm that is active now: what jumped must not become habit.
+    ``compare``: figure -> value and standard uncertainty before the active alarm, so that a jump does not become its own reference.
     """
 
     recipe: str
@@ -39,15 +39,7 @@ class AlarmTerms:
 
 
 def found_in(records: Sequence[VerificationRecord], terms: AlarmTerms) -> FiredRule:
-    """What the latest check of a recipe says of alarms, beside those before it.
-
-    Parameters
-    ----------
-    records : sequence of VerificationRecord
-        Checks of one machine, newest first, as the store gives them.
-    terms : AlarmTerms
-        Which of them count.
-    """
+    """Signals of the latest check of a recipe, compared with earlier ones. ``records``: checks of one machine, newest first."""
     mine = [r for r in records if r.doc.get("recipe") == terms.recipe]
     if not mine or not mine[0].doc.get("values") or not mine[0].doc.get("comparable", True):
         return FiredRule(False, "cannot tell")
@@ -77,7 +69,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
-    """What the latest figure is compared with while too few checks have shown their spread."""
+    """Reference value and standard uncertainty for the latest figure while too few checks show their spread."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
         return kept
@@ -88,12 +80,12 @@ def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: Alar
 
 
 READ_CHECKS = 4 * MOST_CHECKS
-"""Checks that are looked at: of several recipes, a multiple of what the trend uses of one."""
+"""Checks to read: of several recipes, so a multiple of what the trend uses of one."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmCheck:
-    """What a check means for the alarm of its recipe: ``kind`` None: nothing."""
+    """Effect of a check on the alarm of its recipe; ``kind`` None: no effect."""
 
     kind: AlarmKind | None
     now: Alarm | None
@@ -106,12 +98,12 @@ def alarms_of(store: Store, machine: str) -> list[Alarm]:
 
 
 def open_alarms(store: Store, machine: str) -> list[Alarm]:
-    """Those that a person should see: active, or not acknowledged; the newest first."""
+    """Alarms that are active or not acknowledged, newest first."""
     return [one for one in reversed(alarms_of(store, machine)) if is_open(one)]
 
 
 def alarm_doc(one: Alarm) -> Doc:
-    """An alarm as JSON value, for page, MQTT and commands."""
+    """JSON value of an alarm for page, MQTT and commands."""
     return {
         "alarm": one.number,
         "state": one.word,
@@ -131,14 +123,14 @@ def alarm_doc(one: Alarm) -> Doc:
 
 
 def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
-    """Note that a person has seen an alarm.
+    """Record that a person acknowledged an alarm.
 
     Raises
     ------
     NotStored
-        There is no such alarm.
+        The alarm does not exist.
     StoreError
-        Somebody has acknowledged it.
+        The alarm is already acknowledged.
     """
     one = alarm_numbered(store, machine, number)
     if one.acknowledged_by:
@@ -148,7 +140,7 @@ def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
 
 
 def alarm_numbered(store: Store, machine: str, number: int) -> Alarm:
-    """One alarm; NotStored if there is none."""
+    """One alarm by its number; raises `NotStored` if it does not exist."""
     found = next((one for one in alarms_of(store, machine) if one.number == number), None)
     if found is None:
         raise NotStored(f"{machine} has no alarm {number}", "abbe alarm list shows those there are")
@@ -156,21 +148,21 @@ def alarm_numbered(store: Store, machine: str, number: int) -> Alarm:
 
 
 def active_alarm(store: Store, machine: str, recipe: str) -> Alarm | None:
-    """The active alarm of a recipe; there is at most one."""
+    """The only active alarm of a recipe, or None."""
     return next((one for one in reversed(alarms_of(store, machine)) if one.active and one.recipe == recipe), None)
 
 
 def series_begins(store: Store, machine: str) -> datetime | None:
-    """When the table in force came into force: checks before it are of another machine. None: Abbe has brought none into force.
+    """When the table in force came into force; earlier checks do not compare. None: Abbe has put none into force.
 
-    A push that came back leaves the series as it is; tables that others have written are not known here.
+    A push that was rolled back does not begin a new series. Tables written by others are unknown here.
     """
     changed = JournalView.read(store, machine, origins=False).changes
     return datetime.fromisoformat(changed[-1].utc) if changed else None
 
 
 def look(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> AlarmCheck:
-    """Hold the latest check of a recipe against those before it and against the alarm that is active. Nothing is written."""
+    """Compare the latest check of a recipe with earlier ones and with the active alarm. Nothing is written."""
     begins, now = series_begins(store, machine), active_alarm(store, machine, recipe)
     compare = None
     if now is not None and (begins is None or begins < datetime.fromisoformat(now.raised_utc)):
@@ -180,11 +172,11 @@ def look(store: Store, machine: str, recipe: str, records: Sequence[Verification
 
 
 def check_line(check: AlarmCheck, recipe: str, schedule: str, verification: int) -> Doc:
-    """The document of the line that a check writes."""
+    """Document of the alarm line of a check."""
     signals = [asdict(s) for s in check.found.signals]
     return {"recipe": recipe, "schedule": schedule, "verification": verification, "signals": signals, "text": check.found.text}
 
 
 def last_seq(entries: Sequence[AlarmEntryRecord], number: int) -> int:
-    """Number of the last line of an alarm; -1 if there is none."""
+    """Number of the last line of an alarm; -1 for none."""
     return max((e.seq for e in entries if e.alarm == number), default=-1)
