@@ -1,1 +1,1 @@
-"""Demonstrations: the whole job on simulated machines."""
+"""Demonstrations: measure, correct and verify simulated machines."""

@@ -1,7 +1,7 @@
-"""The demonstration: the whole job on a simulated machine over real wires.
+"""The demonstration: measure, correct and verify a simulated machine over real connections.
 
-identify -> measure (before) -> commission -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth says
-how well it went.
+identify -> measure (before) -> commission -> solve -> push -> measure (after) -> keep or roll back; then the simulator's sealed truth shows
+how good the result is.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store
 
 MAX_SAMPLES_PER_S = 6000
-"""Ball-bar samples per wall second that the demonstration asks for at most, so that a small PC follows at high speed."""
+"""Largest number of ball-bar samples per wall-clock second, so that a small PC keeps up at high speed."""
 
 CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
-"""Simulated instruments are as good as their simulator says, for ever."""
+"""Simulated instruments need no calibration."""
 FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
-"""Nobody has ever corrected these machines: their first tables replace nothing by everything, as a person would allow after a look."""
+"""Wide limits: the first table of an uncorrected machine replaces no correction by the whole one."""
 
 
 @dataclass
 class DemoResult:
-    """Everything the demonstration found; the command line prints it, the report shows it."""
+    """Results of the demonstration, for the command line and the report."""
 
     seed: int
     speed: float
@@ -57,7 +57,7 @@ def bar_rate_hz(speed: float) -> int:
 
 
 def demo_site(ready: dict[str, Any]) -> Site:
-    """The machine file's content for a simulated machine: its nominal geometry and where its devices listen."""
+    """Site of a simulated machine: its nominal geometry and the addresses of its devices."""
     machine = machine_from_doc(ready["machine"])
     urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
     return Site(
@@ -66,7 +66,7 @@ def demo_site(ready: dict[str, Any]) -> Site:
 
 
 def write_machine_file(site: Site, folder: Path) -> Path:
-    """A machine file for the running simulated machine, so that other commands can talk to it."""
+    """Write a machine file for the running simulated machine, so that other commands can use it."""
 
     def row(values: Any) -> str:
         return "[" + ", ".join(f"{float(v):g}" for v in values) + "]"
@@ -91,12 +91,12 @@ def write_machine_file(site: Site, folder: Path) -> Path:
 
 
 async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink, clock: Clock | None = None) -> DemoResult:
-    """Run the whole job on a simulated machine; ``folder`` keeps database, machine file and tables.
+    """Measure, correct and verify a simulated machine; ``folder`` receives database, machine file and tables.
 
     Raises
     ------
     AbbeError, DriverError
-        One cause, one remedy. The simulators are gone in any case.
+        With one cause and one remedy. The simulators are stopped in any case.
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()

@@ -1,6 +1,6 @@
-"""The demonstration of a discovery: a simulated machine that may hide an effect, and Abbe does not know which.
+"""The demonstration of a discovery on a simulated machine that may hide an effect unknown to Abbe.
 
-measure -> search -> model book -> measure anew -> does the model hold? -> tables or remedy; the simulator's sealed truth is opened last.
+measure -> search -> model book -> new measurement -> test of the model -> tables or remedy; the simulator's sealed truth is read last.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 MOST = 5000
-"""Readings that are searched one by one: a point every 2 to 6 mm, and the search takes a quarter of the time."""
+"""Largest number of ball-bar readings in the search: one every 2 to 6 mm, in a quarter of the time."""
 CAMPAIGN, ANEW = "discover", "anew"
 
 
 @dataclass
 class HiddenDemo:
-    """Everything that the demonstration found, in the order in which it found it.
+    """Results of the demonstration, in the order of the job.
 
-    ``refused``: why no table was written where one was tried; ``truth``: the simulator's own words, opened at the end.
+    ``refused``: why a table was not written; ``truth``: the simulator's sealed truth, read at the end.
     """
 
     simulator_args: list[str]
@@ -64,21 +64,21 @@ class HiddenDemo:
 async def run_hidden_demo(
     simulator_args: list[str], speed: float, folder: Path, progress: ProgressSink, *, tables: bool = True, clock: Clock | None = None
 ) -> HiddenDemo:
-    """Play a discovery on a simulated machine over real wires.
+    """Run a discovery on a simulated machine over real connections.
 
     Parameters
     ----------
     simulator_args : list of str
-        Arguments of the simulators: ``--hidden SEED``, or a scenario file, which stays unread here.
+        Arguments of the simulators: ``--hidden SEED``, or a scenario file, which is not read here.
     folder : Path
-        Keeps database and machine file.
+        Receives database and machine file.
     tables : bool
-        Whether tables for what tables take out are made and tried where the gap was explained.
+        Whether to write and verify tables if the gap was explained.
 
     Raises
     ------
     AbbeError, DriverError
-        One cause, one remedy. The simulators are gone in any case.
+        With one cause and one remedy. The simulators are stopped in any case.
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()
@@ -104,7 +104,7 @@ def few(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 async def _job(session: Session, store: Store, result: HiddenDemo, progress: ProgressSink, speed: float, *, tables: bool) -> None:
-    site, rate = result.site, bar_rate_hz(2.0 * speed)  # half of what a small PC follows: it has hidden effects to move, too
+    site, rate = result.site, bar_rate_hz(2.0 * speed)  # half the usual rate: hidden effects need computing time
     await measure(session, store, site, discovery_campaign(site.machine, rate_hz=rate, name=CAMPAIGN), progress=progress)
     old = await asyncio.to_thread(from_store, store, CAMPAIGN)
     job = await asyncio.to_thread(prepare, old, catalogue(), current(store, site.name), thin=few)
@@ -120,14 +120,14 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
         return
     try:
         await commission(session, store, site, progress=progress)
-        before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the verification, as tables are judged
+        before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the runs of the verification
         result.correction = await correct(PushContext(session, store, site, progress, rate_hz=rate), CAMPAIGN, before)
     except (TableRefused, NotObservable) as error:
         result.refused = str(error)
 
 
 async def _search(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> Finding:
-    """The search, off the event loop; stopped, it ends with its next word about how far it is."""
+    """Search in a thread. After a cancellation it ends with its next report of progress."""
     stopped = threading.Event()
 
     def checked_progress(p: Progress) -> None:

@@ -1,4 +1,4 @@
-"""The story of a discovery's demonstration, as lines for the terminal and as JSON; the sealed truth judges at the end."""
+"""Results of a discovery's demonstration as lines for the terminal and as JSON, judged by the sealed truth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FORMAT = "abbe-hidden-demo/1"
 
 
 def summary_lines(result: HiddenDemo) -> list[str]:
-    """What happened, one line a thing to know, in the order in which it happened."""
+    """Results line by line, in the order of the job."""
     finding = result.finding
     _, word, text = verdict_of(finding)
     lines = [f"measured: {len(finding.runs)} runs, {sum(r.readings for r in finding.runs.values())} readings"]
@@ -56,7 +56,7 @@ def _tables(result: HiddenDemo) -> list[str]:
 
 
 def hidden_label(truth: dict[str, Any]) -> str | None:
-    """What was hidden as ``name:key``; None if nothing was."""
+    """The hidden effect as ``name:key``; None if nothing was hidden."""
     secret = truth.get("hidden")
     if secret is None:
         return None
@@ -64,9 +64,9 @@ def hidden_label(truth: dict[str, Any]) -> str | None:
 
 
 def judged(result: HiddenDemo) -> tuple[bool, str]:
-    """Whether the answer was right, and the sentence that says so.
+    """Whether the answer was right, and a sentence about it.
 
-    Right is: the hidden name and key and no other; ``none`` where nothing is hidden; ``unknown`` where the catalogue has no such name.
+    Right answers: exactly the hidden name and key; ``none`` if nothing is hidden; ``unknown`` if the catalogue lacks the hidden effect.
     """
     label, finding = hidden_label(result.truth), result.finding
     named = [e.label for e in finding.effects]
@@ -84,7 +84,7 @@ def judged(result: HiddenDemo) -> tuple[bool, str]:
 
 
 def truth_lines(result: HiddenDemo) -> list[str]:
-    """The sealed truth beside the answer."""
+    """Lines that compare the answer with the sealed truth."""
     right, text = judged(result)
     lines = [f"sealed truth: {text}. {'RIGHT' if right else 'WRONG'}."]
     secret = result.truth.get("hidden")
@@ -96,7 +96,7 @@ def truth_lines(result: HiddenDemo) -> list[str]:
 
 
 def hidden_json(result: HiddenDemo) -> dict[str, Any]:
-    """What `abbe demo --hidden SEED --json` prints."""
+    """JSON output of `abbe demo --hidden SEED --json`."""
     finding, c = result.finding, result.correction
     fields = ("label", "name", "key", "strength", "u_strength", "unit", "remedy", "remedy_text")
     right, text = judged(result)

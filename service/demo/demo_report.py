@@ -42,7 +42,7 @@ TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
 
 
 def demo_json(result: DemoResult) -> dict[str, Any]:
-    """What `abbe demo --json` prints: sealed-truth figures, the bound of nine tables, measured figures with uncertainty."""
+    """JSON output of `abbe demo --json`: sealed-truth figures, the bound of nine tables, measured figures with uncertainty."""
     before, after = result.truth_before, result.truth_after
     out: dict[str, Any] = {"format": "abbe-demo/1", "seed": result.seed, "speed": result.speed}
     out |= {key: {"before": before[key], "after": after[key]} for key in TRUTH_KEYS}
@@ -111,12 +111,12 @@ def _tables(t: NineTables) -> list[TableCurve]:
 
 
 def demo_report(result: DemoResult) -> Document:
-    """What the demonstration found: before and after, parameters, tables, residuals.
+    """Report of the demonstration: before and after, parameters, tables, residuals.
 
     Raises
     ------
     ValueError
-        The demonstration did not get as far as a correction.
+        The demonstration ended before a correction.
     """
     c = result.correction
     if c is None:

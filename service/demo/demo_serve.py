@@ -1,8 +1,7 @@
-"""The demonstration with ``--serve``: the service watches a machine, it drifts, and a proposal waits for a person.
+"""The demonstration with ``--serve``: the service watches a drifting machine and proposes a correction for approval.
 
-The service is the real one, a child process on a machine file that stands in the folder. The simulated machine drifts once the first
-scheduled check is in the store; all that follows, alarm, campaign, name of the effect, proposal, push and verification, the service does
-by itself. Only the approval is a person's.
+The service runs as a child process with the machine file in the folder. The simulated machine drifts after the first scheduled check. Alarm,
+campaign, discovery, proposal, push and verification follow automatically; only the approval needs a person.
 """
 
 from __future__ import annotations
@@ -43,19 +42,19 @@ from abbe.service.verification.verify import COVERAGE, figure_rows, figures
 T = TypeVar("T")
 
 DRIFT_UM_PER_M = 160.0
-"""What happens to the machine after its first check: X grows."""
+"""Scale error that X gains after the first check."""
 USER = "approver"
 EVERY_MIN = 2.0
-"""Minutes of the real clock between checks: at the usual speed of the demonstration hours of the machine."""
+"""Minutes of the real clock between checks, which are hours of the machine at the usual speed of the demonstration."""
 READY_S, STOP_S, LOOK_S = 30.0, 6.0, 0.5
 MAX_LOCKED_READS = 60
 MARGIN_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
-"""Nobody has corrected this machine, and it is good enough as it is: the limits are what it does today, U and so much more."""
+"""Margins of the limits: each limit is the figure of the uncorrected machine plus U plus this margin."""
 
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """Where the page is, and who may approve there."""
+    """Address of the page, user and password for the approval, log file."""
 
     page: str
     user: str
@@ -64,12 +63,12 @@ class Serving:
 
 
 async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show: Callable[[str], None]) -> None:
-    """Commission a simulated machine, let the service watch it, tell the story, and go on until somebody ends it.
+    """Commission a simulated machine, run the service on it, report the events, and serve until interrupted.
 
     Raises
     ------
     AbbeError, DriverError
-        One cause, one remedy. Service and simulators are gone in any case.
+        With one cause and one remedy. Service and simulators are stopped in any case.
     """
     async with running_simulators(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
         site = demo_site(simulator.ready)
@@ -92,15 +91,15 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show
 
 
 async def measured_limits(session: Session, store: Store, site: Site, rate_hz: int) -> dict[str, float]:
-    """Limits that the machine just keeps as it is now, µm."""
+    """Measure the machine and return limits that it just keeps, µm."""
     plan = paced(verification(site.machine, rate_hz=rate_hz, name="as it is"), site.max_feed_mm_min)
     ids = await measure(session, store, site, plan, progress=ignore_progress)
     rows = figure_rows(figures(await load_runs(store, ids)))
-    return {key: round(rows[key][0] + COVERAGE * rows[key][1] + room, 1) for key, room in MARGIN_UM.items()}
+    return {key: round(rows[key][0] + COVERAGE * rows[key][1] + margin, 1) for key, margin in MARGIN_UM.items()}
 
 
 async def store_baseline(session: Session, store: Store, site: Site, rate_hz: int) -> None:
-    """Measure and solve the machine as it is, and keep that; nothing is proposed."""
+    """Measure and solve the machine as delivered, and store the solution without a proposal."""
     plan = paced(identification(site.machine, rate_hz=rate_hz, name="as delivered"), site.max_feed_mm_min)
     ids = await measure(session, store, site, plan, progress=ignore_progress)
     solved = await asyncio.to_thread(solve_runs, site, await load_runs(store, ids))
@@ -109,7 +108,7 @@ async def store_baseline(session: Session, store: Store, site: Site, rate_hz: in
 
 
 def service_config(port: int, limits_um: dict[str, float]) -> str:
-    """What the machine file says more when it is served: a check every few minutes, and proposals by themselves."""
+    """Sections of the machine file for the service: page, limits, a check every few minutes, automatic proposals."""
     limits = "\n".join(f"{key} = {value:g}" for key, value in limits_um.items())
     return f"""
 [web]
@@ -131,7 +130,7 @@ on_alarm = "propose"
 
 
 def free_port(wanted: int) -> int:
-    """``wanted`` where nobody has it, or any other."""
+    """The port ``wanted`` if it is free, else any free port."""
     for port in (wanted, 0):
         with socket.socket() as one:
             try:
@@ -143,7 +142,7 @@ def free_port(wanted: int) -> int:
 
 
 def add_approver(store: Store, clock: Clock) -> str:
-    """A user who may approve; his password, which is nowhere else."""
+    """Add a user who may approve; return the new password, which is stored only as a hash."""
     password = secrets.token_urlsafe(12)
     People(store, clock).add(USER, "approver", password)
     return password
@@ -153,12 +152,12 @@ def add_approver(store: Store, clock: Clock) -> str:
 async def served(
     machine_file: Path, store: Store, port: int, limits_um: dict[str, float], clock: Clock | None = None
 ) -> AsyncIterator[Serving]:
-    """The service on this machine file, as long as the block lasts.
+    """Run the service on this machine file for the duration of the block.
 
     Raises
     ------
     AbbeError
-        It did not start; its log says why.
+        The service did not start; its log gives the reason.
     """
     port = free_port(port)
     with machine_file.open("a", encoding="utf-8") as out:
@@ -171,7 +170,7 @@ async def served(
             stdin=asyncio.subprocess.DEVNULL,
             stdout=out_log,
             stderr=out_log,
-            start_new_session=True,  # Ctrl-C at the terminal is for us: we end it
+            start_new_session=True,  # Ctrl-C reaches this process only, which stops the service
         )
     try:
         await _answers(process, port, log)
@@ -209,7 +208,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 async def drift(simulator: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -> None:
-    """Let the simulated machine's X axis grow. Only a simulator can be asked for that."""
+    """Add a scale error to the simulated machine's X axis."""
     host, port = str(simulator.ready["fixture"]).removeprefix("fixture+tcp://").rsplit(":", 1)
     reader, writer = await asyncio.open_connection(host, int(port))
     try:
@@ -223,12 +222,12 @@ async def drift(simulator: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -
 
 
 async def narrate(simulator: SimulatorProcess, machine: str, store: Store, serving: Serving, show: Callable[[str], None]) -> None:
-    """Say what happens, as it happens, one line each; ends when the alarm is over.
+    """Show one line per event until the alarm is cleared.
 
     Raises
     ------
     AbbeError
-        The simulated machine does not drift.
+        The simulated machine does not drift, or the service proposes nothing.
     """
     show(f"1. check by the timetable: {await _check(store, machine, 1)}")
     await drift(simulator)
@@ -254,24 +253,24 @@ async def narrate(simulator: SimulatorProcess, machine: str, store: Store, servi
 
 
 def _checks(store: Store, machine: str) -> list[str]:
-    """What the scheduled checks of a machine found, oldest first."""
+    """Results of the scheduled checks of a machine, oldest first."""
     number = next((m.id for m in store.machines.all() if m.name == machine), None)
     rows = [] if number is None else store.verifications.latest(number)
     return [str(v.doc.get("text", "")) for v in sorted(rows, key=lambda v: v.id) if v.doc.get("schedule")]
 
 
 async def _check(store: Store, machine: str, number: int) -> str:
-    """The text of the service's check ``number``, once there is one."""
+    """Wait for the service's check ``number``; return its text."""
     return (await _until(lambda: _checks(store, machine)[number - 1 :]))[0]
 
 
 async def _until(look: Callable[[], T | None]) -> T:
-    """Look until there is something. The service writes to the same database: one that is locked is looked at again, for a while.
+    """Poll until ``look`` finds something. Reads of a locked database are retried, because the service writes to it.
 
     Raises
     ------
     StoreError
-        It could not be read `MAX_LOCKED_READS` times on end.
+        `MAX_LOCKED_READS` reads failed in a row.
     """
     refused = 0
     while True:

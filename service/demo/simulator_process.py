@@ -1,7 +1,7 @@
-"""The simulated outside world as a child process: started, watched, and gone when we are gone.
+"""The simulators as a child process that never outlives this process.
 
-The product never imports the simulators: it starts them as a program, reads one line of JSON that says where the devices are, and talks to
-them over the wire like to any other device.
+The product never imports the simulators: it starts them as a program, reads one line of JSON with the addresses of the devices, and talks to
+them as to any other device.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ STOP_S = 3.0
 
 
 class SimulatorError(AbbeError):
-    """The simulator process could not be started or answered nonsense."""
+    """The simulator process did not start, failed, or gave an invalid answer."""
 
     code = "SIM-001"
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatorProcess:
-    """A running simulated machine: what its ready line said."""
+    """A running simulated machine with the content of its ready line."""
 
     ready: dict[str, Any]
     pid: int
@@ -38,21 +38,21 @@ class SimulatorProcess:
 
 @asynccontextmanager
 async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]:
-    """Start the simulators with these arguments; end them with the block, whatever ends it.
+    """Start the simulators with these arguments and stop them at the end of the block.
 
-    The child also ends by itself when its standard input closes, so that not even SIGKILL of this process leaves one behind.
+    The child also ends when its standard input closes, so that it does not survive even a SIGKILL of this process.
 
     Raises
     ------
     SimulatorError
-        It did not start; the child's own line says why.
+        They did not start; the message quotes the child's last line.
     """
     process = await asyncio.create_subprocess_exec(
         *python_words("abbe.simulators", *args, "--watch-stdin"),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C at the terminal is for us: we stop the machine first, then the world
+        start_new_session=True,  # Ctrl-C reaches this process only, which stops the machine before the simulators
     )
     try:
         yield SimulatorProcess(await _ready(process), process.pid)
@@ -87,19 +87,19 @@ async def _end(process: asyncio.subprocess.Process) -> None:
         except TimeoutError:
             process.kill()
             await process.wait()
-    # closes the pipes' transports here and now instead of when the garbage collector finds them
+    # close the pipes' transports now, not at garbage collection
     transport = getattr(process, "_transport", None)
     if transport is not None:
         transport.close()
 
 
 async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
-    """Ask the simulators' own evaluation what the machine really does, without and with a table. For demonstrations only.
+    """Read the true errors of the simulated machine, without or with a table (``bank``). For demonstrations only.
 
     Raises
     ------
     SimulatorError
-        It failed; the child's own line says why.
+        The command failed; the message quotes its output.
     """
     command = python_words("abbe.simulators", "truth", *args, "--arrows")
     if bank is not None:

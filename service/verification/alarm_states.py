@@ -1,7 +1,7 @@
 """Alarms as a pure state machine: raised, held, acknowledged, cleared; and the progress of the work on them.
 
-An alarm belongs to one recipe of one machine and is the sum of its append-only lines. A check with a signal raises it, every check that does
-not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not). Acknowledging is
+An alarm belongs to one recipe of one machine and is the sum of its append-only lines. A check with a signal raises it, every check that
+does not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not). Acknowledging is
 independent: a cleared alarm remains visible until a person acknowledges it.
 """
 

@@ -1,4 +1,4 @@
-"""Runs of one kind side by side: may they be compared, their curves on one scale, and is a difference larger than its uncertainty."""
+"""Comparison of runs of one kind: whether they are comparable, their curves on one scale, and differences with uncertainty."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from abbe.service.runs.helix_axis import about_axis, helix_axis, path_axis
 
 MOST = 4
 NEAR_RAD = 0.05
-"""Two readings of a ball-bar belong to the same place up to this angle: the deviation of a machine is smooth over it."""
+"""Two ball-bar readings within this angle belong to the same place: the deviation of a machine is smooth over it."""
 SAME_PLACE_MM = 0.5
 SAME_FEED = 0.01
-"""Feeds that differ by less than this share are one feed."""
+"""Feeds that differ by less than this share count as equal."""
 KIND = ("plane", "axis", "diagonal", "face", "order")
-"""Keys of a set-up that make another test of it, where it has them."""
+"""Keys of a set-up that must agree for two runs to be comparable."""
 PLACE = ("centre_mm", "radius_mm", "start_mm", "end_mm")
 UM = 1e3
 
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A run to be compared: name of its machine, its ``abbe-run/1`` object, its readings, its figures."""
+    """A run to compare: name of its machine, ``abbe-run/1`` object, readings and figures."""
 
     label: str
     machine: str
@@ -45,7 +45,7 @@ class LoadedRun:
 
 @dataclass(frozen=True, eq=False)
 class ComparedCurve:
-    """Deviation along a run, µm, noise, repeatability and calibration as standard uncertainty (NaN: not known).
+    """Deviation along a run, µm, with the standard uncertainty from noise, repeatability and calibration (NaN: unknown).
 
     ``x``: degrees about the axis of a ball-bar path, mm along a laser line. ``place``: direction of the bar, or ``x`` again, shape (n, k).
     """
@@ -59,7 +59,7 @@ class ComparedCurve:
 
 @dataclass(frozen=True, eq=False)
 class RunDifference:
-    """Second minus first where both were read: abscissa, µm, standard uncertainty; the largest and the rms."""
+    """Second minus first at places that both runs read: abscissa, difference, standard uncertainty."""
 
     x: F1
     difference_um: F1
@@ -67,19 +67,19 @@ class RunDifference:
 
     @property
     def largest(self) -> int:
-        """Index of the largest."""
+        """Index of the largest difference."""
         return int(np.argmax(np.abs(self.difference_um)))
 
     @property
     def beyond(self) -> float:
-        """Share of the places where the difference exceeds its U; NaN where no U is known."""
+        """Share of the places whose difference exceeds its U; NaN if no U is known."""
         known = np.isfinite(self.u_um) & (self.u_um > 0.0)
         return float((np.abs(self.difference_um) > COVERAGE * self.u_um)[known].mean()) if known.any() else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
 class FigureRow:
-    """One figure of all runs, value and standard uncertainty; of the last against the first: difference, u, whether larger than U."""
+    """One figure of all runs (value, standard uncertainty), and last minus first: difference, u, whether it exceeds U."""
 
     symbol: str
     name: str
@@ -91,7 +91,7 @@ class FigureRow:
 
 
 def against(first: LoadedRun, other: LoadedRun) -> str:
-    """Why two runs cannot be compared, in one line; empty if they can."""
+    """Reason why two runs are not comparable, in one line; empty if they are."""
     if first.machine != other.machine:
         names = f"{other.label} was measured on machine {other.machine}, {first.label} on {first.machine}"
         return f"{names}: runs of two machines have no difference"
@@ -108,7 +108,7 @@ def against(first: LoadedRun, other: LoadedRun) -> str:
 
 
 def _kind(one: LoadedRun, key: str) -> Any:
-    """What a set-up says under a key; the axis of a helix also where only its path tells it."""
+    """Value of a set-up's key; the axis of a helix is also derived from its path."""
     setup = one.run["setup"]
     if key == "axis" and one.run["test"] == "ballbar_helix":
         axis = helix_axis(setup, one.data.axes_mm)
@@ -121,7 +121,7 @@ def _feed(mm_min: float) -> str:
 
 
 def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -> list[str]:
-    """What the reader has to know: other places, other tables in force, another direction or feed; ``feed`` writes mm/min with its unit."""
+    """Remarks about a comparison: other places, tables in force, directions or feeds. ``feed`` formats mm/min with its unit."""
     out = []
     first = loaded[0]
     for other in loaded[1:]:
@@ -142,7 +142,7 @@ def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -
 
 
 def _column(one: LoadedRun, name: str) -> list[float]:
-    """What a column of a run holds; empty where it has none."""
+    """Values of a column of a run; empty without the column."""
     return [float(v) for v in (one.run.get("columns") or {}).get(name) or () if v is not None]
 
 
@@ -154,11 +154,10 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def curve(one: LoadedRun) -> ComparedCurve:
-    """Deviation along a run as it is compared.
+    """Deviation along a run, prepared for a comparison.
 
-    Of a ball-bar: centre and length of the bar fitted away, noise from second differences, and what mounting it anew changes. Of a laser:
-    mean of all readings of a position, noise from their scatter between out and back about its mean (which is lost motion), the
-    wavelength's share of the length.
+    Ball-bar: centre and length of the bar fitted away; u from noise (second differences) and from remounting the bar. Laser: mean of all
+    readings of a position; u from the scatter between out and back about its mean (the mean is lost motion) and from the wavelength.
     """
     return _bar(one) if one.data.kind == "bar" else _laser(one)
 
@@ -188,7 +187,7 @@ def _laser(one: LoadedRun) -> ComparedCurve:
 
 
 def difference(first: ComparedCurve, second: ComparedCurve) -> RunDifference | None:
-    """Second minus first at the places of the first that both have read; None where there are fewer than three."""
+    """Second minus first at the places of the first that both runs read; None for fewer than three."""
     far = NEAR_RAD if first.round else 0.05
     distance, at = cKDTree(second.place).query(first.place)
     near = distance <= far
@@ -200,9 +199,9 @@ def difference(first: ComparedCurve, second: ComparedCurve) -> RunDifference | N
 
 
 def figure_rows(loaded: Sequence[LoadedRun]) -> list[FigureRow]:
-    """Figures that every run has with a unit, in the order of the first.
+    """Figures with a unit that all runs have, in the order of the first run.
 
-    The uncertainty of a difference counts both as independent: what both share (the same laser, the same bar) makes it smaller, not larger.
+    The uncertainty of a difference treats both values as independent. This is safe: a shared laser or bar makes it smaller.
     """
     tables = [{(f.symbol, f.name): f for f in one.figures if f.unit} for one in loaded]
     out = []

@@ -28,34 +28,21 @@ from abbe.service.site import machine_from_doc
 FORMAT = "abbe-deviations/1"
 MEANING = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"
 SLACK_MM = 1e-9
-"""A point on the end of a stroke may be off by rounding."""
+"""Tolerance for rounding at the ends of a stroke."""
 CHUNK = 65_536
-"""Points that are evaluated at a time."""
+"""Points evaluated at a time."""
 ROWS = 4096
-"""Points that are written at a time."""
+"""Points written at a time."""
 
 Model = Literal["first-order", "exact"]
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """Deviation at points.
+    """Deviation at points, shape (n, 3), actual minus nominal.
 
-    Parameters
-    ----------
-    machine : str
-        Name of the machine.
-    model : "first-order" or "exact"
-    points : PointsFile
-    deviation_mm : array, shape (n, 3)
-    u_mm : array, shape (n, 4), or None
-        Standard uncertainty of dX, dY, dZ and of the norm (`standard_uncertainty_mm`). None: the errors file gives no uncertainty.
-    uncertainty : str
-        One line about it.
-    not_observable : list of dict
-        As the errors file has them.
-    warnings : list of str
-        What a user has to know about these numbers.
+    ``u_mm``: standard uncertainty of dX, dY, dZ and of the norm, shape (n, 4) (`standard_uncertainty_mm`); None if the errors file gives no
+    uncertainty. ``uncertainty``: one line about it. ``not_observable``: as in the errors file.
     """
 
     machine: str
@@ -76,9 +63,9 @@ class Deviations:
 def standard_uncertainty_mm(deviation_mm: F2, covariance_mm2: F3) -> F2:
     """Standard uncertainty of dX, dY, dZ and of the norm.
 
-    The norm's is that along the deviation, the linear term. Where the norm is at most twice the uncertainty of the worst direction (root
-    of the covariance's largest eigenvalue), the direction itself is uncertain, so the linear term says too little, and nothing at all at
-    norm zero: there it is the uncertainty of the worst direction.
+    The uncertainty of the norm is the linear term along the deviation. If the norm is at most twice the uncertainty of the worst direction
+    (root of the covariance's largest eigenvalue), the direction is uncertain and the linear term too small (undefined at norm zero): the
+    uncertainty of the worst direction is used instead.
 
     Parameters
     ----------
@@ -115,15 +102,15 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
     points_path : Path
         CSV, see `abbe.service.runs.points.read_points`.
     exact : bool
-        Finite rotations (docs/explanation/conventions.md) in place of rule G.
+        Finite rotations (docs/explanation/conventions.md) instead of rule G.
 
     Raises
     ------
     ConfigError, FileFormatError
-        One of the files is missing or wrong, or a point lies outside the strokes.
+        A file is missing or invalid, or a point lies outside the strokes.
     """
     name, machine, notes = read_machine(machine_path)
-    with np.errstate(all="ignore"):  # what overflows is looked for, and said in words
+    with np.errstate(all="ignore"):  # _check_finite reports overflows
         known = read_errors(errors_path)
         points = read_points(points_path)
         _check_strokes(machine, points)
@@ -134,7 +121,7 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
 
 
 def _evaluate(machine: Machine, known: KnownErrors, points: PointsFile, *, exact: bool) -> tuple[F2, F2 | None]:
-    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), piece by piece: only these are kept of a million points."""
+    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), in chunks, to bound the memory for a million points."""
     at = Points(points.axes_mm, points.direction, points.tool_mm)
     count = points.axes_mm.shape[0]
     off: F2 = np.empty((count, 3))
@@ -151,19 +138,19 @@ def _evaluate(machine: Machine, known: KnownErrors, points: PointsFile, *, exact
 
 
 def read_machine(path: Path) -> tuple[str, Machine, list[str]]:
-    """Name and nominal geometry from Abbe's machine file or from a machine object, TOML or JSON, and what is strange about it.
+    """Name, nominal geometry and notes from Abbe's machine file or from a machine object, TOML or JSON.
 
     Raises
     ------
     ConfigError, FileFormatError
-        File, key, and what is expected there.
+        The message names file, key and expected value.
     """
     if path.suffix.lower() == ".json":
         if not path.exists():
             raise ConfigError(f"machine file {path} does not exist", "give the path of a machine file (TOML or JSON)")
         document = read_json(path)
     else:
-        document = json.loads(json.dumps(read_toml(path), default=str))  # a date is text there, as in every other machine object
+        document = json.loads(json.dumps(read_toml(path), default=str))  # dates become text, as in JSON machine objects
         own, found = set(MachineFile.model_fields), set(document)
         if found & (own - set(MachineObject.model_fields)) or ("name" in found and found <= own):
             loaded = load_machine(path).machine
@@ -222,9 +209,9 @@ def _ends(motions: ErrorMotions, points: PointsFile) -> list[str]:
 
 
 def deviations_json(found: Deviations) -> Iterator[str]:
-    """Everything as one JSON object on one line, in pieces: one object per point with the columns of the points file, lengths in mm.
+    """One JSON object on one line, in pieces: one object per point with the columns of the points file, lengths in mm.
 
-    ``u_`` is a standard uncertainty. Pieces, because a million points as Python objects take more than a gigabyte.
+    ``u_`` is a standard uncertainty. The pieces bound the memory: a million points as Python objects take more than a gigabyte.
     """
     head = {
         "format": FORMAT,

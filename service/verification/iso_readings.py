@@ -1,4 +1,4 @@
-"""Runs as ISO 230 sees them: approaches of positions, diagonals, circles. Which runs belong to one test, and what of each counts."""
+"""Runs grouped into tests of ISO 230: approaches of positions, diagonals, circles; and the readings of each that count."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.runs.observations import run_data
 
 NEAR_MM = 0.05
-"""Positions closer than this are the same one, approached again (the same as for discoveries: `abbe.service.effects.axis_test`)."""
+"""Positions closer than this count as one position (as for discoveries: `abbe.service.effects.axis_test`)."""
 ALL = 10**9
 
 Run = dict[str, Any]
@@ -25,7 +25,7 @@ Run = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class AxisTest:
-    """One bidirectional test along an axis, or along a diagonal. ``runs``: labels; ``notes``: what the reader has to know."""
+    """One bidirectional test along an axis or a diagonal. ``runs``: labels; ``notes``: remarks for the reader."""
 
     name: str
     setup: str
@@ -48,7 +48,7 @@ class CircleTest:
 
 
 def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
-    """Positioning tests of single axes: runs of one axis in one set-up are one test. ``refused`` gets what cannot be one, in words."""
+    """Positioning tests of single axes: runs of one axis in one set-up are one test. Appends unusable runs, with reason, to ``refused``."""
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in _open(runs, "laser_linear"):
         groups.setdefault((_axis(run), str(run["setup"]["setup_id"])), []).append(run)
@@ -56,7 +56,7 @@ def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
 
 
 def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[AxisTest]]:
-    """Plain diagonals by where they belong: ``body`` or a plane. Step diagonals are no test of ISO 230-6."""
+    """Plain diagonals by group: ``body`` or a plane. Step diagonals are no test of ISO 230-6."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in _open(runs, "laser_diagonal"):
         setup = run["setup"]
@@ -67,15 +67,15 @@ def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[Ax
                 name = "".join(name["XYZ".index(a)] for a in face)
             groups.setdefault((str(face or "body"), name, str(setup["setup_id"])), []).append(run)
     out: dict[str, list[AxisTest]] = {}
-    for (where, name, setup_id), group in groups.items():
+    for (plane, name, setup_id), group in groups.items():
         test = _test(name, setup_id, group, refused)
-        if test is not None and name not in {t.name for t in out.get(where, [])}:  # measured again: the first one counts
-            out.setdefault(where, []).append(test)
+        if test is not None and name not in {t.name for t in out.get(plane, [])}:  # the first of repeated measurements counts
+            out.setdefault(plane, []).append(test)
     return out
 
 
 def circle_tests(runs: Sequence[Run], refused: list[str]) -> list[CircleTest]:
-    """Ball-bar circles, each path of its own."""
+    """Ball-bar circles, one test per path. Appends unusable runs, with reason, to ``refused``."""
     out = []
     for run in _open(runs, "ballbar_circle"):
         try:
@@ -103,7 +103,7 @@ def _message(error: Exception) -> str:
 
 
 def _open(runs: Sequence[Run], test: str) -> list[Run]:
-    """Runs of a kind whose readings are there."""
+    """Runs of one test that have readings (not sealed)."""
     return [r for r in runs if r["test"] == test and r["columns"].get("deviation_mm") is not None]
 
 
@@ -117,7 +117,7 @@ def _way(run: Run) -> F1:
 
 
 def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTest | None:
-    """Readings by position, side and cycle; None, and why, where they are no test from both sides."""
+    """Test from readings by position, side and cycle; None if they are no bidirectional test, with the reason in ``refused``."""
     runs = tuple(r["run_id"] for r in group)
     try:
         readings = _approaches(name, group)
@@ -141,7 +141,7 @@ def _approaches(name: str, group: list[Run]) -> Approaches:
 
 
 def _readings(run: Run, name: str) -> tuple[F1, F1, F1]:
-    """Position along the test, direction and deviation of the readings that count, mm; along the axis' positive sense."""
+    """Position, direction and deviation of the valid readings along the positive sense of the axis, mm."""
     columns = run["columns"]
     axes = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
     keep = np.asarray(columns.get("valid", np.ones(len(axes)))).astype(bool)
@@ -162,7 +162,7 @@ def _place(along: F1) -> F1:
 
 
 def _turning_points(run: Run, name: str) -> list[float]:
-    """Places beyond the positions where the machine turns: they are read, but are no targets (recipes with an overrun)."""
+    """Turning points of recipes with an overrun: they are read but are no target positions."""
     setup = run["setup"]
     if not setup.get("overrun_mm"):
         return []

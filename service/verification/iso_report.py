@@ -1,4 +1,4 @@
-"""ISO 230-2, 230-4 and 230-6 of some runs as figures and pictures of a report."""
+"""ISO 230-2, 230-4 and 230-6 evaluations of runs as figures and pictures of a report."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BAR_STATEMENT = (
 
 @dataclass
 class Evaluated:
-    """What the standards say of some runs; ``statements`` are part of the uncertainty statement."""
+    """Results of evaluated runs for a report; ``statements`` are part of the uncertainty statement."""
 
     figures: list[ReportFigure] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
@@ -78,7 +78,7 @@ def evaluate(runs: Sequence[dict[str, Any]], instruments: dict[str, Any] | None 
 
 
 def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:
-    """What repeats do not show, from the budget's stated inputs and the instrument's resolution."""
+    """Uncertainty that repeats do not show, from the budget's stated inputs and the instrument's resolution."""
     known = StatedInputs()
     scale = float(np.hypot(known.u_wavelength, known.u_scale_temperature_k * known.scale_expansion_per_k))
     return ScaleBudget(scale, float((instruments.get("laser") or {}).get("resolution_mm", 0.0)) / np.sqrt(12.0))
@@ -205,7 +205,7 @@ def _pair(out: Evaluated, group: str, forward: CircleTest, backward: CircleTest)
 
 
 def _u(one: OnePath) -> float:
-    """Of one reading of the shape, mm."""
+    """Standard uncertainty of one reading of the shape, mm."""
     return float(np.hypot(one.noise_mm, U_REPEAT_MM))
 
 

@@ -1,4 +1,4 @@
-"""The trends of a machine's checks: one line for each figure that is judged, from the stored verifications."""
+"""Trends of a machine's checks from the stored verifications: one line for each judged figure."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ HEADINGS = ("figure", "checks", "latest", "U (k = 2)", "limit", "state", "since 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FigureTrend:
-    """Trend of one figure of a machine over its checks, in the figure's unit. Uncertainties have k = 2; what is not known is None.
+    """Trend of one figure of a machine over its checks, in the figure's unit. Uncertainties have k = 2; unknown values are None.
 
     ``state``, ``direction``: of the control chart (`abbe.models.trend.Trend`), whose latest values are the last four fields; ``since_utc``:
-    first check of a drift; ``found_utc``: the check at which it was certain; ``reason``: why the days until the limit are not known.
+    first check of a drift; ``found_utc``: the check that detected it; ``reason``: why the days until the limit are unknown.
     """
 
     figure: str
@@ -49,7 +49,7 @@ class FigureTrend:
 
     @property
     def ahead(self) -> str:
-        """The days until the limit with their interval, or why they are not known."""
+        """The days until the limit with their interval, or why they are unknown."""
         if self.days_until_limit is None or self.days_until_limit_95 is None:
             return self.reason
         low, high = self.days_until_limit_95
@@ -57,14 +57,10 @@ class FigureTrend:
 
 
 def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureTrend]:
-    """Return the trend of every figure that has a limit in the latest check that has figures.
+    """Trend of every figure that has a limit in the latest check with figures.
 
-    Parameters
-    ----------
-    records : sequence of VerificationRecord
-        In any order. Checks without a figure, or with an uncertainty that is none, are left out of that figure's series.
-    after_utc : datetime, optional
-        Only later checks: a new table, a repair, begins a new series.
+    ``records`` may have any order; checks without a figure or a valid uncertainty are left out of its series. Only checks after
+    ``after_utc`` count, because a new table or a repair begins a new series.
     """
     docs = _docs(records, after_utc)
     if not docs:
@@ -74,12 +70,12 @@ def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = N
 
 
 def of_series(key: str, records: Sequence[VerificationRecord], after_utc: datetime | None) -> list[tuple[datetime, float, float]]:
-    """One figure's series: when, value, expanded uncertainty, in order of time."""
+    """One figure's series in order of time: time, value, expanded uncertainty."""
     return _rows(key, _docs(records, after_utc))
 
 
 def _docs(records: Sequence[VerificationRecord], after_utc: datetime | None) -> list[tuple[datetime, dict[str, Any]]]:
-    """Checks whose figures can be put beside each other: measured, and in the air in which they can be judged."""
+    """Comparable checks with their times: measured, and within the allowed temperature."""
     usable = [one for one in records if one.doc.get("values") and one.doc.get("comparable", True)]
     docs = sorted(((_when(one), one.doc) for one in usable), key=lambda one: one[0])
     return [(at, doc) for at, doc in docs if after_utc is None or at > after_utc]
@@ -134,7 +130,7 @@ def _known(value: float) -> float | None:
 
 
 def row(one: FigureTrend) -> tuple[str, ...]:
-    """Return the cells of `HEADINGS`."""
+    """Cells of a trend under `HEADINGS`."""
     state = one.state if not one.direction else f"{one.state} {'up' if one.direction > 0 else 'down'}"
     slope = ""
     if one.change_per_day is not None and one.change_per_day_u is not None:

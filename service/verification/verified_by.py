@@ -1,7 +1,7 @@
-"""Which measurement stands behind the table in force: a check, the push that brought it, or none since the table was changed.
+"""The measurement that supports the table in force: a check, the push that wrote the table, or none since the table changed.
 
-A verdict belongs to the table that was in force while its runs were measured. Whatever brought another table into force since (a rollback,
-a push, a person's word, a stranger) leaves it behind. Every display asks here: home page, fleet, trends, reports, MQTT, OPC UA, MTConnect.
+A verdict belongs to the table that was in force during its runs. It lapses as soon as another table comes into force: by a push, a
+rollback, an acceptance or an unknown writer. Home page, fleet, trends, reports, MQTT, OPC UA and MTConnect all use this module.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
 
 LATEST_CHECKS = 20
-"""So many of the latest checks are looked at for one that measured something."""
+"""Number of latest checks that are searched for one that measured something."""
 STRANGE_TABLE = "CMP-010"
-"""Code of the alarm that somebody else has changed the table in force."""
+"""Code of the alarm for a table in force that the journal does not expect."""
 
 VerifiedState = Literal["verified", "unverified", "unknown"]
 VerifiedReason = Literal["check", "push", "rollback", "accepted", "changed", "other", "open", "never", "journal"]
@@ -44,25 +44,25 @@ _TEXTS: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class VerifiedBy:
-    """Which measurement stands behind the table in force: every display shows this record.
+    """The measurement that supports the table in force. Every display shows this record.
 
     Parameters
     ----------
     state : "verified", "unverified" or "unknown"
-        Whether a measurement stands behind the table in force. Verified by a check says that it was measured, not that it passed.
+        Whether a measurement supports the table in force. Verified by a check means measured, not passed.
     why : str
-        ``check``, ``push``: what measured it. ``rollback``, ``accepted``, ``changed``, ``other``, ``open``: since what it is unverified.
-        ``never``, ``journal``: why it is unknown.
+        ``check``, ``push``: what measured it. ``rollback``, ``accepted``, ``changed``, ``other``, ``open``: the event that made it
+        unverified. ``never``, ``journal``: why the state is unknown.
     number : int
-        Of the check or of the push; 0 for none.
+        Number of the check or push; 0 for none.
     utc : datetime or None
-        When that was; None for never.
+        Time of that check or event; None for never.
     crc : int or None
-        CRC-32 of the table in force by the push journal; None where there was no push, or it is not known.
+        CRC-32 of the table in force by the push journal; None without a push, or if unknown.
     since : datetime or None
-        When that table came into force by the journal; None where no push brought one. Checks before it are of another table.
+        When that table came into force by the journal; None without a push. Earlier checks are of another table.
     changes : tuple of datetime
-        Whenever a table came into force.
+        All times at which a table came into force.
     """
 
     state: VerifiedState
@@ -75,7 +75,7 @@ class VerifiedBy:
 
     @property
     def holds(self) -> bool:
-        """Whether a verdict of a check can be shown as that of the machine."""
+        """Whether the verdict of a check may be shown as that of the machine."""
         return self.why in ("check", "never")
 
     @computed_field  # type: ignore[prop-decorator]
@@ -87,52 +87,51 @@ class VerifiedBy:
     @computed_field  # type: ignore[prop-decorator]
     @property
     def table_crc(self) -> str | None:
-        """CRC-32 of the table in force, hexadecimal; None where it is not known."""
+        """CRC-32 of the table in force, hexadecimal; None if unknown."""
         return None if self.crc is None else f"{self.crc:08X}"
 
     def as_doc(self) -> Doc:
-        """As JSON value for messages: without the times of all changes."""
+        """JSON value for messages, without the times of all changes."""
         utc = None if self.utc is None else self.utc.isoformat()
         return {"state": self.state, "why": self.why, "number": self.number, "utc": utc, "table_crc": self.table_crc, "text": self.text}
 
     def verdict(self, verdict: str) -> str:
-        """The word to show for the last verdict: itself where it holds, else where the machine stands."""
+        """Text for the last verdict: the verdict itself if it holds, else the state of the machine."""
         return verdict if self.holds else self.state
 
 
 def measure_now(machine_file: str = "MACHINE.toml") -> str:
-    """What to do about an unverified machine."""
+    """Command that verifies a machine."""
     return f"abbe measure {machine_file} --recipe quick-check"
 
 
 def minute(utc: datetime | None) -> str:
-    """A moment to the minute, as lines for people have it; empty for none."""
+    """Time to the minute for messages; empty for None."""
     return "" if utc is None else f"{utc:%Y-%m-%d %H:%M} UTC"
 
 
 def strange_table(attention: Sequence[str]) -> bool:
-    """Whether what needs a person now is that somebody else has changed the table in force."""
+    """Whether the attention texts contain the alarm of an unexpected table in force."""
     return any(text.startswith(f"{STRANGE_TABLE}:") for text in attention)
 
 
 def verified_by(store: Store, machine: str, *, control: str = "", strange: bool = False) -> VerifiedBy:
-    """Where a machine stands, by its push journal and its last checks.
+    """Verification state of a machine from its push journal and its last checks.
 
     Parameters
     ----------
-    store : Store
-        The database.
     machine : str
         Name of the machine.
     control : str
-        Identity of its control; empty: not known, the journal is that which this name was last used in.
+        Identity of its control; empty: unknown, use the journal last used under this name.
     strange : bool
-        The controller holds a table that the journal does not expect (`strange_table`); what the machine's service said last counts, too.
+        The controller holds a table that the journal does not expect (`strange_table`). The last heartbeat of the machine's service counts
+        as well.
 
     Raises
     ------
     StoreError
-        The database does not answer. A journal that was changed is a standing, not an error.
+        The database does not answer. A changed journal is a state ("unknown"), not an error.
     """
     journal = JournalView.read(store, machine, control, origins=False)
     if not journal.sound:
@@ -142,8 +141,8 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
 
 
 def _reported_strange(store: Store, machine: str, journal: JournalView, checks: Sequence[VerificationRecord]) -> bool:
-    """Whether the machine's service saw a strange table when it was heard last, and neither a table came into force since nor a check found
-    the journal's one in force.
+    """Whether the last heartbeat of the machine's service reports a strange table, without a later change of table and without a later
+    check that found the expected one.
     """
     heartbeat = store.heartbeats.all().get(machine)
     if heartbeat is None or not strange_table(heartbeat.doc.get("attention") or []):
@@ -156,7 +155,7 @@ def _reported_strange(store: Store, machine: str, journal: JournalView, checks: 
 
 
 def _of_journal(store: Store, journal: JournalView, checks: Sequence[VerificationRecord], *, strange: bool) -> VerifiedBy:
-    """The same of a journal that was read and checks, newest first."""
+    """Verification state from a journal and checks (newest first)."""
     crc, settled = journal.wanted
     changed = journal.changes
     changes = tuple(datetime.fromisoformat(e.utc) for e in changed)
@@ -176,7 +175,7 @@ def _of_journal(store: Store, journal: JournalView, checks: Sequence[Verificatio
 
 
 def _since(store: Store, journal: JournalView, change: JournalEntry, known: dict[str, Any]) -> VerifiedBy:
-    """No check was measured since a table came into force: what brought it says whether a measurement stands behind it."""
+    """State after a change of table without a later check: decided by the kind of change."""
     if change.state is PushState.ACCEPTED:
         return VerifiedBy("unverified", "accepted", change.push, datetime.fromisoformat(change.utc), **known)
     number = journal.facts(change.push).table
@@ -188,17 +187,17 @@ def _since(store: Store, journal: JournalView, change: JournalEntry, known: dict
 def _kind(store: Store, table: int) -> str:
     try:
         return str(store.tables.get(table).doc.get("kind", "push"))
-    except StoreError:  # without its document it counts as one that nothing has measured
+    except StoreError:  # a table without a document counts as unmeasured
         return KIND
 
 
 def measured(record: VerificationRecord) -> bool:
-    """Whether a stored verification is a check that measured the machine: not one of a push, nor one that could not be completed."""
+    """Whether a stored verification is a completed check of the machine (not one of a push)."""
     return not record.doc.get("push") and bool(record.doc.get("values"))
 
 
 def of_push_taken_back(record: VerificationRecord) -> bool:
-    """Whether it is the verification of a push that was not kept: of a table that is not in force."""
+    """Whether a verification belongs to a push that was not kept, so that its table is not in force."""
     return bool(record.doc.get("push")) and record.verdict != "pass"
 
 
@@ -207,24 +206,24 @@ def _last_measured(checks: Sequence[VerificationRecord]) -> VerificationRecord |
 
 
 def _measured_with(store: Store, record: VerificationRecord, crc: int | None, since: datetime) -> bool:
-    """Whether a check began after a moment, and the table in force was this one."""
+    """Whether a check began after ``since`` with the table ``crc`` in force."""
     return crc is not None and began(store, record) > since and table_of(store, record) == crc
 
 
 def began(store: Store, record: VerificationRecord) -> datetime:
-    """When a check's campaign began, after a word for the table that was given with the command; without a campaign: the check itself."""
+    """Start of a check's campaign, which is later than an acceptance given with the command; without a campaign: start of the check."""
     if record.campaign_id is None:
         return started(record)
     return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)
 
 
 def started(record: VerificationRecord) -> datetime:
-    """When a check began; its table was read then."""
+    """Start of a check, when its table was read."""
     return datetime.fromisoformat(record.doc.get("started_utc") or record.utc)
 
 
 def table_of(store: Store, record: VerificationRecord) -> int | None:
-    """CRC-32 of the table that was in force while a check was measured; None where it was not recorded."""
+    """CRC-32 of the table in force during a check; None if not recorded."""
     crc = record.doc.get("table_crc")
     if crc is None and record.campaign_id is not None:
         crc = store.campaigns.find(record.campaign_id).doc.get("table_crc")

@@ -1,4 +1,4 @@
-"""Verification: figures of runs that were not used to identify, before against after, and against limits."""
+"""Verification: figures of runs that identification did not use, compared before and after a push, and with limits."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from abbe.service.runs.observations import run_data
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
-"""Any figure may get worse by its expanded uncertainty plus this share: of the worst diagonal before (diagonals), of itself (helix)."""
+"""Any figure may get worse by its expanded uncertainty plus this share of the worst diagonal before (diagonals) or of itself (helix)."""
 
 SAME_AIR_C = 1.0
-"""All readings of before and after must have been taken in air within so much: steel and iron grow by 11 to 12 um per metre and kelvin,
-which is what a correction is about. An assumption of this service; there are no body sensors here, so what the castings do is not seen."""
+"""Largest range of air temperature over all readings before and after: steel and iron grow by 11 to 12 um per metre and kelvin, which is
+the size of a correction. An assumption of this service: without sensors in the castings their temperature is unknown."""
 
 DIAGONALS = frozenset({"ppp", "npp", "pnp", "ppn"})
 
@@ -28,10 +28,10 @@ Verdict = Literal["pass", "fail", "cannot tell"]
 
 @dataclass(frozen=True)
 class VerificationFigures:
-    """What one verification measured: body diagonals by name, and the helix.
+    """Figures of one verification: body diagonals by name, and the helix.
 
-    ``air_c``: lowest and highest temperature of the air, None where no reading says any. ``tables``: CRC of every table that was active
-    while its runs were measured; None stands for a run that does not say so.
+    ``air_c``: lowest and highest air temperature, None without any reading. ``tables``: CRC of every table that was active during its runs;
+    None stands for a run that does not record it.
     """
 
     diagonals: Mapping[str, VerificationFigure]
@@ -57,7 +57,7 @@ def figures(runs: list[dict[str, Any]]) -> VerificationFigures:
     Raises
     ------
     MeasurementFault
-        Not all four body diagonals are there, or a run is not judged (`abbe.service.runs.coverage`) or has too few valid readings.
+        A body diagonal is missing, or a run is not judged (`abbe.service.runs.coverage`) or has too few valid readings.
     """
     diagonals, helix = {}, None
     for run in runs:
@@ -84,12 +84,12 @@ def _air_c(runs: list[dict[str, Any]]) -> tuple[float, float] | None:
 
 
 def check_before(before: VerificationFigures) -> None:
-    """Refuse a verification that nothing can be compared with, before anything is written.
+    """Refuse a verification that cannot serve as the reference of a push, before anything is written.
 
     Raises
     ------
     TableRefused
-        A figure is no number, or no reading says how warm the air was.
+        A figure is no number, or no air temperature is recorded.
     """
     what = "" if before.finite else "a figure of it is no number"
     what = what or ("" if before.air_c is not None else "no reading of it says how warm the air was")
@@ -99,7 +99,7 @@ def check_before(before: VerificationFigures) -> None:
 
 @dataclass(frozen=True, slots=True)
 class VerificationDecision:
-    """Keep the new table or go back, and why."""
+    """Whether to keep the new table, and why."""
 
     keep: bool
     text: str
@@ -110,12 +110,9 @@ def _expanded(a: VerificationFigure, b: VerificationFigure) -> float:
 
 
 def incomparable(before: VerificationFigures, after: VerificationFigures, pushed_crc: int | None = None) -> str:
-    """Why before and after say nothing about a new table; empty if they can be compared.
+    """Reason why the verifications before and after cannot be compared; empty if they can.
 
-    Parameters
-    ----------
-    pushed_crc : int, optional
-        CRC of the new table: every run of the verification after must have been measured with it, and with no other.
+    ``pushed_crc``: CRC of the new table; all runs of the verification after must have been measured with this table.
     """
     if not (before.finite and after.finite):
         return "a figure is no number"
@@ -135,9 +132,9 @@ def incomparable(before: VerificationFigures, after: VerificationFigures, pushed
 def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: int | None = None) -> VerificationDecision:
     """Keep only if the worst diagonal improved by more than its expanded uncertainty and no other figure got worse (reliability.md H11).
 
-    "Worse" is more than the expanded uncertainty of the difference plus `WORSE_SHARE`: a diagonal that happened to be good because errors
-    cancelled may come closer to the others, but only by a small part of what the worst one was. Where that is unknown, because the two
-    do not compare (`incomparable`) or a figure is less certain than what was gained, the old table comes back as well.
+    "Worse" is more than the expanded uncertainty of the difference plus `WORSE_SHARE`: a diagonal that was good because errors cancelled
+    may come closer to the others, but only by a small share of the worst one. The old table is restored as well if this cannot be decided:
+    the two do not compare (`incomparable`), or a figure is less certain than the gain.
     """
     why = incomparable(before, after, pushed_crc)
     if why:
@@ -171,7 +168,7 @@ def judge(value_um: float, u_um: float, limit_um: float) -> Verdict:
 
 
 def overall(verdicts: list[Verdict]) -> Verdict:
-    """The worst of several verdicts; nothing judged is "cannot tell"."""
+    """The worst of several verdicts; "cannot tell" without any."""
     if "fail" in verdicts:
         return "fail"
     return "cannot tell" if "cannot tell" in verdicts or not verdicts else "pass"
