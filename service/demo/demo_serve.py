@@ -1,7 +1,7 @@
 """The demonstration with ``--serve``: the service watches a drifting machine and proposes a correction for approval.
 
-The service runs as a child process with the machine file in the folder. The simulated machine drifts after the first scheduled check. Alarm,
-campaign, discovery, proposal, push and verification follow automatically; only the approval needs a person.
+The service runs as a child process with the machine file in the folder. The simulated machine drifts after the first scheduled check.
+Alarm, campaign, discovery, proposal, push and verification follow automatically; only the approval needs a person.
 """
 
 from __future__ import annotations

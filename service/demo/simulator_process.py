@@ -1,7 +1,7 @@
 """The simulators as a child process that never outlives this process.
 
-The product never imports the simulators: it starts them as a program, reads one line of JSON with the addresses of the devices, and talks to
-them as to any other device.
+The product never imports the simulators: it starts them as a program, reads one line of JSON with the addresses of the devices, and talks
+to them as to any other device.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Reports: a `document.Document` in, HTML, PDF, CSV and JSON out. Self-contained: no script, no request to anywhere."""
+"""Rendering of a `document.Document` as self-contained HTML, PDF, CSV or JSON."""

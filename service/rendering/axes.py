@@ -16,7 +16,7 @@ def nice_step(span: float, count: int = 5) -> float:
         return 1.0
     raw = span / max(count, 1)
     power = 10.0 ** math.floor(math.log10(raw))
-    # Nearest in proportion: always rounding up would leave two ticks on some axes.
+    # Nearest ratio: always rounding up would leave two ticks on some axes.
     return next((m * power for m, limit in ((1.0, 1.5), (2.0, 3.3), (5.0, 7.1)) if raw <= limit * power), 10.0 * power)
 
 
@@ -34,24 +34,14 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 
 def tick_text(value: float, step: float) -> str:
-    """Tick label with just the decimals that the tick distance needs."""
+    """Tick label with the decimals that the tick distance needs."""
     if not 1e-6 <= step < 1e7:
         return f"{value:.1e}"
     return fixed(value, max(0, -math.floor(math.log10(step) + 1e-9)))
 
 
 def data_range(values: Iterable[float | None], *, margin: float = 0.06, zero: bool = False) -> tuple[float, float]:
-    """Range that holds all finite values, widened by a margin; 0 .. 1 when there are none.
-
-    Parameters
-    ----------
-    values : iterable of float or None
-        The data; what is not finite does not count.
-    margin : float, optional
-        Widening on both sides as a fraction of the span.
-    zero : bool, optional
-        Whether zero has to be inside.
-    """
+    """Range of all finite values, widened on both sides by ``margin`` times the span; 0 .. 1 without any. ``zero``: include zero."""
     good = [float(v) for v in values if finite(v)]
     if zero:
         good.append(0.0)
@@ -67,7 +57,7 @@ def data_range(values: Iterable[float | None], *, margin: float = 0.06, zero: bo
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Straight map from ``low`` .. ``high`` to the pixels ``start`` .. ``end``."""
+    """Linear map from ``low`` .. ``high`` to the pixels ``start`` .. ``end``."""
 
     low: float
     high: float

@@ -1,6 +1,6 @@
-"""What a report says, as plain values: one of them becomes PDF, HTML, CSV and JSON.
+"""Content of a report as plain values, the source of PDF, HTML, CSV and JSON.
 
-Values stand in the unit that people read (µm, µrad, °C); every ``u`` is a standard uncertainty (k = 1) in the figure's unit.
+Values are in the printed unit (µm, µrad, °C); every ``u`` is a standard uncertainty (k = 1) in the figure's unit.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SIGNATURES = ("Measured by", "Checked by", "Approved by")
 
 @dataclass(frozen=True, slots=True)
 class ReportFigure:
-    """One figure. ``symbol``: as the standard has it; ``method``: by which rule; ``limit`` and ``verdict``: where it was judged."""
+    """One numeric result. ``symbol``: of the standard; ``method``: rule of evaluation; ``limit``, ``verdict``: of a judged figure."""
 
     group: str
     symbol: str
@@ -43,7 +43,7 @@ class ReportFigure:
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """An instrument of the measurement: what is known of its certificate and uncertainty, in words."""
+    """An instrument of the measurement, with text about its certificate and uncertainty."""
 
     name: str
     certificate: str
@@ -52,7 +52,7 @@ class Instrument:
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Sentences, one below the other; ``numbered``: their order counts."""
+    """A list of sentences; ``numbered``: an ordered list."""
 
     items: Sequence[str]
     numbered: bool = False
@@ -60,14 +60,14 @@ class Lines:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Names and values in words."""
+    """Names and values as text."""
 
     items: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """A table of words and ready-made numbers; columns that hold only numbers are set to the right."""
+    """A table of text and formatted numbers; columns of numbers only are aligned to the right."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -77,7 +77,7 @@ class TextTable:
 class Picture:
     """``<svg>`` elements of `abbe.service.rendering.plots` under one caption.
 
-    ``layout``: two beside each other, one below the other over the whole width, or in two columns that pictures of unlike heights fill.
+    ``layout``: two side by side, one below the other at full width, or in two columns for pictures of different heights.
     """
 
     caption: str
@@ -87,7 +87,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading and what stands below it; ``folded``: shut on a page until the reader opens it, open on paper."""
+    """A heading with its blocks; ``folded``: collapsed on a page until opened, open on paper."""
 
     title: str
     blocks: Sequence[Block]
@@ -99,11 +99,11 @@ Block: TypeAlias = str | Lines | Facts | TextTable | Picture | Section
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Document:
-    """A report. Mappings are name and value in words, in the order in which they are printed.
+    """A report. Mappings hold names and values as text, in printed order.
 
-    ``verdict``: sign, word and sentence; ``remarks``: what the reader has to know first; ``sections``: what the reader came for, before the
-    figures; ``not_observable``: what this measurement could not show, None where nothing was measured; ``appendix``: pictures and tables
-    behind the figures; ``provenance``: versions and hashes; ``signatures``: who signs, empty for a working paper.
+    ``verdict``: sign, word and sentence; ``remarks``: important notes at the top; ``sections``: main results, printed before the figures;
+    ``not_observable``: what this measurement could not show, None without a measurement; ``appendix``: pictures and tables after the
+    figures; ``provenance``: versions and hashes; ``signatures``: roles that sign, empty for a working paper.
     """
 
     kind: Kind
@@ -124,12 +124,12 @@ class Document:
 
     @property
     def pictures(self) -> list[Picture]:
-        """Every picture, in the order of the paper."""
+        """Every picture, in printed order."""
         return [block for _, block in blocks([*self.sections, *self.appendix]) if isinstance(block, Picture)]
 
 
 def blocks(sections: Sequence[Section]) -> Iterator[tuple[str, Block]]:
-    """Every block with the title of its own section, sections within sections opened."""
+    """Every block with the title of its section, including nested sections."""
     for section in sections:
         for block in section.blocks:
             if isinstance(block, Section):

@@ -1,4 +1,4 @@
-"""A report for programs: the JSON object (`abbe-report/1`), the CSV of its figures, and the words that page and paper print alike."""
+"""A report for programs: the JSON object (`abbe-report/1`), the CSV of its figures, and the data for the templates of page and PDF."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ NOTHING_HIDDEN = "Nothing was found that this measurement should have shown and 
 
 
 def document_json(document: Document) -> str:
-    """The report as JSON: all digits, pictures left out (they draw what the runs hold). Equal reports give equal bytes."""
+    """The report as JSON with all digits and without pictures. Equal reports give equal bytes."""
     return json.dumps(_data(document), ensure_ascii=False, indent=2, allow_nan=False) + "\n"
 
 
 def document_csv(document: Document) -> str:
-    """The figures as CSV, all digits; ``expanded`` is U, empty where there is none."""
+    """The figures as CSV with all digits; ``expanded`` is U, empty if unknown."""
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
     write.writerow(COLUMNS)
     for figure in _data(document)["figures"]:
-        # A cell that begins so would be taken for a formula by a spreadsheet.
+        # A spreadsheet would read such a cell as a formula.
         write.writerow(["'" + v if isinstance(v, str) and v[:1] in "=+@\t" and v else v for v in (figure[c] for c in COLUMNS)])
     return out.getvalue()
 
@@ -97,7 +97,7 @@ def _number(value: float | None) -> float | None:
 
 
 def _lines(section: Section) -> list[str]:
-    """The words of a section that stand in no table."""
+    """The text of a section outside its tables."""
     out: list[str] = []
     for _, block in blocks([section]):
         match block:
@@ -113,7 +113,7 @@ def _lines(section: Section) -> list[str]:
 
 
 def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any]:
-    """What a template prints: words, numbers rounded with their uncertainty, and pictures as ``draw`` makes them of their SVG."""
+    """Data for a template: text, numbers rounded with their uncertainty, and pictures as ``draw`` converts their SVG."""
     data = _data(document)
     groups: dict[str, list[dict[str, str]]] = {}
     for f in document.figures:
@@ -130,7 +130,7 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
 
 
 def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:
-    """A block with its kind, as the templates print it."""
+    """A block with its kind, for the templates."""
     match block:
         case Lines():
             return {"kind": "lines", "items": list(block.items), "numbered": block.numbered}
@@ -153,7 +153,7 @@ def _pairs(facts: Mapping[str, str]) -> list[dict[str, str]]:
 
 
 def _right(columns: int, rows: Sequence[Sequence[str]]) -> list[bool]:
-    """Which columns, after the first, hold numbers and nothing else."""
+    """For each column whether it holds numbers only (never the first one)."""
     cells = [[row[k] for row in rows if row[k]] for k in range(columns)]
     return [k > 0 and bool(some) and all(_NUMERIC.fullmatch(c) for c in some) for k, some in enumerate(cells)]
 
@@ -170,7 +170,7 @@ def _figure_cells(figure: ReportFigure) -> dict[str, str]:
 
 
 def _clean(value: Any) -> Any:
-    """Without characters that neither page nor paper can hold."""
+    """Remove characters that neither XML nor PDF can hold."""
     if isinstance(value, dict):
         return {k: _clean(v) for k, v in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""A report as HTML page, PDF, CSV or JSON file. Page and PDF print the same words (`document_data.shown`) and the same pictures."""
+"""A report as HTML page, PDF, CSV or JSON file. Page and PDF print the same text (`document_data.shown`) and the same pictures."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from abbe.service.rendering.palette import paper_rules, style_rules
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 FONT = "Libertinus Serif"
-"""Comes inside of the typesetter: no font of the computer is used, so that a report looks the same everywhere."""
+"""Bundled with the typesetter, so that a report looks the same on every computer."""
 
 
 def document_html(document: Document) -> str:
-    """Self-contained page: no script, no request to anywhere. Equal reports give equal bytes."""
+    """Self-contained page without scripts or requests. Equal reports give equal bytes."""
     mark = "" if document.verdict is None else _MARKS[document.verdict[0]]
     style = Markup(style_rules())  # noqa: S704 - our own constants
     return printable(_environment().get_template("document.html").render(doc=shown(document), mark=mark, style=style))
 
 
 def document_pdf(document: Document) -> bytes:
-    """The report as PDF (A4, tagged), set by typst with the fonts that it brings. No clock, no network: equal reports give equal bytes."""
+    """The report as PDF (A4, tagged), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes."""
     import typst
 
     data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
@@ -45,7 +45,7 @@ def document_pdf(document: Document) -> bytes:
 
 
 def standalone(svg: str) -> str:
-    """A picture that stands by itself: with its name space, and the colours of paper instead of the page's variables."""
+    """A stand-alone picture: with its XML namespace and fixed colours instead of the page's CSS variables."""
     head, _, rest = svg.partition(">")
     return f'{head} xmlns="http://www.w3.org/2000/svg"><style>{paper_rules(FONT)}</style>{rest}'
 
@@ -65,21 +65,21 @@ FORMS: dict[str, Callable[[Document], str | bytes]] = {
     ".csv": document_csv,
     ".json": document_json,
 }
-"""How a report is written, by the ending of its file."""
+"""Writer of each file extension."""
 
 
 def default_name(document: Document) -> str:
-    """File name of a report without one: its title in letters, digits and dashes."""
+    """Default file name of a report: its title in letters, digits and dashes."""
     return re.sub(r"[^A-Za-z0-9]+", "-", document.title).strip("-").lower()[:60] + ".pdf"
 
 
 def form_of(target: Path) -> Callable[[Document], str | bytes]:
-    """How a file of this name is written.
+    """Writer for a file name.
 
     Raises
     ------
     FileFormatError
-        Its ending is none of ours.
+        The extension is not supported.
     """
     try:
         return FORMS[target.suffix.lower()]
@@ -88,11 +88,11 @@ def form_of(target: Path) -> Callable[[Document], str | bytes]:
 
 
 def write_document(document: Document, target: Path) -> None:
-    """Write a report whole or not at all; the file's ending says how.
+    """Write a report atomically, in the format of the file's extension.
 
     Raises
     ------
     FileFormatError
-        Another ending, or the file cannot be written.
+        The extension is not supported, or the file cannot be written.
     """
     write_page(form_of(target)(document), target)

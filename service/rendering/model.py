@@ -1,4 +1,4 @@
-"""What the pictures of a report draw, as plain values. Lengths in µm, positions in mm; every ``u`` is a standard uncertainty (k = 1)."""
+"""Data of the pictures of a report. Lengths in µm, positions in mm; every ``u`` is a standard uncertainty (k = 1)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 Floats = Sequence[float] | NDArray[np.float64]
 
 SETUP_NOTE = "set-up"
-"""Note of a parameter that belongs to the set-up (cup, bar, mirror) and not to the machine: the report folds these away."""
+"""Note of a parameter of the set-up (cup, bar, mirror) instead of the machine; the report folds these."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
-    """One identified parameter. ``note``: a word about it; ``SETUP_NOTE`` for those of the set-up."""
+    """One identified parameter. ``note``: a remark; ``SETUP_NOTE`` for parameters of the set-up."""
 
     name: str
     value: float | None
@@ -27,7 +27,7 @@ class ParameterRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualSeries:
-    """Measured minus modelled along one run; ``x_label`` names the abscissa with its unit. ``label`` as in the table of runs."""
+    """Measured minus modelled along one run. ``x_label``: name and unit of the abscissa; ``label``: as in the table of runs."""
 
     label: str
     x_label: str
@@ -64,7 +64,7 @@ class PolarTrace:
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """Share of one error source in the whole, e.g. its part of the volumetric error."""
+    """Contribution of one error source, e.g. to the volumetric error."""
 
     name: str
     value_um: float | None
@@ -73,7 +73,7 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionCurve:
-    """One error motion over its stroke. ``value`` and ``u`` in ``unit`` (µm or µrad); ``status``: whether these runs show it by itself."""
+    """One error motion over its stroke. ``value`` and ``u`` in ``unit`` (µm or µrad); ``status``: its observability."""
 
     name: str
     axis: str
@@ -86,7 +86,7 @@ class MotionCurve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slice:
-    """Values over one plane of the volume: ``values`` in µm, shape (len(y), len(x)); ``at`` says where the plane is."""
+    """Values over one plane of the volume: ``values`` in µm, shape (len(y), len(x)); ``at``: position of the plane as text."""
 
     x_axis: str
     y_axis: str
@@ -98,7 +98,7 @@ class Slice:
 
 @dataclass(frozen=True, slots=True)
 class MotionShare:
-    """One error motion: share of what is known of it that comes from the readings, 0 to 1, and its status in words."""
+    """One error motion: share of its information that comes from the readings, 0 to 1, and its observability."""
 
     name: str
     share: float
@@ -115,7 +115,7 @@ class Correlations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """Measured minus simulated along one run, before and after. All three of shape (n,); ``why`` this one is shown."""
+    """Measured minus simulated along one run, before and after, arrays of shape (n,). ``why``: reason for showing this run."""
 
     label: str
     x_label: str
@@ -128,10 +128,10 @@ class Trace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceMap:
-    """Where in one plane of the volume the gap lives.
+    """Size of the gap over one plane of the volume.
 
-    ``x_mm``, ``y_mm``: centres of cells that were measured, shape (n,); ``times_noise``: rms of the gap there over its noise; ``spot``:
-    what was located, centre and radius.
+    ``x_mm``, ``y_mm``: centres of measured cells, shape (n,); ``times_noise``: rms of the gap divided by its noise; ``spot``: centre and
+    radius of the located area.
     """
 
     x_axis: str

@@ -1,4 +1,4 @@
-"""Numbers as a metrologist writes them: the uncertainty decides how many digits the value may have."""
+"""Formatted numbers: the uncertainty decides the number of digits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COVERAGE = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """What a length is shown in: the sign behind its numbers, and how many of ours one of them is (µm of an error, mm of a place)."""
+    """Display unit of a length: its sign, and its size in internal units (µm for errors, mm for places)."""
 
     sign: str
     size: float = 1.0
@@ -22,17 +22,17 @@ class Unit:
 
 UM, MM = Unit("µm"), Unit("mm")
 
-# XML 1.0 has no way to write these at all, not even escaped.
+# XML 1.0 cannot hold these characters, not even escaped.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
 
 
 def finite(value: float | None) -> TypeGuard[float]:
-    """Whether there is a number at all."""
+    """Whether the value is a finite number."""
     return value is not None and math.isfinite(value)
 
 
 def plain(value: float | None, digits: int = 3) -> str:
-    """Value to ``digits`` significant digits, never in exponent notation within 1e-6 .. 1e7; ``n/a`` when there is none."""
+    """Value to ``digits`` significant digits, without exponent within 1e-6 .. 1e7; ``n/a`` without a value."""
     if not finite(value):
         return NOT_AVAILABLE
     if value == 0.0:
@@ -43,7 +43,7 @@ def plain(value: float | None, digits: int = 3) -> str:
 
 
 def tidy(value: float | None) -> str:
-    """A set value (stroke, scale, coverage factor) with no more digits than it was given: 600, not 600.0."""
+    """A nominal value (stroke, scale, coverage factor) without trailing zeros: 600, not 600.0."""
     if not finite(value):
         return NOT_AVAILABLE
     text = plain(value, 6)
@@ -51,7 +51,7 @@ def tidy(value: float | None) -> str:
 
 
 def placed(value_mm: float, unit: Unit) -> str:
-    """A commanded place: to a thousandth of a mm or a ten-thousandth of an inch (2.5 µm), as the 3-D map says it; no zeros at the end."""
+    """A commanded position to 0.001 mm or 0.0001 in (2.5 µm), as in the 3-D map, without trailing zeros."""
     if not finite(value_mm):
         return NOT_AVAILABLE
     text = fixed(value_mm / unit.size, 3 if unit.size == 1.0 else 4)
@@ -59,26 +59,16 @@ def placed(value_mm: float, unit: Unit) -> str:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Value with so many decimals; negative ``decimals`` round to tens, hundreds and so on."""
+    """Value with a fixed number of decimals; negative ``decimals`` round to tens, hundreds and so on."""
     if decimals < 0:
         return _signed(f"{round(value, decimals):.0f}")
     return _signed(f"{value:.{decimals}f}")
 
 
 def with_uncertainty(value: float | None, u: float | None) -> tuple[str, str]:
-    """Value and expanded uncertainty U = k u (k = 2), rounded together: two significant digits of U.
+    """Value and expanded uncertainty U = k u (k = 2) as text, rounded together to two significant digits of U.
 
-    Parameters
-    ----------
-    value : float or None
-        The value.
-    u : float or None
-        Its standard uncertainty, in the same unit.
-
-    Returns
-    -------
-    tuple of str
-        The value and U; U is ``n/a`` when there is none, and the value then keeps three significant digits.
+    ``u``: standard uncertainty in the unit of the value. Without it U is ``n/a`` and the value keeps three significant digits.
     """
     if not finite(value):
         return NOT_AVAILABLE, NOT_AVAILABLE
@@ -92,7 +82,7 @@ def with_uncertainty(value: float | None, u: float | None) -> tuple[str, str]:
 
 
 def printable(text: object) -> str:
-    """Text without the control characters that XML and HTML cannot hold. Escaping is the writer's business."""
+    """Text without the control characters that XML and HTML cannot hold; not escaped."""
     return _UNPRINTABLE.sub("\ufffd", str(text))
 
 

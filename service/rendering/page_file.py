@@ -1,4 +1,4 @@
-"""A page on the disk: written whole or not at all."""
+"""Atomic writing of a page to disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from abbe.service.errors import FileFormatError
 
 
 def write_page(text: str | bytes, target: Path) -> None:
-    """Write a page (or the bytes of a PDF) beside its place and move it there: a reader sees the old file or the whole new one.
+    """Write a page (or the bytes of a PDF) to a temporary file and rename it: a reader sees the old file or the whole new one.
 
     Raises
     ------
@@ -27,7 +27,7 @@ def write_page(text: str | bytes, target: Path) -> None:
             file.write(text.encode() if isinstance(text, str) else text)
             file.flush()
             os.fsync(file.fileno())
-        aside.chmod(0o644)  # mkstemp makes private files, this one is for others
+        aside.chmod(0o644)  # mkstemp creates private files
         aside.replace(target)
     except OSError as error:
         if aside is not None:

@@ -1,4 +1,4 @@
-"""Colours of reports: told apart by colour-blind readers, legible on white, on black and on paper.
+"""Colours of reports, distinguishable for colour-blind readers and legible on white, on black and on paper.
 
 Plots never name a colour; they name a role (``c1``, ``seq3``, ``ink``), which the page's style sheet binds to a value for light and for
 dark. The series colours descend from Okabe and Ito's set, darkened (light page) or lightened (dark page) until each has a contrast of 4.5.
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 SERIES = 5
 SEQUENCE = 5
 BANDS = 8
-"""Colours for values of either sign: half of them below zero, half above."""
+"""Number of colours for signed values: half below zero, half above."""
 
 LIGHT: Mapping[str, str] = {
     "page": "#ffffff",
@@ -106,13 +106,13 @@ def _variables(values: Mapping[str, str]) -> str:
 
 
 def style_rules() -> str:
-    """CSS that gives every role its colour: light by default and in print, dark where the reader's system asks for it."""
+    """CSS with the colour of every role: light by default and in print, dark if the reader's system prefers it."""
     dark = f"@media screen and (prefers-color-scheme:dark){{:root{{{_variables(DARK)}}}}}"
     return f":root{{color-scheme:light dark;{_variables(LIGHT)}}}\n{dark}\n{_PLOT_RULES}{_role_rules()}"
 
 
 def paper_rules(font: str) -> str:
-    """CSS of a picture that stands alone on paper: every role with its light colour, for programs that know no variables."""
+    """CSS of a stand-alone picture: every role with its light colour, for programs without CSS variables."""
     rules = (_PLOT_RULES + _role_rules()).replace("font-family:inherit", f"font-family:'{font}'")
     for name, value in LIGHT.items():
         rules = rules.replace(f"var(--{name})", value)

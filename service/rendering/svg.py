@@ -1,7 +1,7 @@
 """A small SVG writer: the same calls always give the same bytes.
 
-Elements carry style classes, not colours (see ``palette``). Anything without finite coordinates is left out, so that a gap in the data is
-a gap in the plot and never a broken file.
+Elements carry style classes, not colours (see ``palette``). Elements without finite coordinates are left out, so that a gap in the data
+becomes a gap in the plot and never a broken file.
 """
 
 from __future__ import annotations
@@ -16,24 +16,15 @@ XY = tuple[float, float]
 
 
 def coordinate(value: float) -> str:
-    """Pixel coordinate with at most two decimals: a hundredth of a pixel is invisible, and short files load faster."""
+    """Pixel coordinate with at most two decimals, which are accurate enough and keep the file short."""
     text = f"{value:.2f}".rstrip("0").rstrip(".")
     return "0" if text in {"-0", ""} else text
 
 
 class Svg:
-    """One picture. Coordinates in pixels, y downwards.
+    """One picture. Coordinates in pixels, y downwards; the page scales it.
 
-    Parameters
-    ----------
-    width, height : float
-        Size of the drawing; the page scales it to the space there is.
-    key : str
-        Identifier, unique in the page.
-    title : str
-        What the picture shows, for screen readers.
-    desc : str
-        What can be read from it, in words.
+    ``key``: identifier, unique in the page. ``title``, ``desc``: text for screen readers.
     """
 
     def __init__(self, width: float, height: float, key: str, title: str, desc: str = "") -> None:
@@ -45,7 +36,7 @@ class Svg:
         self._body: list[str] = []
 
     def line(self, start: XY, end: XY, style: str) -> None:
-        """Straight line."""
+        """Draw a straight line."""
         if _finite(start, end):
             (x1, y1), (x2, y2) = (_pair(start), _pair(end))
             self._body.append(f'<line x1="{x1}" y1="{y1}" x2="{x2}" y2="{y2}" class="{_attr(style)}"/>')
@@ -65,7 +56,7 @@ class Svg:
             self._body.append(f'<polygon points="{_points(corners)}" class="{_attr(style)}"/>')
 
     def rect(self, corner: XY, size: XY, style: str, tip: str = "") -> None:
-        """Rectangle; ``tip`` is shown when the pointer rests on it."""
+        """Rectangle with the tooltip ``tip``."""
         if _finite(corner, size):
             (x, y), (w, h) = _pair(corner), _pair((abs(size[0]), abs(size[1])))
             self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="{_attr(style)}"{_close("rect", tip)}')
@@ -77,7 +68,7 @@ class Svg:
             self._body.append(f'<circle cx="{x}" cy="{y}" r="{coordinate(radius)}" class="{_attr(style)}"/>')
 
     def dot(self, centre: XY, radius: float, style: str, tip: str = "") -> None:
-        """Point marker; ``tip`` is shown when the pointer rests on it."""
+        """Point marker with the tooltip ``tip``."""
         if _finite(centre):
             x, y = _pair(centre)
             self._body.append(f'<circle cx="{x}" cy="{y}" r="{coordinate(radius)}" class="{_attr(style)}"{_close("circle", tip)}')
@@ -94,17 +85,7 @@ class Svg:
             self.line((x + side * dx - cx, y + side * dy - cy), (x + side * dx + cx, y + side * dy + cy), "whisker")
 
     def arrow(self, start: XY, end: XY, style: str, tip: str = "") -> None:
-        """Arrow with a filled head; shorter than a pixel it becomes a dot, because a head would claim a direction that is invisible.
-
-        Parameters
-        ----------
-        start, end : tuple of float
-            Foot and tip.
-        style : str
-            Role of the colour, e.g. ``"c1"`` or ``"seq3"``.
-        tip : str, optional
-            Shown when the pointer rests on it.
-        """
+        """Arrow with a filled head, or a dot if shorter than a pixel. ``style``: role of the colour; ``tip``: tooltip."""
         if not _finite(start, end):
             return
         dx, dy = end[0] - start[0], end[1] - start[1]
@@ -134,7 +115,7 @@ class Svg:
         self._body.append(f'<text x="{x}" y="{y}"{kind}{side}{rotation}>{escape(printable(content))}</text>')
 
     def legend(self, at: XY, entries: Sequence[tuple[str, str]]) -> None:
-        """Row of line samples with their names. Entries: style class of the line, name."""
+        """Row of line samples with their names. ``entries``: style class of the line, name."""
         x, y = at
         for style, name in entries:
             self.line((x, y - 4.0), (x + 22.0, y - 4.0), style)

@@ -1,4 +1,4 @@
-"""Plots of the report: each takes plain values and gives one ``<svg>`` element."""
+"""Plots of the report: each turns plain values into one ``<svg>`` element."""
 
 from abbe.service.rendering.plots.bars import contribution_bars, uncertainty_bars
 from abbe.service.rendering.plots.diagonals import diagonal_plot

@@ -17,15 +17,7 @@ OPEN = "not observable"
 
 
 def motion_bands(curves: Sequence[MotionCurve], *, key: str) -> str:
-    """Curves of one unit, each with its band; a motion that these runs do not show by itself is dashed.
-
-    Parameters
-    ----------
-    curves : sequence of MotionCurve
-        All of one unit.
-    key : str
-        Identifier, unique in the page.
-    """
+    """Curves of one unit, each with its band; motions that are not observable by themselves are dashed."""
     unit = curves[0].unit if curves else ""
     axes = sorted({c.axis for c in curves})
     rows = sorted({c.name[1] for c in curves})

@@ -1,4 +1,4 @@
-"""Horizontal bars: which error contributes how much, and how well each parameter is known."""
+"""Horizontal bars: contributions of the errors, and uncertainty of each parameter."""
 
 from __future__ import annotations
 
@@ -12,25 +12,13 @@ from abbe.service.rendering.svg import Svg
 WIDTH, ROW, TOP, BOTTOM = 500.0, 22.0, 34.0, 46.0
 LABELS = 150.0
 FIGURES = 130.0
-"""Room for value and uncertainty at the right of a ranking."""
+"""Width of the column for value and uncertainty of a ranking."""
 
 
 def contribution_bars(
     rows: Sequence[Contribution], *, key: str = "ranking", heading: str = "Rank of error contributions", unit: Unit = UM
 ) -> str:
-    """Contributions, largest first, with their expanded uncertainty (k = 2).
-
-    Parameters
-    ----------
-    rows : sequence of Contribution
-        In any order; those without a number come last.
-    key : str, optional
-        Identifier, unique in the page.
-    heading : str, optional
-        Heading of the picture.
-    unit : Unit, optional
-        What the reader sees them in.
-    """
+    """Contributions with their expanded uncertainty (k = 2), largest first, those without a number last. ``unit``: display unit."""
     ranked = sorted((_in_unit(r, unit) for r in rows), key=lambda r: -abs(r.value_um) if finite(r.value_um) else 1.0)
     summary = "; ".join(f"{r.name} {_rounded(r)} {unit.sign}" for r in ranked)
     svg = Svg(WIDTH, TOP + ROW * max(len(ranked), 1) + BOTTOM, key, heading, f"{heading}: {summary}.")
@@ -51,35 +39,27 @@ def contribution_bars(
 
 
 def _in_unit(row: Contribution, unit: Unit) -> Contribution:
-    """The same numbers in what the reader sees."""
+    """The contribution in the display unit."""
     value, u = (v / unit.size if finite(v) else v for v in (row.value_um, row.u_um))
     return Contribution(row.name, value, u)
 
 
 def _rounded(row: Contribution) -> str:
-    """Value and U (k = 2), rounded to the uncertainty; the value alone where there is none."""
+    """Value and U (k = 2), rounded to the uncertainty; the value alone without an uncertainty."""
     if row.value_um is not None and row.u_um is not None and finite(row.value_um) and finite(row.u_um) and row.u_um > 0.0:
         return "{} ± {}".format(*with_uncertainty(row.value_um, row.u_um))
     return plain(row.value_um)
 
 
 def _whisker(svg: Svg, panel: Panel, row: Contribution, y: float) -> None:
-    """U of a contribution; a size is never below zero, so the whisker ends there."""
+    """Whisker of U, cut off at zero because a contribution is never negative."""
     value, u = abs(row.value_um or 0.0), COVERAGE * (row.u_um or 0.0)
     low, high = panel.x(max(value - u, 0.0)), panel.x(value + u)
     svg.error_bar((0.5 * (low + high), y), 0.5 * (high - low), horizontal=True)
 
 
 def uncertainty_bars(rows: Sequence[ParameterRow], *, key: str = "parameters") -> list[str]:
-    """Parameters with whiskers of U (k = 2): one picture per unit, because µm and µrad have no common axis.
-
-    Parameters
-    ----------
-    rows : sequence of ParameterRow
-        Parameters without a value or an uncertainty are left to the table.
-    key : str, optional
-        Identifier, unique in the page.
-    """
+    """Parameters with whiskers of U (k = 2), one picture per unit. Parameters without a value or an uncertainty are left out."""
     units: dict[str, list[ParameterRow]] = {}
     for row in rows:
         if finite(row.value) and finite(row.u):

@@ -19,22 +19,13 @@ LABELS, CELL, HEAD = 128.0, 22.0, 40.0
 
 
 def common_step(slices: Sequence[Slice]) -> float:
-    """Width of one colour band, µm, with which all slices can be compared."""
+    """Common width of a colour band for all slices, µm."""
     largest = max((float(np.nanmax(s.values)) for s in slices), default=0.0)
     return round_up(largest / SEQUENCE) if largest > 0.0 else 1.0
 
 
 def slice_plot(found: Slice, step: float, *, key: str, heading: str) -> str:
-    """One plane of the volume, a cell per node; dark is large.
-
-    Parameters
-    ----------
-    found : Slice
-    step : float
-        Width of a colour band, µm, from `common_step`.
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
-    """
+    """One plane of the volume, a cell per node; dark is large. ``step``: width of a colour band, µm, from `common_step`."""
     low, high = float(np.nanmin(found.values)), float(np.nanmax(found.values))
     summary = f"from {plain(low)} to {plain(high)} µm, {found.at}"
     svg = Svg(WIDTH, HEIGHT, key, heading, f"Map over a plane: {summary}.")
@@ -43,7 +34,7 @@ def slice_plot(found: Slice, step: float, *, key: str, heading: str) -> str:
     dx, dy = (0.5 * float(v[1] - v[0]) for v in (found.x_mm, found.y_mm))
     ranges = (float(found.x_mm[0]) - dx, float(found.x_mm[-1]) + dx), (float(found.y_mm[0]) - dy, float(found.y_mm[-1]) + dy)
     panel = Panel(LEFT, TOP, WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, *ranges)
-    size = (panel.width / len(found.x_mm) + 0.6, panel.height / len(found.y_mm) + 0.6)  # a little over, so that no seam shows
+    size = (panel.width / len(found.x_mm) + 0.6, panel.height / len(found.y_mm) + 0.6)  # cells overlap slightly to hide seams
     for j, y in enumerate(found.y_mm):
         for i, x in enumerate(found.x_mm):
             value = float(found.values[j, i])
@@ -62,14 +53,7 @@ def slice_plot(found: Slice, step: float, *, key: str, heading: str) -> str:
 
 
 def correlation_plot(found: Correlations, *, key: str = "correlations") -> str:
-    """Matrix of correlations: blue below zero, orange above; the pointer shows the number.
-
-    Parameters
-    ----------
-    found : Correlations
-    key : str, optional
-        Identifier, unique in the page.
-    """
+    """Matrix of correlations: blue below zero, orange above, with the number as tooltip."""
     n = len(found.names)
     side = n * CELL
     scale = SignedScale(0.25)

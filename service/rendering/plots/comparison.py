@@ -1,4 +1,4 @@
-"""Readings against lines, and what is left between them."""
+"""Readings with fitted lines, and their differences."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LINES = ("s-c2", "s-c3 dash", "s-c4 dots")
 class Comparison:
     """Readings over a position with the lines that describe them. Values in um.
 
-    ``lines``: name and value at every position, up to three; the first is what the readings are compared with in the lower panel.
+    ``lines``: up to three names with values at every position; the lower panel compares the readings with the first one.
     """
 
     x_label: str
@@ -33,14 +33,7 @@ class Comparison:
 
 
 def comparison_plot(data: Comparison, *, key: str, heading: str) -> str:
-    """Upper panel: readings and lines; lower panel: readings minus the first line.
-
-    Parameters
-    ----------
-    data : Comparison
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
-    """
+    """Upper panel: readings and lines; lower panel: readings minus the first line."""
     apart = data.readings_um - data.lines[0][1]
     size = np.abs(apart)
     summary = f"{data.name} − {data.lines[0][0]}: largest {plain(float(size.max()))} µm, mean size {plain(float(size.mean()))} µm"

@@ -21,18 +21,9 @@ LEFT, TOP, RIGHT, BOTTOM = 62.0, 48.0, 20.0, 96.0
 
 
 def contour_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str, dots: Sequence[XY] = ()) -> str:
-    """Map of a surface seen from above.
+    """Map of a surface from above; ``surface`` needs a fine grid to look smooth.
 
-    Parameters
-    ----------
-    surface : Surface
-        Fine enough that its cells look smooth.
-    scale : SignedScale
-        Bands of the colours and levels of the lines; zero is drawn stronger.
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
-    dots : sequence of points, optional
-        Places to mark, in the coordinates of the axes.
+    ``scale``: colour bands and levels of the lines, with a stronger line at zero. ``dots``: marked points, in the coordinates of the axes.
     """
     low, high = extremes(surface.values.ravel())
     summary = f"from {plain(low)} to {plain(high)} {surface.unit}"
@@ -67,7 +58,7 @@ def level_lines(x: Array, y: Array, values: Array, level: float) -> list[list[XY
     Returns
     -------
     list of lists of (x, y)
-        One list a line; a closed line ends where it began. A saddle is joined so that its centre lies on the side of the cell's mean.
+        One list per line; a closed line ends at its first point. The lines of a saddle put its centre on the side of the cell's mean.
     """
     segments: list[Segment] = []
     for j in range(len(y) - 1):
@@ -76,7 +67,7 @@ def level_lines(x: Array, y: Array, values: Array, level: float) -> list[list[XY
             if np.isfinite(corners).all():
                 places = ((x[i], y[j]), (x[i + 1], y[j]), (x[i + 1], y[j + 1]), (x[i], y[j + 1]))
                 segments += _cell(corners, [(float(a), float(b)) for a, b in places], level)
-    return _join([s for s in segments if _key(s[0]) != _key(s[1])])  # a corner that lies on the level gives a segment of no length
+    return _join([s for s in segments if _key(s[0]) != _key(s[1])])  # drop segments of zero length from corners on the level
 
 
 def _cell(corners: Array, places: list[XY], level: float) -> list[Segment]:
@@ -98,14 +89,14 @@ def _between(p: XY, q: XY, at_p: float, at_q: float, level: float) -> XY:
 
 
 def _join(segments: list[Segment]) -> list[list[XY]]:
-    """Chain segments that share an end; neighbouring cells compute the shared point from the same numbers, so the ends are equal."""
+    """Chain segments that share an end. Neighbouring cells compute the shared point from the same numbers, so their ends are equal."""
     ends: dict[XY, list[int]] = {}
     for k, (p, q) in enumerate(segments):
         for end in (_key(p), _key(q)):
             ends.setdefault(end, []).append(k)
     free = set(range(len(segments)))
     lines = []
-    # Open lines first, from their loose ends; what is left over is closed.
+    # Open lines first, from their loose ends; the remaining lines are closed.
     order = [k for shared in ends.values() if len(shared) == 1 for k in shared] + list(range(len(segments)))
     for start in order:
         if start not in free:
@@ -128,7 +119,7 @@ def _key(point: XY) -> XY:
 
 
 def _draw_bands(svg: Svg, panel: Panel, surface: Surface, scale: SignedScale) -> None:
-    """Cells of one colour that follow each other in a row are one rectangle; they overlap by a pixel so that no seam shows."""
+    """Neighbouring cells of one colour in a row become one rectangle; rectangles overlap by a pixel to hide seams."""
     v = surface.values
     mean = 0.25 * (v[:-1, :-1] + v[1:, :-1] + v[:-1, 1:] + v[1:, 1:])
     for j in range(mean.shape[0]):

@@ -1,4 +1,4 @@
-"""A machine's volume as a grid: nominal and, magnified, as it is."""
+"""A machine's volume as a grid: nominal, and with magnified errors."""
 
 from __future__ import annotations
 
@@ -16,18 +16,13 @@ Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 500.0, 470.0
 SHARE = 0.14
-"""Longest error on paper as a share of the volume's diagonal."""
+"""Drawn length of the longest error as a share of the volume's diagonal."""
 
 
 def deformed_grid(grid_mm: Array, deviation_um: Array, *, key: str, heading: str) -> str:
-    """The lines of a grid on the faces of its box: dashed as commanded, solid where the magnified errors put them.
+    """The lines of a grid on the faces of its box: dashed as commanded, solid with magnified errors.
 
-    Parameters
-    ----------
-    grid_mm, deviation_um : arrays, shape (nx, ny, nz, 3)
-        Nodes and actual minus nominal there.
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
+    ``grid_mm``, ``deviation_um``: nodes and actual minus nominal, shape (nx, ny, nz, 3).
     """
     longest = float(np.linalg.norm(deviation_um, axis=3).max())
     low, high = grid_mm[0, 0, 0], grid_mm[-1, -1, -1]
@@ -54,7 +49,7 @@ def deformed_grid(grid_mm: Array, deviation_um: Array, *, key: str, heading: str
 
 
 def _face_lines(nodes: Array) -> Iterator[Array]:
-    """Grid lines on the three faces that the viewer sees (X large, Y small, Z large) and the three edges behind."""
+    """Grid lines on the three visible faces (X large, Y small, Z large) and the three hidden edges."""
     nx, ny, nz = nodes.shape[:3]
     for i in range(nx):
         yield nodes[i, 0, :]

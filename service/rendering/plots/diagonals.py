@@ -1,4 +1,4 @@
-"""The four body diagonals before and after, on one ordinate: the picture that an ISO 230-6 reader looks for."""
+"""The four body diagonals before and after, on one ordinate (ISO 230-6)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,7 @@ Curves = Mapping[str, tuple[Floats, Floats]]
 def diagonal_plot(before: Curves, after: Curves, *, key: str = "diagonals") -> str:
     """Deviation along each diagonal before and after the correction.
 
-    Parameters
-    ----------
-    before, after : mapping of str to (position in mm, deviation in µm)
-        By name of the diagonal, e.g. ``ppp``. Out and back may follow each other in one curve.
-    key : str, optional
-        Identifier, unique in the page.
+    Curves: position in mm and deviation in µm by name of the diagonal, e.g. ``ppp``; one curve may run out and back.
     """
     names = list(dict.fromkeys([*before, *after]))
     rows = max(1, math.ceil(len(names) / COLUMNS))

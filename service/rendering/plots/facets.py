@@ -17,20 +17,12 @@ Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 500.0, 430.0
 FLOOR, ROOF = 0.0, 0.62
-"""Height of the box that a surface is drawn in, as a share of its side."""
+"""Bottom and top of the box of a surface, as a share of its side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Values over a rectangle.
-
-    Attributes
-    ----------
-    x, y : arrays, shapes (nx,), (ny,)
-    values : array, shape (ny, nx)
-    x_label, y_label, unit : str
-        Names of the axes with their units; unit of the values.
-    """
+    """Values over a rectangle: ``x`` (nx,), ``y`` (ny,), ``values`` (ny, nx) in ``unit``; labels: names and units of the axes."""
 
     x: Array
     y: Array
@@ -43,11 +35,7 @@ class Surface:
 def draw_facets(svg: Svg, paper: Paper, nodes: Array, values: Array, scale: SignedScale) -> None:
     """Quadrangles between neighbouring nodes, far ones first, coloured by the mean of their corners.
 
-    Parameters
-    ----------
-    nodes : array, shape (rows, columns, 3)
-        Points of space.
-    values : array, shape (rows, columns)
+    ``nodes``: points in space, shape (rows, columns, 3); ``values``: shape (rows, columns).
     """
     corners = np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, 1:], nodes[1:, :-1]], axis=2).reshape(-1, 4, 3)
     mean = (0.25 * (values[:-1, :-1] + values[:-1, 1:] + values[1:, 1:] + values[1:, :-1])).ravel()
@@ -57,15 +45,9 @@ def draw_facets(svg: Svg, paper: Paper, nodes: Array, values: Array, scale: Sign
 
 
 def surface_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str) -> str:
-    """One surface over its rectangle, height and colour both the value.
+    """One surface over its rectangle; height and colour show the value.
 
-    Parameters
-    ----------
-    surface : Surface
-    scale : SignedScale
-        Shared by all pictures that are to be compared; the height of the box is its whole range.
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
+    ``scale``: shared by all pictures to compare; its whole range is the height of the box.
     """
     low_value, high_value = extremes(surface.values.ravel())
     summary = f"from {plain(low_value)} to {plain(high_value)} {surface.unit}"
@@ -92,7 +74,7 @@ def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scal
     Parameters
     ----------
     colatitude_rad, longitude_rad : arrays, shapes (rows,), (columns,)
-        From the pole (0) to the equator (pi/2); once around, first and last column the same direction.
+        From the pole (0) to the equator (pi/2); full turn, first and last column in the same direction.
     values : array, shape (rows, columns)
         um, outwards positive.
     """

@@ -1,4 +1,4 @@
-"""Measured against simulated: gap of every run over its noise, along one run before and after, and where in the volume."""
+"""Measured against simulated: gap of every run over its noise, gap along one run before and after, and gap over the volume."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ ROW, TOP, BOTTOM, LABELS = 20.0, 52.0, 46.0, 190.0
 TRACE_HEIGHT = 400.0
 MAX_POINTS = 1500
 STEPS = (1.5, 2.5, 4.0, 7.0)
-"""Limits between the five colours of a place: rms of the gap over the noise."""
+"""Limits between the five colours of a cell: rms of the gap over the noise."""
 
 
 def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
-    """One row a run: gap before (hollow) and after (filled), and the noise floor as a tick. Runs whose readings are sealed are left out."""
+    """One row per run: gap before (hollow) and after (filled), and the noise floor as a tick. Sealed runs are left out."""
     rows = [
         (label, r, r.rms_before_um, r.rms_after_um)
         for label, r in runs.items()
@@ -73,7 +73,7 @@ def trace_plot(trace: Trace, *, key: str) -> str:
 
 
 def place_plot(place: PlaceMap, *, key: str) -> str:
-    """Cells of one plane, darker where the gap is larger against its noise; a ring where something was located."""
+    """Cells of one plane, darker for a larger gap over its noise; a ring marks the located area."""
     heading = f"Where the gap lives, {place.x_axis} and {place.y_axis}"
     worst = float(place.times_noise.max()) if place.times_noise.size else math.nan
     svg = Svg(HALF, 380.0, key, heading, f"rms of the gap over its noise, up to {plain(worst, 2)}")
@@ -101,7 +101,7 @@ def place_plot(place: PlaceMap, *, key: str) -> str:
 
 
 def _thinned(y: NDArray[np.float64]) -> Sequence[int]:
-    """Every so-many-th point, and of each bin the largest, so that no spike is lost."""
+    """Indices of evenly spaced points and of the largest value per bin, so that no spike is lost."""
     if y.size <= MAX_POINTS:
         return range(y.size)
     edges = np.linspace(0, y.size, MAX_POINTS // 2 + 1).astype(int)

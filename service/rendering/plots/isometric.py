@@ -1,4 +1,4 @@
-"""A box of space on paper: the isometric view that all spatial pictures share.
+"""The isometric view that all spatial pictures share.
 
 The view is from the front right, from above: X runs to the lower right, Y to the upper right, Z up.
 """
@@ -34,7 +34,7 @@ class ViewWindow:
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """Where a point of space comes to lie: pixels per unit of space, the point in the middle, and its pixel."""
+    """Projection of space to pixels: pixels per unit, and the central point with its pixel."""
 
     zoom: float
     centre: F2
@@ -92,6 +92,6 @@ def label_edges(svg: Svg, paper: Paper, low: F2, high: F2) -> None:
 
 
 def round_down(value: float) -> float:
-    """Largest handy magnification (1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten) that does not exceed ``value``."""
+    """Largest round magnification (1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten) that does not exceed ``value``."""
     power = 10.0 ** math.floor(math.log10(value))
     return max(m for m in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0) if m * power <= value * (1.0 + 1e-9)) * power

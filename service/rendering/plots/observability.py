@@ -1,4 +1,4 @@
-"""What the readings tell: how much of each error motion comes from them, and what they make of reading noise over the volume."""
+"""Observability: share of each error motion that comes from the readings, and gain of the reading noise over the volume."""
 
 from __future__ import annotations
 
@@ -18,15 +18,7 @@ STYLES = {"observed": "f-c1", "weak": "f-c3"}
 
 
 def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str = "What the readings tell of each error motion") -> str:
-    """Share of information from readings per error motion, with its status beside it; what is not observable has an empty bar.
-
-    Parameters
-    ----------
-    rows : sequence of MotionShare
-        In the order in which they are drawn.
-    key, heading : str, optional
-        Identifier, unique in the page; heading of the picture.
-    """
+    """Share of information from readings per error motion, with its status, in the given order; the bar is empty if not observable."""
     kept = [r.name for r in rows if r.status == "observed"]
     summary = f"{len(kept)} of {len(rows)} may stand in a table of their own: {', '.join(kept) or 'none'}"
     svg = Svg(WIDTH, TOP + ROW * max(len(rows), 1) + BOTTOM, key, heading, f"{heading}: {summary}.")
@@ -48,12 +40,7 @@ def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str
 def gain_map(found: Slice, *, key: str, heading: str = "Noise gain") -> str:
     """Micrometres of predicted deviation per micrometre of reading noise over one plane of the volume, with level lines.
 
-    Parameters
-    ----------
-    found : Slice
-        ``values`` without unit; finer than ten nodes a side looks smooth.
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
+    ``found.values`` has no unit; more than ten nodes per side look smooth.
     """
     labels = (f"{found.x_axis} in mm", f"{found.y_axis} in mm")
     surface = Surface(found.x_mm, found.y_mm, found.values, *labels, "µm per µm")

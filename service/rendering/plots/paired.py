@@ -15,7 +15,7 @@ STYLES = ("f-c1", "f-c2")
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """One figure: two values with their standard uncertainties, µm; None: there is none on that side."""
+    """One figure: two values with their standard uncertainties, µm; None: no value on that side."""
 
     name: str
     first: tuple[float, float] | None
@@ -23,18 +23,7 @@ class Pair:
 
 
 def paired_bars(pairs: Sequence[Pair], names: tuple[str, str], *, key: str, heading: str, unit: Unit = UM) -> str:
-    """Pairs from top to bottom.
-
-    Parameters
-    ----------
-    pairs : sequence of Pair
-    names : tuple of str
-        What the first and the second bar of each pair are.
-    key, heading : str
-        Identifier, unique in the page; heading of the picture.
-    unit : Unit, optional
-        What the reader sees them in.
-    """
+    """Pairs from top to bottom. ``names``: of the first and the second bar of each pair; ``unit``: display unit."""
     pairs = [Pair(p.name, _in_unit(p.first, unit), _in_unit(p.second, unit)) for p in pairs]
     sides = [side for p in pairs for side in (p.first, p.second) if side is not None]
     summary = "; ".join(f"{p.name}: {_words(p.first, unit)}, {_words(p.second, unit)}" for p in pairs)

@@ -16,18 +16,9 @@ STYLES = ("s-c1 dash", "s-c2", "s-c3", "s-c4", "s-c5")
 
 
 def polar_plot(traces: Sequence[PolarTrace], *, key: str = "polar", heading: str = "Circular deviation", unit: Unit = UM) -> str:
-    """Deviation against the angle. The heavier ring is zero; outwards is a larger radius.
+    """Deviation of up to five traces against the angle, which may exceed one turn. The heavier ring is zero, outwards is positive.
 
-    Parameters
-    ----------
-    traces : sequence of PolarTrace
-        Up to five; a helix of several turns simply goes around several times.
-    key : str, optional
-        Identifier, unique in the page.
-    heading : str, optional
-        Heading of the picture.
-    unit : Unit, optional
-        What the reader sees the deviation in.
+    ``unit``: display unit of the deviation.
     """
     seen = [[float(v) / unit.size for v in t.deviation_um] for t in traces]
     low, high = data_range((v for values in seen for v in values), zero=True)

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositioningCurves:
-    """What is drawn: position in mm; mean deviations and standard deviations of both directions in µm (None: no repeats), shape (m,)."""
+    """Position in mm; mean deviations and standard deviations of both directions in µm (None: no repeats), shape (m,)."""
 
     label: str
     x_label: str
@@ -28,16 +28,7 @@ class PositioningCurves:
 
 
 def positioning_plot(curves: PositioningCurves, *, key: str, figures: str = "") -> str:
-    """Means of both directions against the position; bars reach two standard deviations to both sides.
-
-    Parameters
-    ----------
-    curves : PositioningCurves
-    key : str
-        Identifier, unique in the page.
-    figures : str, optional
-        Figures in words, at the head of the picture.
-    """
+    """Means of both directions against the position, with bars of ± two standard deviations. ``figures``: text for the heading."""
     sides = (
         (curves.forward_um, curves.s_forward_um, "c2", "moving in +"),
         (curves.backward_um, curves.s_backward_um, "c1", "moving in −"),
@@ -56,7 +47,7 @@ def positioning_plot(curves: PositioningCurves, *, key: str, figures: str = "") 
         for at, half in zip(points, np.zeros(y.size) if s is None else 2.0 * s, strict=True):
             svg.dot(at, 2.2, f"f-{role}")
             if half > 0.0:
-                # The two directions side by side, or one would hide the other.
+                # Shift the two directions so that neither hides the other.
                 svg.error_bar((at[0] + (3.0 if k else -3.0), at[1]), float(panel.y(0.0) - panel.y(float(half))), cap=2.5)
     panel.draw_frame(svg)
     svg.legend((66.0, HEIGHT - 8.0), [(f"s-{role}" + (" dash" if k else ""), name) for k, (_, _, role, name) in enumerate(sides)])

@@ -1,4 +1,4 @@
-"""Residual of one run: what the model leaves unexplained, against the noise that the instrument has anyway."""
+"""Residual of one run, compared with the noise of the instrument."""
 
 from __future__ import annotations
 
@@ -15,22 +15,13 @@ from abbe.service.rendering.svg import Svg
 
 WIDTH, HEIGHT = 500.0, 215.0
 MAX_POINTS = 900
-"""Above this a run is drawn as its envelope: the lowest and highest residual per bin, so that no spike is lost."""
+"""Longer runs are drawn as an envelope of the lowest and highest residual per bin, so that no spike is lost."""
 
 
 def residual_plot(series: ResidualSeries, *, noise_um: float | None, y_range: tuple[float, float] | None = None, key: str) -> str:
-    """Residual against position along the path or time.
+    """Residual against time or position along the path.
 
-    Parameters
-    ----------
-    series : ResidualSeries
-        The run.
-    noise_um : float or None
-        Standard deviation of the reading; drawn as a band of plus and minus two of them.
-    y_range : tuple of float, optional
-        Common range, so that runs can be compared with each other.
-    key : str
-        Identifier, unique in the page.
+    ``noise_um``: standard deviation of the reading, drawn as a band of ± 2 of them. ``y_range``: common range of several runs.
     """
     x, y = _paired(series)
     good = y[np.isfinite(y)]
@@ -52,7 +43,7 @@ def residual_plot(series: ResidualSeries, *, noise_um: float | None, y_range: tu
     else:
         for xi, yi in zip(x.tolist(), y.tolist(), strict=True):
             svg.dot(panel.at(xi, yi), 1.5, "f-c2")
-    for edge in band:  # again, over dense data
+    for edge in band:  # drawn again above dense data
         svg.line((panel.left, panel.y(edge)), (panel.left + panel.width, panel.y(edge)), "band-edge")
     panel.draw_frame(svg)
     return svg.render()

@@ -1,4 +1,4 @@
-"""Where a planned campaign is set up: every path in the machine's volume, numbered in the order of measuring."""
+"""Set-ups of a planned campaign: every path in the machine's volume, numbered in the order of measuring."""
 
 from __future__ import annotations
 
@@ -15,21 +15,13 @@ F2 = NDArray[np.float64]
 
 WIDTH, HEIGHT = 760.0, 620.0
 MAX_POINTS = 400
-"""Points per drawn path: more cannot be told apart."""
+"""Largest number of points per drawn path; more are indistinguishable."""
 STYLES = {"bar": "c1", "line": "c2", "diagonal": "c3"}
 NAMES = {"bar": "ball-bar, its cup", "line": "laser along an axis", "diagonal": "laser along a body diagonal"}
 
 
 def setups_picture(stroke_mm: F2, paths: Sequence[DrawnTest], *, key: str = "setups") -> str:
-    """Isometric view of the strokes with all paths and, at each set-up, its number.
-
-    Parameters
-    ----------
-    stroke_mm : array, shape (3, 2)
-        First and last position of X, Y, Z.
-    paths : sequence of DrawnTest
-        In the order of measuring.
-    """
+    """Isometric view of the strokes, shape (3, 2), with all paths in the order of measuring and the numbers of their set-ups."""
     count = len({p.number for p in paths})
     summary = "; ".join(f"{p.number}: {p.text}" for p in paths)
     svg = Svg(WIDTH, HEIGHT, key, f"{count} set-ups in the machine's volume", summary)
@@ -37,7 +29,7 @@ def setups_picture(stroke_mm: F2, paths: Sequence[DrawnTest], *, key: str = "set
     paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, HEIGHT / 2.0 - 14.0), WIDTH - 150.0, HEIGHT - 130.0))
     draw_box(svg, paper, low, high)
     middles = np.array([p.path_mm.mean(axis=0) for p in paths]).reshape(-1, 3)
-    for i in np.argsort(depth(middles), kind="stable"):  # far ones first, near ones over them
+    for i in np.argsort(depth(middles), kind="stable"):  # far ones first, near ones on top
         path = paths[int(i)]
         thinned = path.path_mm[:: max(1, len(path.path_mm) // MAX_POINTS)]
         svg.polyline([paper(point) for point in (*thinned, path.path_mm[-1])], f"s-{STYLES[path.kind]} thin")

@@ -1,4 +1,4 @@
-"""Colours for values of either sign: eight bands with edges at -4 .. +4 steps, blue below zero, orange above.
+"""Colours for signed values: eight bands with edges at -4 .. +4 steps, blue below zero, orange above.
 
 Roles ``d1`` (far below zero) to ``d8`` (far above) have their colours in `abbe.service.rendering.palette`.
 """
@@ -26,7 +26,7 @@ class SignedScale:
 
     @classmethod
     def around(cls, *fields: NDArray[np.float64]) -> SignedScale:
-        """Smallest step of the form 1, 2, 5 with which the bands hold all finite values of all fields."""
+        """Scale with the smallest step of the form 1, 2, 5 that covers all finite values of all fields."""
         sizes = [float(np.nanmax(np.abs(f))) for f in fields if np.isfinite(f).any()]
         largest = max(sizes, default=0.0)
         return cls(round_up(largest / HALF) if largest > 0.0 else 1.0)
@@ -37,7 +37,7 @@ class SignedScale:
         return f"f-d{band + HALF + 1}"
 
     def levels(self) -> list[float]:
-        """Edges between the bands, zero among them."""
+        """Edges between the bands, including zero."""
         return [k * self.step for k in range(-HALF + 1, HALF)]
 
     def draw_bar(self, svg: Svg, at: XY, unit: str, cell: float = 40.0) -> None:

@@ -1,4 +1,4 @@
-"""A plane through the machine's volume: commanded grid, the same with its errors magnified, an arrow at each node where one is known."""
+"""A plane through the machine's volume: commanded grid, grid with magnified errors, and an arrow at each node with a significant error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 WIDTH, SIDE, LEFT, TOP, BOTTOM = 620.0, 420.0, 74.0, 52.0, 104.0
 MARGIN = 0.11
-"""Room for the magnified errors beside the strokes, as a share of the longer one."""
+"""Margin for the magnified errors around the strokes, as a share of the longer one."""
 HANDY = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 PLANES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 """Axes to the right, upwards and through the paper."""
@@ -26,7 +26,7 @@ PLANES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlicePlane:
-    """Nodes of one plane, shape (a, b, 3), mm; deviation, µm; U (k = 2) of its length, µm, and whether that is exceeded, shape (a, b)."""
+    """Nodes of one plane, shape (a, b, 3), mm; deviation, µm; U (k = 2) of its length, µm; whether the length exceeds U, shape (a, b)."""
 
     plane: str
     grid_mm: Array
@@ -37,7 +37,7 @@ class SlicePlane:
 
 @dataclass(frozen=True, slots=True)
 class SliceTexts:
-    """What the picture says, in the reader's language; places and errors in the reader's units."""
+    """Texts of the picture in the reader's language, and display units of places and errors."""
 
     heading: str
     nominal: str
@@ -49,7 +49,7 @@ class SliceTexts:
 
 
 def colour_top(length: Array) -> float:
-    """Upper end of the colour scale that holds these lengths: five equal handy steps, at most a third longer than needed."""
+    """Upper end of the colour scale for these lengths: five equal round steps, at most a third longer than needed."""
     longest = float(length.max()) if length.size else 0.0
     if longest <= 0.0:
         return 1.0
@@ -58,12 +58,12 @@ def colour_top(length: Array) -> float:
 
 
 def magnification(span_mm: float, longest_um: float) -> float:
-    """Handy factor at which the longest error spans a tenth of the volume."""
+    """Round factor at which the longest error spans a tenth of the volume."""
     return round_down(0.1 * span_mm / (longest_um * 1e-3)) if longest_um > 0.0 and span_mm > 0.0 else 1.0
 
 
 def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts, *, key: str = "slice") -> str:
-    """One plane. ``top``: upper end of the colours in the reader's unit; ``magnified``: mm drawn per mm of error."""
+    """One plane. ``top``: upper end of the colours in the display unit; ``magnified``: mm drawn per mm of error."""
     across, up, _ = PLANES[data.plane]
     grid = data.grid_mm / texts.place.size
     low, high = grid[0, 0], grid[-1, -1]
@@ -81,7 +81,7 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts
     panel.draw_x(svg, f"{'XYZ'[across]} {texts.place.sign}", count=5)
     panel.draw_y(svg, f"{'XYZ'[up]} {texts.place.sign}", count=5)
     actual = grid + data.deviation_um * 1e-3 * magnified / texts.place.size
-    known = np.where(data.significant[..., None], actual, np.nan)  # a line breaks where its course is unknown
+    known = np.where(data.significant[..., None], actual, np.nan)  # lines break at insignificant nodes
     for nodes, style in ((grid, "hidden-edge"), (known, "s-c2 thin")):
         for line in (*nodes, *np.swapaxes(nodes, 0, 1)):
             svg.polyline([panel.at(float(p[across]), float(p[up])) for p in line], style)
@@ -92,7 +92,7 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts
 
 
 def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array], top: float, texts: SliceTexts) -> None:
-    """From the first ends to the second."""
+    """Arrows from the first ends to the second."""
     across, up, _ = PLANES[data.plane]
     (grid, actual), unit = ends, texts.error
     for index in np.ndindex(data.significant.shape):
@@ -110,7 +110,7 @@ def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array],
 
 
 def _key(svg: Svg, y: float, top: float, texts: SliceTexts) -> None:
-    """Colours with their numbers, and what the lines mean."""
+    """Key of the colours and lines."""
     cell, step = 52.0, top / SEQUENCE
     for i in range(SEQUENCE):
         svg.rect((LEFT + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
@@ -122,5 +122,5 @@ def _key(svg: Svg, y: float, top: float, texts: SliceTexts) -> None:
 
 
 def steps(top: float) -> list[str]:
-    """Numbers at the ends of the five colours, in words."""
+    """Upper ends of the five colours as text."""
     return [tidy(i * top / SEQUENCE) for i in range(SEQUENCE + 1)]

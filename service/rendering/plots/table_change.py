@@ -41,15 +41,7 @@ class CurveChange:
 
 
 def change_plot(curves: Sequence[CurveChange], *, key: str = "change") -> str:
-    """Corrections in µm against the position in mm, one ordinate for all.
-
-    Parameters
-    ----------
-    curves : sequence of CurveChange
-        Up to nine.
-    key : str, optional
-        Identifier, unique in the page.
-    """
+    """Corrections of up to nine tables in µm against the position in mm, on one ordinate."""
     inputs, outputs = (sorted({str(getattr(c, name)) for c in curves}) for name in ("moved", "corrected"))
     rows, columns = max(len(outputs), 1), max(len(inputs), 1)
     svg = Svg(WIDTH, TOP + rows * CELL_HEIGHT + (rows - 1) * GAP + BOTTOM, key, "Tables before and after", _describe(curves))

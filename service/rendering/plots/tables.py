@@ -13,20 +13,13 @@ from abbe.service.rendering.svg import Svg
 WIDTH, CELL_HEIGHT = 1010.0, 150.0
 LEFT, GAP, TOP, BOTTOM = 68.0, 14.0, 30.0, 48.0
 LSB_LINES = 24
-"""Draw the levels that the controller can hold only while they can be told apart."""
+"""Largest number of drawn levels; more are indistinguishable."""
 
 
 def table_plot(tables: Sequence[TableCurve], *, lsb_um: float | None = None, key: str = "tables") -> str:
     """Correction in µm, which the controller adds to the command, against the position in mm.
 
-    Parameters
-    ----------
-    tables : sequence of TableCurve
-        Up to nine curves; a missing one leaves its cell empty.
-    lsb_um : float, optional
-        The controller's resolution; drawn as levels when it is coarse enough to be seen.
-    key : str, optional
-        Identifier, unique in the page.
+    Up to nine curves; a missing one leaves its cell empty. ``lsb_um``: resolution of the controller, drawn as levels if coarse enough.
     """
     axes_in, axes_out = (sorted({str(getattr(t, name)) for t in tables}) for name in ("axis_in", "axis_out"))
     rows, columns = max(len(axes_out), 1), max(len(axes_in), 1)

@@ -18,7 +18,7 @@ F1 = NDArray[np.float64]
 WIDTH, HEIGHT = 760.0, 760.0
 SIDE = 300.0
 MAX_POINTS = 600
-"""Points per drawn path: more cannot be told apart."""
+"""Largest number of points per drawn path; more are indistinguishable."""
 STYLES = {"bar": "c1", "laser": "c2"}
 VIEWS = ((0, 1, "from above"), (0, 2, "from the front"), (1, 2, "from the side"))
 CORNERS = ((70.0, 40.0), (70.0, 420.0), (450.0, 420.0))
@@ -31,18 +31,18 @@ class DrawnTest:
     Parameters
     ----------
     number : int
-        Its place in the campaign, or its set-up's, from 1.
+        Number of the test or of its set-up in the campaign, from 1.
     kind : "bar", "laser", "line" or "diagonal"
     text : str
-        What it is; shown when the pointer rests on it.
+        Tooltip.
     path_mm : array, shape (n, 3)
         Commanded positions, in order.
     mount_mm : array, shape (3,)
-        Where the cup stands or the laser line starts.
+        Position of the cup, or start of the laser line.
     radius_mm : float
-        Of the bar, 0 for a laser.
+        Radius of the bar, 0 for a laser.
     mounts : bool
-        Whether its set-up begins with it: its number is drawn.
+        Whether the test begins a set-up, whose number is then drawn.
     """
 
     number: int
@@ -55,16 +55,9 @@ class DrawnTest:
 
 
 def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views", unit: Unit = MM) -> str:
-    """The drawing: paths of all tests in three views with one scale, the strokes as frames, set-ups numbered in the order of measuring.
+    """Paths of all tests (in the order of measuring) in three views with one scale, strokes as frames, set-ups with their numbers.
 
-    Parameters
-    ----------
-    stroke_mm : array, shape (3, 2)
-        First and last position of X, Y, Z.
-    tests : sequence of DrawnTest
-        In the order of measuring.
-    unit : Unit, optional
-        What the reader sees places in.
+    ``stroke_mm``: first and last position of X, Y, Z, shape (3, 2). ``unit``: display unit of places.
     """
     summary = "; ".join(f"{t.number}: {t.text}" for t in tests)
     svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", summary)
@@ -94,7 +87,7 @@ def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views"
 
 
 def _draw_scales(svg: Svg, panel: Panel, plane: tuple[int, int], unit: Unit) -> None:
-    """Grid and numbers at round values of the reader's unit."""
+    """Grid and numbers at round values of the display unit."""
     (x_low, x_high), (y_low, y_high) = ((low / unit.size, high / unit.size) for low, high in (panel.x_range, panel.y_range))
     scaled = replace(panel, x_range=(x_low, x_high), y_range=(y_low, y_high))
     scaled.draw_x(svg, f"{'XYZ'[plane[0]]} {unit.sign}")

@@ -1,7 +1,6 @@
 """The machine's volume in isometric view, with an arrow for the error at every node.
 
-Before and after are drawn with one exaggeration and one colour scale: a picture in which each side is scaled to fill its box would hide
-the improvement.
+Before and after share one exaggeration and one colour scale, because individual scales would hide the improvement.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ F2 = NDArray[np.float64]
 
 WIDTH, HEIGHT = 500.0, 450.0
 MAX_ARROWS = 420
-"""More arrows than this are a thicket; nodes are then thinned out evenly (the figures still use all of them)."""
+"""Largest number of arrows; more nodes are thinned out evenly (the figures still use all of them)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArrowScale:
-    """What both pictures share. ``exaggeration``: mm drawn per mm of error; ``top_um``: length at the upper end of the colours."""
+    """Common scale of both pictures. ``exaggeration``: mm drawn per mm of error; ``top_um``: length at the upper end of the colours."""
 
     exaggeration: float
     top_um: float
@@ -46,19 +45,7 @@ def common_scale(*fields: ArrowField) -> ArrowScale:
 
 
 def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: str) -> str:
-    """One volume with its arrows, scale key and figures.
-
-    Parameters
-    ----------
-    field : ArrowField
-        Nodes (n, 3) in mm and deviations (n, 3) in µm.
-    scale : ArrowScale
-        From ``common_scale``, shared by all pictures that are to be compared.
-    key : str
-        Identifier, unique in the page.
-    heading : str
-        Heading of the picture.
-    """
+    """One volume with its arrows, scale key and figures. ``scale``: from ``common_scale``, shared by all pictures to compare."""
     lengths = _lengths(field)
     good = lengths[np.isfinite(lengths)]
     longest = float(good.max()) if good.size else math.nan
@@ -72,7 +59,7 @@ def volume_arrows(field: ArrowField, scale: ArrowScale, *, key: str, heading: st
     finite_grid = field.grid_mm[np.isfinite(field.grid_mm).all(axis=1)] if field.grid_mm.size else field.grid_mm
     if finite_grid.size:
         low, high = finite_grid.min(axis=0), finite_grid.max(axis=0)
-        # Arrows at the faces leave the box: the margin leaves them room.
+        # The margin leaves room for arrows that leave the box.
         window = ViewWindow((WIDTH / 2.0, 58.0 + (HEIGHT - 110.0) / 2.0), WIDTH - 120.0, HEIGHT - 178.0)
         paper = Paper.around(low, high, window)
         draw_box(svg, paper, low, high)
@@ -91,7 +78,7 @@ def volume_pair(before: ArrowField | None, after: ArrowField | None, *, key: str
 
 def _draw_arrows(svg: Svg, paper: Paper, field: ArrowField, scale: ArrowScale) -> None:
     lengths = _lengths(field)
-    order = np.argsort(depth(field.grid_mm), kind="stable")  # far ones first, near ones over them
+    order = np.argsort(depth(field.grid_mm), kind="stable")  # far ones first, near ones on top
     for i in order[:: max(1, math.ceil(order.size / MAX_ARROWS))]:
         if not (np.isfinite(lengths[i]) and np.isfinite(field.grid_mm[i]).all()):
             continue
@@ -110,7 +97,7 @@ def _draw_key(svg: Svg, paper: Paper, scale: ArrowScale) -> None:
         svg.rect((x + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
         svg.text((x + i * cell, y + 23.0), tidy(i * step), "t-small", anchor="middle")
     svg.text((x + SEQUENCE * cell, y + 23.0), f"{tidy(scale.top_um)} µm", "t-small", anchor="middle")
-    # Arrows lie askew in space; the key is a length in the plane of the paper, as every arrow parallel to it is drawn.
+    # The key is a length in the plane of the paper; arrows at an angle to it are drawn shorter.
     bar = nice_step(scale.top_um, 3)
     length = bar * 1e-3 * scale.exaggeration * paper.zoom
     right = WIDTH - 24.0
