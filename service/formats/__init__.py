@@ -1,1 +1,1 @@
-"""Compensation tables as the files that controls read, and back: one module per format, text on one side, `Compensation` on the other."""
+"""Conversion of `Compensation` to the table files of controls and back: one module per format."""

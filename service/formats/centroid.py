@@ -1,8 +1,8 @@
 """Centroid ballscrew table, version 1 (.tab; CNC7 v6.00 on): encoder counts, one direction (cncsnw.com, "Laser Compensation").
 
 First line: number of values, and the travel from the first to the last in counts with its sign; then one whole number per line, the first
-at the reference. The page's own example (24 values over -1448819 counts) is 40 mm a point at 40000 counts an inch. Versions 2
-and 3 (two directions, a longer heading) are described in the same place, but their text was not at hand: they are not written here.
+at the reference. The page's own example (24 values over -1448819 counts) is 40 mm per point at 40000 counts per inch. Versions 2
+and 3 (two directions, a longer heading) are not supported, because their description was not available.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        Another kind of table, two directions, no reference, or one that is neither end.
+        The table is of another kind, has two directions or no reference, or the reference is not at one of its ends.
     """
     check_kinds(comp, LIMITS, WHAT)
     files = []
@@ -46,12 +46,12 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """The tables of version 1 files; the axis is the letter before ``.tab``, positions count from the reference.
+    """Read version 1 files; the axis is the letter before ``.tab``, positions count from the reference.
 
     Raises
     ------
     TableFileError
-        A first line that is not two whole numbers, another number of values than stated, a value that is none.
+        The first line is not two whole numbers, the number of values differs from the stated one, or a value is no number.
     """
     return Compensation(tuple(_read_one(f, settings) for f in files))
 

@@ -1,7 +1,7 @@
-"""The best use of a control: what each kind of table would leave of an identified machine, and the one to take.
+"""The best use of a control: residual errors of an identified machine with each kind of table, and the best kind.
 
-Judged over the whole volume, both directions of motion, best-fit rigid motion removed, with the numbers rounded as the control holds them.
-A control with a limited number of tables gets those that take out most, one after the other.
+Judged over the whole volume in both directions of motion, with the best-fit rigid motion removed and the numbers rounded as in the control.
+A limited number of tables is filled greedily by the largest reduction.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Latti
 
 JUDGE_NODES, COARSE_NODES = 12, 6
 MIN_GAIN = 0.02
-"""A larger set of tables is taken only if it leaves at least this share less (rms) than a smaller one."""
+"""A larger set of tables must reduce the residual rms of a smaller one by at least this share."""
 
 
 @dataclass(frozen=True)
 class FormatChoice:
-    """One kind of tables: what is left (rms and largest vector over the volume, mm), how many numbers it takes, whether it is the one."""
+    """One kind of tables with its residual error (rms and largest vector over the volume, mm); ``best``: the recommended kind."""
 
     kind: str
     compensation: Compensation
@@ -35,12 +35,12 @@ class FormatChoice:
 
     @property
     def numbers(self) -> int:
-        """Numbers that the control has to hold."""
+        """Count of numbers in all tables."""
         return self.compensation.numbers
 
 
 class FormatJudge:
-    """The identified field at the places where tables are judged, computed once."""
+    """The identified error field at the nodes at which tables are judged."""
 
     def __init__(self, known: Identified, control: ControlModel, nodes: int = JUDGE_NODES) -> None:
         self.points_mm: F2 = volume_grid(known.machine.stroke_mm, nodes)
@@ -48,7 +48,7 @@ class FormatJudge:
         self._control = control
 
     def left_mm(self, comp: Compensation) -> F1:
-        """Length of what is left at every place, moving in + and in −, shape (2 n,)."""
+        """Length of the residual error at every node, moving in + and in −, mm, shape (2 n,)."""
         stored = rounded(comp, self._control.unit_mm)
         parts = []
         for way, field in self._moving.items():
@@ -58,13 +58,13 @@ class FormatJudge:
         return np.asarray(np.linalg.norm(remove_rigid(both, np.concatenate(parts)), axis=1))
 
     def choice(self, kind: str, comp: Compensation) -> FormatChoice:
-        """A kind of tables with its figures."""
+        """Evaluate one kind of tables."""
         left = self.left_mm(comp)
         return FormatChoice(kind, comp, float(np.sqrt(np.mean(left**2))), float(left.max()))
 
 
 def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple[FormatChoice, ...]:
-    """Every kind of tables the control can hold, from none to all, one of them marked as the best."""
+    """Every kind of tables that the control can hold, from none to all; one is marked as the best."""
     judge = FormatJudge(known, control)
     found = [judge.choice("no table", Compensation())]
     if control.own:
@@ -83,7 +83,7 @@ def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple
 
 
 def best_of(found: tuple[FormatChoice, ...]) -> FormatChoice:
-    """The one that is marked."""
+    """The choice marked as the best."""
     return next(c for c in found if c.best)
 
 
@@ -101,7 +101,7 @@ def _grids(known: Identified, points: int, reference_mm: F1) -> tuple[F1, F1, F1
 
 
 def _own(known: Identified, control: ControlModel, tables: tuple[AxisTable, ...]) -> Compensation:
-    """Own-axis tables as the control holds lost motion: in their columns, or as its backlash parameter."""
+    """Own-axis tables with lost motion in their two columns or in the control's backlash parameter."""
     if control.both_directions:
         return Compensation(tables)
     plain = tuple(replace(t, backward_mm=t.forward_mm) for t in tables)
@@ -109,7 +109,7 @@ def _own(known: Identified, control: ControlModel, tables: tuple[AxisTable, ...]
 
 
 def _crossed(control: ControlModel, build: _Builder, judge: FormatJudge) -> list[FormatChoice]:
-    """Own-axis tables with cross tables, and with products; as many as the control has room for."""
+    """Own-axis tables with as many cross tables and products as the control can hold."""
     kinds: list[tuple[str, tuple[ProductTable, ...]]] = [("one-axis and cross tables", ())]
     kinds += [("one-axis, cross and product tables", build.offered)] if control.products else []
     out = []
@@ -126,7 +126,7 @@ PAIRS: tuple[Pair, ...] = tuple((a, o) for a in AXES for o in AXES if a != o)
 
 
 class _Builder:
-    """Puts tables together; what some hold is not in the others. Everything is linear, so every part is worked out once."""
+    """Builds sets of tables that correct every error once. All parts are linear, so each is computed once."""
 
     def __init__(self, known: Identified, control: ControlModel, reference_mm: F1) -> None:
         self.known, self._control = known, control
@@ -136,7 +136,7 @@ class _Builder:
         self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
 
     def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
-        """Own-axis tables on their grid, cross tables (axis, output) on theirs, both for what the products leave."""
+        """Own-axis and cross tables, each on its own grid, for the error that the products leave."""
         fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
         own = _own(self.known, self._control, tuple(t for t in fine if t.own))
         cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)
@@ -147,7 +147,7 @@ class _Builder:
         return x, y, z
 
     def greedy(self, judge: FormatJudge, offered: tuple[ProductTable, ...], room: int) -> tuple[tuple[ProductTable, ...], tuple[Pair, ...]]:
-        """Again and again what takes out most per table that it needs, until the room is full or nothing helps."""
+        """Add the part with the largest reduction per table until ``room`` tables are used or nothing helps."""
         products: tuple[ProductTable, ...] = ()
         pairs: tuple[Pair, ...] = ()
         left = float(np.mean(judge.left_mm(self.together(products, pairs)) ** 2))
@@ -167,12 +167,12 @@ class _Builder:
 
 
 def _added_by(product: ProductTable, points_mm: F2) -> F2:
-    """What one product adds: tables beside it have to take as much less out."""
+    """Correction by one product, to be subtracted from the other tables."""
     return correction_at(Compensation(products=(product,)), points_mm)
 
 
 def rounded(comp: Compensation, unit_mm: float) -> Compensation:
-    """All corrections in whole units, angles a thousand times finer, as the control will hold them."""
+    """Corrections rounded to the control's unit; angles are a thousand times finer."""
 
     def to(v: F1, unit: float = unit_mm) -> F1:
         return np.asarray(np.round(v / unit) * unit)

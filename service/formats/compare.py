@@ -1,4 +1,4 @@
-"""Are these the tables that were meant? Differences place by place, and the mistakes that a file alone does not show."""
+"""Comparison of tables with the expected ones: differences by position, and mistakes such as wrong signs or units."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from abbe.service.formats.model import Compensation, correction_at
 
 REMEDY = "do not load this file"
 ALIKE = 0.2
-"""Tables are taken for the expected ones times a factor if what then differs is below this share of them."""
+"""Tables count as the expected ones times a factor if the remaining difference is below this share of them."""
 FACTORS = (
     (-1.0, "the sign is wrong: it would double every error"),
     (1000.0, "1000 times too large: µm were taken for mm"),
@@ -27,7 +27,7 @@ POINTS = 400
 
 @dataclass(frozen=True, slots=True)
 class FormatDifference:
-    """Largest difference of one axis' correction, mm, and where it is: commanded position, direction of motion."""
+    """Largest difference of one axis' correction, mm, with its commanded position and direction of motion."""
 
     axis: str
     size_mm: float
@@ -36,7 +36,7 @@ class FormatDifference:
 
 
 def places_mm(*parts: Compensation) -> F2:
-    """Where tables are compared: all their points along each axis, and random ones of the box they cover, shape (n, 3)."""
+    """Positions of the comparison, shape (n, 3): all points of the tables along each axis, and random points of their box."""
     axes: list[list[F1]] = [[], [], []]
     for comp in parts:
         for t in comp.tables:
@@ -71,12 +71,12 @@ def differences(found: Compensation, expected: Compensation) -> tuple[FormatDiff
 
 
 def check_same(found: Compensation, expected: Compensation, tolerance_mm: float) -> tuple[FormatDifference, ...]:
-    """Differences, if all are within the tolerance.
+    """Return the differences if all are within the tolerance.
 
     Raises
     ------
     TableContradicts
-        Wrong sign, unit, exchanged directions or axes (by name where the tables are alike otherwise), or just other values, and where.
+        The message names the mistake (wrong sign or unit, exchanged directions or axes), if recognized, and the place.
     """
     found_differences = differences(found, expected)
     worst = max(found_differences, key=lambda d: d.size_mm)
@@ -94,7 +94,7 @@ def _moving(comp: Compensation, p: F2, way: int) -> F2:
 
 
 def _mistake(found: Compensation, expected: Compensation) -> str:
-    """The mistake that turns the expected tables into those that were found; empty if there is none that is known."""
+    """The known mistake that turns the expected tables into the found ones; empty if none does."""
     p = places_mm(found, expected)
     have, want = (np.stack([_moving(c, p, way) for way in (1, -1)]) for c in (found, expected))
     size = np.linalg.norm(want)

@@ -1,4 +1,4 @@
-"""What controls can hold, as far as documents say: which tables, how many, how fine, in which order they act (controllers.md 1, 5)."""
+"""Capabilities of controls from their documents: kinds, number and resolution of tables, and order of action (controllers.md 1, 5)."""
 
 from __future__ import annotations
 
@@ -14,24 +14,22 @@ class ControlModel:
 
     Attributes
     ----------
-    key, name : str
     own, cross : str
-        Format of own-axis tables; of cross and product tables; empty: it has none.
+        Format of own-axis tables; format of cross and product tables; empty for none.
     own_points, cross_points : int
         Points of a table.
     both_directions : bool
-        Own-axis tables have two columns. Without, lost motion is left to the control's backlash parameter.
-    products : bool
+        Own-axis tables have two columns. Otherwise the control's backlash parameter holds the lost motion.
     tables : int, optional
-        Most tables of the ``cross`` format, a product being two; none: as many as needed.
+        Largest number of tables of the ``cross`` format, of which a product takes two; None: unlimited.
     lattice, nodes : str, int
-        Format of a 3-D grid, nodes per axis.
+        Format of a 3-D grid; nodes per axis.
     motions : str
-        Format of error motions for the control's own chain.
+        Format of error motions for the control's own kinematic chain.
     lookup : str
-        Where all but the own-axis tables are looked up.
+        Argument of all tables but the own-axis ones.
     unit_mm : float
-        Unit of its numbers.
+        Unit of the numbers in the tables.
     """
 
     key: str
@@ -107,7 +105,7 @@ def control_of(key: str) -> ControlModel:
     Raises
     ------
     FormatRefused
-        There is none; the message names those there are.
+        The key is unknown; the message lists the known ones.
     """
     if key not in CONTROLS:
         raise FormatRefused(f"there is no control {key!r}", f"known are {', '.join(CONTROLS)}")

@@ -1,7 +1,7 @@
 """Fanuc three-dimensional error compensation: a sheet of the nodes (A-79351E p. 3: rectangular grid, trilinear; controllers.md 5.2).
 
-No public manual gives the control's own file, its parameter numbers or its limits: this is a sheet to enter them from, in whole detection
-units, X fastest. The control's interpolation is the documented one.
+No public manual describes the control's file, parameter numbers or limits. This module writes a sheet for manual entry, in whole detection
+units, X fastest. The interpolation is as documented.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ HEADER = "node,x_mm,y_mm,z_mm,x_units,y_units,z_units"
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """One line per node.
+    """Write one line per node.
 
     Raises
     ------
     FormatRefused
-        Anything but a 3-D grid, unequal spacing, a correction that is too large, not zero at the reference.
+        There is no 3-D grid or another kind of table, the spacing is unequal, a correction is too large or not zero at the reference.
     """
     check_kinds(comp, LIMITS, WHAT)
     if comp.lattice is None:
@@ -48,12 +48,12 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """The grid of a sheet.
+    """Read the grid of a sheet.
 
     Raises
     ------
     TableFileError
-        Another heading, a number that is none, a node that is missing or out of order.
+        The heading or a number is invalid, or a node is missing or out of order.
     """
     file = files[0]
     rows: list[list[float]] = []

@@ -4,7 +4,7 @@ Point n holds what is added between coordinate (n - ref - 1) and (n - ref) inter
 reference by construction (B-63980EN p. 100). Rounding: every SUM is rounded and the numbers are differences of the rounded sums, so the
 remainder is carried on and no point is ever off by more than half a unit. Both directions: 3605#0 = 1, the second set of points from 3626,
 3627 = the value at the reference when coming from the other side. Acts after power off, power on and reference return.
-Data identification of the pitch lines (Q1 here, as in the specification) and the sign differ between sources: see the step first.
+Data identification of the pitch lines (Q1 here, as in the specification) and the sign differ between sources: verify the 10 µm step first.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class _Data:
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Parameters 3605 to 3627 and the points of all axes in one file; ``settings.reference_mm`` is the reference position.
+    """Write parameters 3605 to 3627 and the points of all axes in one file; ``settings.reference_mm`` is the reference position.
 
     Raises
     ------
     FormatRefused
-        Another kind of table, the reference is no point of the table, a difference beyond ``largest_step``, no points left.
+        The table is of another kind, the reference is no point of it, a difference exceeds ``largest_step``, or the points are used up.
     """
     check_kinds(comp, LIMITS, WHAT)
     if settings.reference_mm is None:
@@ -105,12 +105,12 @@ def _points(difference: np.ndarray[tuple[int, ...], np.dtype[np.int64]], first: 
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """What the control would sum up from the points.
+    """Read the tables as the control would sum them up from the points.
 
     Raises
     ------
     TableFileError
-        A line that is neither parameter nor point, no second ``%`` (half a file), a missing parameter or point.
+        A line is neither parameter nor point, the second ``%`` is missing (truncated file), or a parameter or point is missing.
     """
     file = files[0]
     data = _parse(file)

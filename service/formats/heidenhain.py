@@ -2,7 +2,7 @@
 
 One .COM per axis that something depends on: column X, Y or Z holds what that axis gets as a function of the table's axis, so straightness
 and sag are native. BACKLASH holds the own axis' values measured in −. The heading differs per control: export a table from the target
-control and compare; the sign of the values differs between manuals: see the step first.
+control and compare. The sign of the values differs between manuals: verify the 10 µm step first.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"
 UNIT_MM = 1e-4
 STEEPEST = 64
-"""TNC 4xx: two neighbouring values may differ by the spacing over this."""
+"""TNC 4xx: neighbouring values may differ by the spacing divided by this."""
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """One .COM per axis that something depends on, and CONFIG.CMA with its only line active.
+    """Write one .COM per input axis, and CONFIG.CMA with its only line active.
 
     Raises
     ------
     FormatRefused
-        Another kind of table; a direction-dependent cross table (BACKLASH is the own axis'); a limit; positions finer than 0.1 µm.
+        The table is of another kind, is a direction-dependent cross table (only the own axis has BACKLASH), exceeds a limit, or has
+        positions finer than 0.1 µm.
     """
     check_kinds(comp, LIMITS, WHAT)
     files, names = [], {}
@@ -89,12 +90,13 @@ def _com(axis: str, tables: list[AxisTable], settings: FormatSettings) -> str:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """What the control would take from the tables that the active line of the .CMA names (all .COM files if there is no .CMA).
+    """Read the tables that the active line of the .CMA names (all .COM files without a .CMA).
 
     Raises
     ------
     TableFileError
-        No active line or two, a named file that is missing, no [END] (half a file), too many points, positions that do not increase.
+        The number of active lines is not one, a named file or [END] is missing (truncated file), there are too many points, or positions
+        do not increase.
     """
     by_name = {f.name.upper(): f for f in files}
     cma = next((f for n, f in by_name.items() if n.endswith(".CMA")), None)
@@ -109,7 +111,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names of the columns, and the rows with their lines, of a table between BEGIN and [END]."""
+    """Column names, and rows with line numbers, of a table between BEGIN and [END]."""
     lines = list(file.lines())
     if not lines or not lines[0][1].startswith("BEGIN "):
         raise file.wrong(1, "the first line is not BEGIN")
@@ -127,7 +129,7 @@ def _active(cma: TextFile) -> dict[str, str]:
     if len(active) != 1:
         raise cma.wrong(active[1] if active else 3, f"{len(active)} lines are active, expected one")
     head, row = lines[1][1], lines[active[0] - 1][1]
-    at = {c: head.index(f" {c}") + 1 for c in columns if c in AXES}  # columns are found by where they begin: cells may be empty
+    at = {c: head.index(f" {c}") + 1 for c in columns if c in AXES}  # columns are located by their position, because cells may be empty
     found = {c: row[k : k + 12].strip().rstrip("*").strip().upper() for c, k in at.items()}
     return {c: v for c, v in found.items() if v}
 

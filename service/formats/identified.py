@@ -1,7 +1,7 @@
-"""A machine as it was identified, as far as tables need it, and its error taken apart into what controls can hold.
+"""An identified machine, and the decomposition of its errors into the tables that controls can hold.
 
 Rule G (docs/explanation/conventions.md): a carriage's angle times a travel of ANOTHER axis is a product of two functions of one axis each;
-everything else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products are all there is.
+everything else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products are sufficient.
 """
 
 from __future__ import annotations
@@ -27,12 +27,15 @@ Grids = tuple[F1, F1, F1]
 NODES = 9
 BEND_WEIGHT = 1e-3
 SPACING_DECIMALS = 4
-"""Pitch of every grid in whole 0.1 µm: the coarsest that a format writes positions with."""
+"""Decimals of the pitch of every grid, mm: 0.1 µm is the coarsest resolution of positions among the formats."""
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """``coefficients`` of ``terms`` (mm, rad); lost motion B of each axis, mm: moving in s it is off by design @ coefficients − s B/2."""
+    """``coefficients`` of ``terms`` (mm, rad), and lost motion B of each axis, mm.
+
+    The deviation while moving in direction s is design @ coefficients − s B/2.
+    """
 
     machine: Machine
     terms: tuple[Term, ...]
@@ -40,16 +43,16 @@ class Identified:
     lost_motion_mm: Mapping[str, float] = field(default_factory=dict)
 
     def deviation_mm(self, axes_mm: F2) -> F2:
-        """Mean of both directions, shape (n, 3)."""
+        """Deviation as mean of both directions, mm, shape (n, 3)."""
         return np.asarray(design(self.machine, self.terms, axes_mm) @ self.coefficients)
 
     def moving_mm(self, axes_mm: F2, direction: int) -> F2:
-        """While all axes move in + (1) or in − (−1), shape (n, 3)."""
+        """Deviation while all axes move in + (1) or in − (−1), mm, shape (n, 3)."""
         lost = np.array([self.lost_motion_mm.get(a, 0.0) for a in AXES])
         return self.deviation_mm(axes_mm) - 0.5 * direction * lost
 
     def motion(self, name: str, position_mm: F1) -> F1:
-        """One of the 18 error motions (squareness not in it) over positions of its axis, mm or rad."""
+        """One of the 18 error motions (without squareness) over positions of its axis, mm or rad."""
         axis = PLACES[name][0]
         mine = [i for i, t in enumerate(self.terms) if t.motion == name]
         points = np.tile(self.machine.centre_mm, (position_mm.size, 1))
@@ -59,7 +62,7 @@ class Identified:
 
 
 def grid_mm(machine: Machine, axis: int, points: int, reference_mm: F1) -> F1:
-    """Equidistant points that reach at least over the stroke, one of them the reference: what incremental formats need."""
+    """Equidistant points that cover the stroke and include the reference, as incremental formats need, mm."""
     low, high = machine.stroke_mm[axis]
     reference = float(np.clip(reference_mm[axis], low, high))
     pitch = np.ceil((high - low) / max(1, points - 2) * 10**SPACING_DECIMALS - 1e-6) / 10**SPACING_DECIMALS
@@ -70,9 +73,9 @@ def grid_mm(machine: Machine, axis: int, points: int, reference_mm: F1) -> F1:
 
 
 def line_fit(grid: F1, stroke_mm: F1) -> tuple[F1, F2]:
-    """Positions inside the stroke at which a function is asked for, and the operator from its values to the best broken line on a grid.
+    """Sampling positions inside the stroke, and the operator from values there to the best piecewise linear function on a grid.
 
-    A grid may reach beyond the stroke by part of a cell: what stands there only continues the line (a weak pull towards no bend).
+    A grid may reach beyond the stroke by part of a cell; a weak penalty on bends extrapolates the function there.
     """
     low, high = stroke_mm
     inside = np.clip(grid, low, high)
@@ -89,7 +92,7 @@ def line_fit(grid: F1, stroke_mm: F1) -> tuple[F1, F2]:
 
 
 def products_of(known: Identified, grids: Grids, reference_mm: F1) -> tuple[ProductTable, ...]:
-    """All products of rule G, as corrections: minus angle over its own axis, times the travel from the reference of another axis."""
+    """All products of rule G as corrections: minus angle over its own axis, times the travel of another axis from the reference."""
     masks, unit = lever_masks(known.machine.chain), np.eye(3)
     out = []
     for j, k, c in product(range(3), range(3), range(3)):
@@ -104,7 +107,7 @@ def products_of(known: Identified, grids: Grids, reference_mm: F1) -> tuple[Prod
 
 
 def _sampled(known: Identified, name: str, grid: F1) -> F1:
-    """A motion as the best broken line on a grid."""
+    """A motion as the best piecewise linear function on a grid."""
     at, operator = line_fit(grid, known.machine.stroke_mm[PLACES[name][0]])
     return np.asarray(operator @ known.motion(name, at))
 
@@ -118,8 +121,8 @@ def table_values(
 ) -> tuple[Values, ...]:
     """The best nine one-axis tables for minus a field, on several sets of grids, zero at the reference. Linear in the field.
 
-    ``field``: positions (n, 3) to values (n, 3), mm. ``smooth``: it is made of the terms, so its main effects are polynomials, and as many
-    positions as those have coefficients tell all.
+    ``field``: positions (n, 3) to values (n, 3), mm. ``smooth``: the field consists of the terms, so its main effects are polynomials and
+    as many positions as coefficients suffice.
     """
     stroke = known.machine.stroke_mm
     fits = [[line_fit(grids[a], stroke[a]) for grids in sets] for a in range(3)]
@@ -144,15 +147,15 @@ def table_values(
 
 
 def _chebyshev(stroke_mm: F1, n: int) -> F1:
-    """Positions of a stroke at which a polynomial with n coefficients is asked for."""
+    """Chebyshev nodes on a stroke for a polynomial with n coefficients."""
     return np.asarray(stroke_mm.mean() - 0.5 * np.ptp(stroke_mm) * np.cos((np.arange(n) + 0.5) * np.pi / n))
 
 
 def axis_tables(known: Identified, grids: Grids, values: Values) -> tuple[AxisTable, ...]:
-    """Nine tables of values; own tables have both directions.
+    """Nine tables from values; own-axis tables have both directions.
 
-    Forward columns are zero at the reference: it is approached in +. While moving in − an axis with lost motion B stands B further, so its
-    backward column is the forward one less B.
+    Forward columns are zero at the reference, which is approached in +. An axis with lost motion B stands B further while moving in −, so
+    its backward column is the forward one minus B.
     """
     out = []
     for a, axis in enumerate(AXES):
@@ -164,7 +167,7 @@ def axis_tables(known: Identified, grids: Grids, values: Values) -> tuple[AxisTa
 
 
 def lattice_of(known: Identified, grids: Grids, reference_mm: F1) -> Lattice:
-    """The best 3-D grid, zero at the reference: every term is fitted along its own axis, where alone it bends (rule G)."""
+    """The best 3-D grid, zero at the reference. Every term is fitted along its own axis, the only one along which it bends (rule G)."""
     counts = tuple(g.size for g in grids)
     total: F2 = np.zeros((int(np.prod(counts)), 3))
     for a in range(3):
@@ -181,7 +184,7 @@ def lattice_of(known: Identified, grids: Grids, reference_mm: F1) -> Lattice:
 
 
 def motions_of(known: Identified, grids: Grids) -> Motions:
-    """All error motions as identified: right for the tool that was measured with, whatever the readings tell apart."""
+    """All identified error motions. They hold for the measured tool even if single motions are not observable."""
     curves = {}
     for name, (axis, _) in PLACES.items():
         if any(t.motion == name for t in known.terms):

@@ -1,8 +1,8 @@
 """Beckhoff/ISG volumetric CSV (controllers.md 5.4): ISO 230-1 error motions per axis. The neutral exchange format.
 
-Blank-separated columns under a heading; ``//`` comment; ``#`` begins a new heading. Arguments mm, errors mm and rad. The kernel works the
-correction out by its own chain; its parameter ``negate`` turns single axes over, so the step must be seen first. Squareness (C0Y, B0Z, A0Z)
-is one row without argument and counts travel from the start of the stroke here; another zero is a constant shift of the whole map.
+Blank-separated columns under a heading; ``//`` comment; ``#`` begins a new heading. Arguments mm, errors mm and rad. The kernel computes
+the correction by its own chain. Its parameter ``negate`` inverts single axes: verify the 10 µm step first. Squareness (C0Y, B0Z, A0Z) is
+one row without argument and counts travel from the start of the stroke here; another zero is a constant shift of the whole map.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ANGLE_DECIMALS = 3
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Error motions (or one-axis tables, as the translations they correct) in one file.
+    """Write error motions (or one-axis tables, as the translations that they correct) in one file.
 
     Raises
     ------
     FormatRefused
-        Products or a grid; motions and tables at once; two directions; motions of one axis at different points.
+        There are products, a grid, motions together with tables, two directions, or motions of one axis at different points.
     """
     check_kinds(comp, LIMITS, WHAT)
     if comp.motions is not None and comp.tables:
@@ -75,14 +75,15 @@ def _block(axis: str, mine: dict[str, AxisCurve], settings: FormatSettings) -> l
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """The error motions of a file; ``settings.machine`` is the chain that the kernel is configured with.
+    """Read the error motions of a file; ``settings.machine`` is the chain configured in the kernel.
 
     Raises
     ------
     TableFileError
-        A heading with an unknown name or two arguments (2-D tables are not read), a row of another length, positions that do not increase.
+        A heading has an unknown name or two arguments (2-D tables are not supported), a row has another length, or positions do not
+        increase.
     FormatRefused
-        No machine was given: without its chain the file says nothing about a correction.
+        No machine was given; the correction needs its chain.
     """
     if settings.machine is None:
         raise FormatRefused(f"{WHAT}: the control works with its machine's chain, and none is given", "give the machine")
@@ -100,7 +101,7 @@ Row = tuple[int, list[str]]
 
 
 def _blocks(file: TextFile) -> list[tuple[Row, list[Row]]]:
-    """Headings with their rows."""
+    """Blocks of a heading with its rows."""
     blocks: list[tuple[Row, list[Row]]] = []
     fresh = True
     for line, text in file.lines():

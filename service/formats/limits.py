@@ -1,4 +1,4 @@
-"""What a control's format can hold, checked before anything is written: points, spacing, size, directions, zero at the reference."""
+"""Limits of a control's format, checked before anything is written: points, spacing, size, directions, zero at the reference."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from abbe.service.formats.model import AxisTable, Compensation
 
 NOTHING = "nothing was written"
 PLAUSIBLE_MM = 1.0
-"""No machine that can be measured is off by this much: a larger correction is another unit, another type, or a position."""
+"""Largest plausible correction; a larger number has another unit or is not a correction."""
 SPACING_TOLERANCE_MM = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class FormatLimits:
-    """``points``: most per table; ``directional``: both directions can be held; ``size_mm``: largest absolute number."""
+    """Limits of a format. ``points``: per table; ``directional``: two directions are supported; ``size_mm``: largest absolute number."""
 
     points: int
     equidistant: bool = False
@@ -35,12 +35,12 @@ class FormatLimits:
 
 
 def check_kinds(comp: Compensation, limits: FormatLimits, what: str) -> None:
-    """Refuse kinds of tables that the format does not know.
+    """Refuse kinds of tables that the format does not support.
 
     Raises
     ------
     FormatRefused
-        Which table, and why.
+        The message names the table and the reason.
     """
     for table in comp.tables:
         if not (limits.own if table.own else limits.cross):
@@ -68,7 +68,7 @@ def check_table(table: AxisTable, limits: FormatLimits, what: str, reference_mm:
     Raises
     ------
     FormatRefused
-        Which limit, where, by how much.
+        The message names limit, place and excess.
     """
     name = f"{what}, table {table.name}"
     check_positions(table.position_mm, limits, name)
@@ -86,12 +86,12 @@ def check_table(table: AxisTable, limits: FormatLimits, what: str, reference_mm:
 
 
 def check_positions(position_mm: F1, limits: FormatLimits, name: str) -> None:
-    """Number, order and spacing of a table's points.
+    """Check number, order and spacing of a table's points.
 
     Raises
     ------
     FormatRefused
-        Which of them is wrong.
+        One of them is wrong.
     """
     n = position_mm.size
     if not 2 <= n <= limits.points:
@@ -106,12 +106,12 @@ def check_positions(position_mm: F1, limits: FormatLimits, name: str) -> None:
 
 
 def check_size(position_mm: F1, values: F1, limits: FormatLimits, name: str) -> None:
-    """Refuse numbers that are none, or larger than a correction can be.
+    """Refuse values that are not finite or too large for a correction.
 
     Raises
     ------
     FormatRefused
-        Where, and how large.
+        The message names place and size.
     """
     if not np.isfinite(values).all():
         raise FormatRefused(f"{name}: holds values that are no numbers", f"check the solution; {NOTHING}")

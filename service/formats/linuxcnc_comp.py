@@ -1,9 +1,9 @@
 """LinuxCNC COMP_FILE, type 0 and 1 (controllers.md 1.4): bare triplets "nominal forward reverse", one file per joint.
 
 The control reads with sscanf and stops WITHOUT AN ERROR at the first line that is not three numbers: a comment, a heading or a blank line
-in front is an empty table. Lines whose nominal does not increase are skipped. So the writer writes nothing but triplets, and the reader
-refuses what the control would silently leave out. BACKLASH of the ini file has no effect on a joint with a table: lost motion stands in the
-two columns.
+in front yields an empty table. Lines whose nominal does not increase are skipped. So the writer writes triplets only, and the reader
+refuses what the control would silently skip. BACKLASH of the ini file has no effect on a joint with a table, so the two columns hold the
+lost motion.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ POSITION_DECIMALS = 6
 
 
 def write(comp: Compensation, settings: FormatSettings, *, kind: int = 1) -> tuple[TextFile, ...]:
-    """One file per own-axis table: ``x.comp`` ... for ``COMP_FILE`` with ``COMP_FILE_TYPE = kind``.
+    """Write one file per own-axis table: ``x.comp`` ... for ``COMP_FILE`` with ``COMP_FILE_TYPE = kind``.
 
     Raises
     ------
     FormatRefused
-        Another kind of table than own-axis, or a limit.
+        A table is not an own-axis table or exceeds a limit.
     """
     what = f"LinuxCNC COMP_FILE type {kind}"
     check_kinds(comp, LIMITS, what)
@@ -41,12 +41,12 @@ def write(comp: Compensation, settings: FormatSettings, *, kind: int = 1) -> tup
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings, *, kind: int = 1) -> Compensation:
-    """What LinuxCNC would take from the files; the axis is the first letter of the file's name.
+    """Read the files as LinuxCNC does; the axis is the first letter of the file's name.
 
     Raises
     ------
     TableFileError
-        A line at which the control would stop or that it would skip; a table of the other type; too many points.
+        The control would stop at a line or skip it, the table is of the other type, or there are too many points.
     """
     return Compensation(tuple(_read_one(f, kind) for f in files))
 
@@ -76,7 +76,7 @@ def _read_one(file: TextFile, kind: int) -> AxisTable:
 
 
 def _right_type(file: TextFile, kind: int, lines: list[int], size_mm: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
-    """Refuse corrections that can be none: a table of the other type has positions where corrections should be, or the other way round."""
+    """Refuse implausible corrections: a table of the other type has positions in place of corrections, or vice versa."""
     k = int(np.argmax(size_mm))
     if size_mm[k] > PLAUSIBLE_MM:
         other = "0 (positions reached)" if not SIGNS[f"linuxcnc-{kind}"].adds_position else "1 (corrections)"

@@ -24,14 +24,14 @@ WHAT = "LinuxCNC HAL network"
 NAME = "abbe.hal"
 JOINTS = {"X": 0, "Y": 1, "Z": 2}
 ANGLE_DECIMALS = 3
-"""More than for millimetres: an angle is multiplied by up to a metre."""
+"""Additional decimals of an angle, which is multiplied by up to a metre."""
 _TABLE = re.compile(r"t-([xyz])([xyz])")
 _PART = re.compile(r"(a|l)-([xyz])([xyz])([xyz])")
 
 
 @dataclass
 class _Network:
-    """What a HAL file says: curves with their size, values of parameters with their line, the components that run."""
+    """Content of a HAL file: curves with their size, parameter values with their line, running and wired components."""
 
     points: dict[str, int] = field(default_factory=dict)
     values: dict[str, tuple[float, int]] = field(default_factory=dict)
@@ -40,12 +40,12 @@ class _Network:
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """The network as one HAL file: components, order of execution, wires, tables.
+    """Write the network as one HAL file: components, order of execution, wires, tables.
 
     Raises
     ------
     FormatRefused
-        A grid, error motions, a direction-dependent table, or more than 16 points.
+        There are a grid, error motions, a direction-dependent table, or more than 16 points.
     """
     check_kinds(comp, LIMITS, WHAT)
     curves: list[tuple[str, str, AxisCurve, int]] = []
@@ -105,12 +105,12 @@ def _summed(axis: str, parts: list[str]) -> list[str]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """What a network written by `write` does.
+    """Read a network written by `write`.
 
     Raises
     ------
     TableFileError
-        A line of another kind, a point that is missing, positions that do not increase (HAL does not check it), a curve that does not run.
+        A line is of another kind, a point is missing, positions do not increase (HAL does not check that), or a curve does not run.
     """
     file = files[0]
     net = _Network()

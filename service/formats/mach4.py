@@ -1,4 +1,4 @@
-"""Mach4 screw map as a sheet to enter in its Machine Calibration plugin (controllers.md 5.6); there is no file of its own.
+"""Mach4 screw map as a sheet for manual entry in its Machine Calibration plugin (controllers.md 5.6), which reads no file.
 
 Start (most negative), length, equidistant points, error = expected − actual at each; separate values for + and − since build 4780.
 """
@@ -20,12 +20,12 @@ _HEAD = ("axis", "start_mm", "length_mm", "points")
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """One sheet per axis.
+    """Write one sheet per axis.
 
     Raises
     ------
     FormatRefused
-        Another kind of table, unequal spacing, not zero at the reference.
+        The table is of another kind, has unequal spacing, or is not zero at the reference.
     """
     check_kinds(comp, LIMITS, WHAT)
     files = []
@@ -42,12 +42,12 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """The tables of such sheets.
+    """Read the tables of sheets.
 
     Raises
     ------
     TableFileError
-        Another heading, a number that is none, points that are not where start, length and count say.
+        The heading or a number is invalid, or the points do not match start, length and count.
     """
     return Compensation(tuple(_read_one(f) for f in files))
 

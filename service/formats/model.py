@@ -1,7 +1,7 @@
-"""What is exported, in one form for all controls: corrections added to the command, and one function that does what a control would do.
+"""Common model of all exported tables (corrections added to the command), and one function that acts as a control would.
 
 A machine that goes too far by e needs the correction −e (docs/explanation/conventions.md).
-Tables are broken lines with their end values held.
+Tables are piecewise linear with their end values held.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from abbe.models.geometry.jacobian import squareness_motions
 from abbe.models.machine import AXES, Machine
 
 Lookup = Literal["command", "corrected"]
-"""Where a control looks cross, product and grid tables up: at the command, or at the position that the own-axis tables have corrected."""
+"""Argument of cross, product and grid tables: the command, or the position corrected by the own-axis tables."""
 
 
 @dataclass(frozen=True, eq=False)
 class AxisCurve:
-    """A function of where one axis stands: ``value`` at increasing ``position_mm`` of ``axis`` (X, Y, Z)."""
+    """A function of the position of one axis: ``value`` at increasing ``position_mm`` of ``axis`` (X, Y, Z)."""
 
     axis: str
     position_mm: F1
@@ -48,7 +48,7 @@ class AxisTable:
 
     @property
     def name(self) -> str:
-        """As people say it: ``Y over X``."""
+        """Name in messages: ``Y over X``."""
         return f"{self.output} over {self.axis}"
 
     @property
@@ -62,7 +62,7 @@ class AxisTable:
         return not np.array_equal(self.forward_mm, self.backward_mm)
 
     def at(self, axes_mm: F2, direction: F2) -> F1:
-        """Correction at positions, moving as ``direction`` says (+1, −1; 0: the mean of both), shape (n, 3) each -> (n,)."""
+        """Correction at positions for a ``direction`` of motion (+1, −1; 0: the mean of both), shape (n, 3) each -> (n,)."""
         a = AXES.index(self.axis)
         there = np.interp(axes_mm[:, a], self.position_mm, self.forward_mm)
         back = np.interp(axes_mm[:, a], self.position_mm, self.backward_mm)
@@ -71,7 +71,7 @@ class AxisTable:
 
 @dataclass(frozen=True, eq=False)
 class ProductTable:
-    """Correction of ``output`` = ``angle`` (rad) times ``lever`` (mm): what a turned carriage does at a distance."""
+    """Correction of ``output`` = ``angle`` (rad) times ``lever`` (mm): the effect of a carriage's rotation at a distance."""
 
     output: str
     angle: AxisCurve
@@ -79,7 +79,7 @@ class ProductTable:
 
     @property
     def name(self) -> str:
-        """As people say it: ``X over Z times Y``."""
+        """Name in messages: ``X over Z times Y``."""
         return f"{self.output} over {self.angle.axis} times {self.lever.axis}"
 
 
@@ -93,7 +93,7 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """ERROR motions (ISO 230-1, not corrections; mm, rad) for a control that works the deviation out by its own chain (rule G)."""
+    """ERROR motions (ISO 230-1, not corrections; mm, rad) for a control that computes the deviation by its own chain (rule G)."""
 
     machine: Machine
     curves: Mapping[str, AxisCurve]
@@ -112,9 +112,9 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """All tables together; what they hold is added up.
+    """The sum of all tables.
 
-    ``lost_motion_mm``: per axis, what the control adds as its own backlash parameter: nothing while the axis moves in +, −B in −.
+    ``lost_motion_mm``: the control's backlash parameter per axis: it adds nothing while the axis moves in +, and −B in −.
     """
 
     tables: tuple[AxisTable, ...] = ()
@@ -135,7 +135,7 @@ class Compensation:
 
     @property
     def numbers(self) -> int:
-        """Numbers that the control has to hold."""
+        """Count of numbers in all tables."""
         size = sum(t.position_mm.size * (2 if t.directional else 1) for t in self.tables)
         size += sum(p.angle.value.size + p.lever.value.size for p in self.products)
         size += 0 if self.lattice is None else int(self.lattice.correction_mm.size)
@@ -145,16 +145,16 @@ class Compensation:
 
 
 def correction_at(comp: Compensation, axes_mm: F2, direction: F2 | None = None, *, lookup: Lookup = "command") -> F2:
-    """What a control adds to commanded positions: the judge of every format.
+    """Correction that a control adds to commanded positions; the reference for every format.
 
     Parameters
     ----------
     axes_mm : array, shape (n, 3)
         Commanded positions.
     direction : array, shape (n, 3), optional
-        Direction in which each axis moves, +1 or −1; none: the mean of both.
+        Direction of motion of each axis, +1 or −1; None: the mean of both.
     lookup : "command" or "corrected"
-        Where all but the own-axis tables are looked up.
+        Argument of all tables but the own-axis ones.
 
     Returns
     -------

@@ -1,6 +1,6 @@
-"""The 10 µm step: an error of +10 µm at one place, in every format: which number stands in the file, and what the axis then has to do.
+"""The 10 µm step: an error of +10 µm at one place in every format, with the number in the file and the expected motion.
 
-Written to a machine and measured there, it tells sign, axis, unit and scale of a control before the first real table (controllers.md 5.7).
+Written to a machine and measured there, it proves sign, axis, unit and scale of a control before the first real table (controllers.md 5.7).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SETTINGS = FormatSettings(
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """One row: format, what was written, the lines of its file that a table of zeros has otherwise, where, what is added there (mm)."""
+    """One row: format, kind of table, lines of the file that differ from a table of zeros, place, and correction there (mm)."""
 
     format: str
     what: str
@@ -39,7 +39,7 @@ class Proof:
 
 
 def proofs(form: Format) -> tuple[Proof, ...]:
-    """Rows of all kinds of table that a format holds."""
+    """Rows of all kinds of table of a format."""
     out = []
     for what, axis, at, way, step, nothing in _cases(form):
         files, zeros = form.write(step, SETTINGS), form.write(nothing, SETTINGS)
@@ -59,7 +59,7 @@ Case = tuple[str, str, tuple[float, float, float], int, Compensation, Compensati
 
 
 def _cases(form: Format) -> list[Case]:
-    """What is written: kind, output axis, place, the step (a correction of −10 µm there), and the same without it."""
+    """Cases of a format: kind, output axis, place, direction, the step (a correction of −10 µm there), and the same without the step."""
     spike = np.where(np.arange(POSITION_MM.size) == AT, -STEP_MM, 0.0)
     place = float(POSITION_MM[AT])
     cases: list[Case] = []

@@ -1,4 +1,4 @@
-"""All formats by their key: what each can hold, how its word is proved, who writes and reads it."""
+"""Registry of all formats by key, with limits, writer and reader."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Read = Callable[[tuple[TextFile, ...], FormatSettings], Compensation]
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A format: ``key`` for the command line, ``name`` for people, ``live``: what makes a loaded file act."""
+    """A format: ``key`` for the command line, ``name`` for people, ``live``: how a loaded file becomes active."""
 
     key: str
     name: str
@@ -121,7 +121,7 @@ def format_of(key: str) -> Format:
     Raises
     ------
     FormatRefused
-        There is none; the message names those there are.
+        The key is unknown; the message lists the known ones.
     """
     if key not in FORMATS:
         raise FormatRefused(f"there is no format {key!r}", f"known are {', '.join(FORMATS)}")

@@ -1,4 +1,4 @@
-"""What an exporter has to know about the one machine that will read its file. Every field has the usual value."""
+"""Settings of an export for one machine. Every field has a usual default."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ class FormatSettings:
     """Attributes.
 
     reference_mm : (x, y, z), optional
-        Where the tables must be zero (reference point, home); none: not checked.
+        Position at which the tables must be zero (reference point, home); None: not checked.
     decimals : int
-        Of millimetres; numbers are rounded to 10^-decimals. Angles have three more.
+        Decimals of millimetres. Angles have three more.
     points : int, optional
-        Most points of a table on this machine (Siemens MD38000, MD18342; Fanuc option); none: the format's own limit.
+        Largest number of points of a table on this machine (Siemens MD38000, MD18342; Fanuc option); None: limit of the format.
     machine : Machine, optional
-        Nominal geometry, which a control with a kinematic model works with (ISG).
+        Nominal geometry for a control with a kinematic model (ISG).
     axis_names : (str, str, str)
         Siemens machine axes of X, Y, Z.
     unit_mm, magnification, largest_step : Fanuc
@@ -45,5 +45,5 @@ class FormatSettings:
 
     @property
     def step_mm(self) -> float:
-        """What one in the last decimal is, mm."""
+        """Value of one unit in the last decimal, mm."""
         return float(10.0**-self.decimals)

@@ -1,4 +1,4 @@
-"""What both Siemens table files have in common: lines ``$VARIABLE[indices]=value ; comment`` between a head and ``M17``."""
+"""Common parts of both Siemens table files: lines ``$VARIABLE[indices]=value ; comment`` between a head and ``M17``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Assignments:
     line: dict[tuple[str, tuple[str, ...]], int] = field(default_factory=dict)
 
     def number(self, name: str, *index: str) -> float:
-        """One number; TableFileError where it is missing or none."""
+        """One number; raises `TableFileError` if it is missing or invalid."""
         key = (name, index)
         if key not in self.value:
             raise self.file.wrong(1, f"${name}[{','.join(index)}] is missing: the control would keep what it had")
@@ -55,12 +55,12 @@ class Assignments:
 
 
 def parse(file: TextFile, name: str) -> Assignments:
-    """Assignments of a file ``%_N_name_INI``.
+    """Read the assignments of a file ``%_N_name_INI``.
 
     Raises
     ------
     TableFileError
-        A line that is neither head, assignment, comment nor M17; no M17 (half a file); two values for one variable.
+        A line is neither head, assignment, comment nor M17, M17 is missing (truncated file), or a variable has two values.
     """
     out, ended = Assignments(file), False
     for line, text in file.lines():
@@ -90,7 +90,7 @@ def grid(found: Assignments, count: int, step: float, first: float, last: float,
     Raises
     ------
     TableFileError
-        Step not positive, or first + (count − 1) step is not the stated end.
+        The step is not positive, or first + (count − 1) step is not the stated end.
     """
     line = found.line.get((where[0], tuple(where[1].split(","))), 1)
     if not step > 0 or abs(first + (count - 1) * step - last) > 1e-6 * max(1.0, abs(last), count):
@@ -101,12 +101,12 @@ def grid(found: Assignments, count: int, step: float, first: float, last: float,
 
 
 def step_of(position_mm: F1, name: str) -> float:
-    """Step that reproduces a grid when it is written with few decimals.
+    """Step that reproduces a grid with the written decimals.
 
     Raises
     ------
     FormatRefused
-        The step needs more decimals than are written: the last point would not be where it is.
+        The step needs more decimals than are written, which would shift the last point.
     """
     step = round(float(np.ptp(position_mm)) / (position_mm.size - 1), POSITION_DECIMALS)
     if abs(position_mm[0] + step * (position_mm.size - 1) - position_mm[-1]) > 1e-6:

@@ -2,7 +2,7 @@
 
 Directions: two tables with $AN_CEC_DIRECTION 1 and -1. Products: $AN_CEC_MULT_BY_TABLE[t] = n multiplies table t by table n (index n - 1).
 The manual's grid example (6FC5397-1BP40-3BA1 p. 259) counts the product alone, and so does this module; the factor table must not act by
-itself: its evaluation is switched off ($SN_CEC_TABLE_ENABLE = 0). Nobody has tried that on a control here: see the step first.
+itself: its evaluation is switched off ($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first.
 Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the command.
 """
 
@@ -29,7 +29,7 @@ ANGLE_DECIMALS = 3
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """One $AN_CEC table: its curve (numbers as in the file), output, direction, the table it is multiplied by (0: none), a mere factor?"""
+    """One $AN_CEC table: curve (numbers as in the file), output, direction, table of its factor (0: none), whether it is only a factor."""
 
     curve: AxisCurve
     output: str
@@ -40,12 +40,12 @@ class _Table:
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """All tables in one file, numbered from 0, in the order of the manual's example.
+    """Write all tables in one file, numbered from 0, in the order of the manual's example.
 
     Raises
     ------
     FormatRefused
-        A grid or error motions; a limit; more points than MD18342 (``settings.points``).
+        There are a grid or error motions, or a table exceeds a limit or MD18342 (``settings.points``).
     """
     limits = LIMITS if settings.points is None else FormatLimits(points=settings.points, equidistant=True, cross=True, products=True)
     check_kinds(comp, limits, WHAT)
@@ -85,13 +85,13 @@ def _lines(t: int, table: _Table, *, switches: bool) -> list[str]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """What the control would make of the file; a table for one direction alone is nothing in the other.
+    """Read the file as the control does; a table for one direction is zero in the other.
 
     Raises
     ------
     TableFileError
-        A line that is none of its own, a missing point, an end that does not fit step and count, an axis other than AX1 to AX3, a product
-        with a table that is not there.
+        A line is of another kind, a point is missing, the end does not fit step and count, an axis is not AX1 to AX3, or the table of a
+        factor is missing.
     """
     found = parse(files[0], "NC_CEC")
     numbers = sorted({int(i[0]) for v, i in found.value if v == "AN_CEC" and i[0].isdigit()})
@@ -117,7 +117,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def _both(axis: str, output: str, parts: list[tuple[int, AxisCurve]]) -> AxisTable:
-    """All tables of one pair of axes on one grid: what they add in + and in −."""
+    """Sum of all tables of one pair of axes on one grid, for both directions."""
     position = parts[0][1].position_mm
     there, back = np.zeros(position.size), np.zeros(position.size)
     for way, curve in parts:

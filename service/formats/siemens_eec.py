@@ -20,12 +20,12 @@ NAME = "AX_EEC.INI"
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """All own-axis tables in one file, in the order of the manual's example.
+    """Write all own-axis tables in one file, in the order of the manual's example.
 
     Raises
     ------
     FormatRefused
-        Another kind of table, a direction-dependent one, more points than MD38000 (``settings.points``), not zero at the reference.
+        A table is of another kind, depends on direction, exceeds MD38000 (``settings.points``), or is not zero at the reference.
     """
     limits = LIMITS if settings.points is None else FormatLimits(points=settings.points, equidistant=True, directional=False)
     check_kinds(comp, limits, WHAT)
@@ -45,12 +45,12 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """What the control would take from the file.
+    """Read the file as the control does.
 
     Raises
     ------
     TableFileError
-        A line that is none of its own, a missing point, an end that does not fit step and count, a table for a rotary axis.
+        A line is of another kind, a point is missing, the end does not fit step and count, or a table is for a rotary axis.
     """
     found = parse(files[0], "AX_EEC")
     tables = []

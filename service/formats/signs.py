@@ -1,6 +1,6 @@
-"""The sign rule of every format, in one place (controllers.md 5.7). e = actual − nominal; no other code knows a sign.
+"""The sign rule of every format (controllers.md 5.7), e = actual − nominal. No other code depends on these signs.
 
-A number in a file is ``per_error`` times e, plus the nominal position where the control wants the position that was reached.
+A number in a file is ``per_error`` times e, plus the nominal position if the control expects the reached position.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ Evidence = Literal["verified by execution", "by manual"]
 
 @dataclass(frozen=True, slots=True)
 class SignRule:
-    """How an error becomes a number in a file.
+    """Conversion of an error to a number in a file.
 
-    ``per_error``: +1 or −1. ``adds_position``: the number is a position reached. ``sure``: False where no manual says it in so many words;
-    then nothing may be loaded before the 10 µm step has been seen on the machine.
+    ``per_error``: +1 or −1. ``adds_position``: the number is a reached position. ``sure``: False if no manual states the sign explicitly;
+    then the 10 µm step must be verified on the machine before anything is loaded.
     """
 
     per_error: Literal[1, -1]
@@ -53,7 +53,7 @@ def to_file(rule: str, correction: F1, position_mm: F1) -> F1:
 
 
 def from_file(rule: str, number: F1, position_mm: F1) -> F1:
-    """Corrections that numbers of a file mean."""
+    """Corrections from numbers of a file."""
     sign = SIGNS[rule]
     value = np.asarray(number, dtype=np.float64)
     return -sign.per_error * (value - position_mm if sign.adds_position else value) + 0.0

@@ -1,4 +1,4 @@
-"""Files as text, and numbers in them: written so that no control can misread them, read so that every mistake has its file and line."""
+"""Text files and their numbers, written unambiguously for controls and read with file and line of every mistake."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class TextFile:
         Raises
         ------
         TableFileError
-            It is none; the message has file and line.
+            The text is no such number; the message has file and line.
         """
         if NUMBER.fullmatch(word) is None or not math.isfinite(float(word)):
             raise self.wrong(line, f"{what} is {word!r}, expected a number")
@@ -44,19 +44,19 @@ class TextFile:
 
 
 def short(value: float, decimals: int) -> str:
-    """As few digits as the rounded value needs, one after the point at least, no exponent, no minus zero: ``0.01``, ``-200.0``."""
+    """Shortest text of the rounded value with at least one decimal, no exponent, no minus zero: ``0.01``, ``-200.0``."""
     text = f"{round(value, decimals) + 0.0:.{decimals}f}"
     head, _, tail = text.partition(".")
     return f"{head}.{tail.rstrip('0') or '0'}" if float(text) != 0.0 else "0.0"
 
 
 def fixed(value: float, decimals: int) -> str:
-    """So many decimals always, no minus zero: ``0.010``."""
+    """Text with a fixed number of decimals, no minus zero: ``0.010``."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 
 def whole(value: float, decimals: int) -> str:
-    """As `short`, but whole numbers without a point: ``100``, ``12.5``."""
+    """Like `short`, but whole numbers without a point: ``100``, ``12.5``."""
     return short(value, decimals).removesuffix(".0")
 
 
@@ -71,7 +71,7 @@ def increasing(file: TextFile, position: list[float], lines: list[int]) -> None:
     Raises
     ------
     TableFileError
-        The line that goes back or stands still.
+        The message names the line that goes back or repeats.
     """
     for before, now, line in zip(position, position[1:], lines[1:], strict=False):
         if not now > before:

@@ -1,1 +1,1 @@
-"""`abbe papers`: every printed number of the four papers beside ours."""
+"""`abbe papers`: every printed number of the four papers compared with the computed one."""

@@ -1,4 +1,4 @@
-"""Checks of our own functions on a paper's numbers. What comes back is what was put in: proof of the function, not of the paper."""
+"""Round-trip checks of Abbe's functions on a paper's numbers. They prove the function, not the paper."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ Outcome = Literal["holds", "fails"]
 
 @dataclass(frozen=True, slots=True)
 class PaperCheck:
-    """A number that has to come back within a bound.
+    """A number that must be reproduced within a bound.
 
     Attributes
     ----------
     paper, where : str
-        Whose numbers are used, and where the bound or the demand stands.
-    quantity, unit : str
+        Source of the numbers, and place of the bound or demand.
     expected, found, bound : float
-        In ``unit``; holds when the two are nearer than ``bound``.
+        In ``unit``; the check holds if the two differ by less than ``bound``.
     how : str
-        Through which functions.
+        Functions that are checked.
     why : str
-        Why this bound, and what is assumed.
+        Reason of the bound, and assumptions.
     series : str
-        Name of the group that a check belongs to; people see a group in one line.
+        Group of the check; a group is shown in one line.
     """
 
     paper: Paper
@@ -48,11 +47,11 @@ class PaperCheck:
 
     @property
     def status(self) -> Outcome:
-        """What the numbers say."""
+        """Outcome of the check."""
         return "holds" if abs(self.deviation) < self.bound else "fails"
 
     def doc(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """JSON value for ``--json``."""
         return {**asdict(self), "deviation": self.deviation, "status": self.status}
 
 

@@ -1,4 +1,4 @@
-"""Whether a computed number is the printed one: by its digits, within its inputs' rounding, under an assumption, or not."""
+"""Comparison of a computed with a printed number: equal digits, within the rounding of the inputs, under an assumption, or different."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ from typing import Literal
 from abbe.service.papers.printed import Printed
 
 Fit = Literal["equal", "rounding", "padding", "bound", "no"]
-"""Equal to the last printed digit; within the rounding of the inputs; that only if zeros at the end are padding; below a bound; not."""
+"""Equal to the last printed digit; within the rounding of the inputs; the same if trailing zeros are padding; below a bound; different."""
 
 FLOAT = 1e-12
-"""Of the larger number: what binary arithmetic may add to a decimal comparison."""
+"""Relative tolerance for binary arithmetic in a decimal comparison."""
 OPERANDS = "rounding of the printed operands"
 
 
 @dataclass(frozen=True, slots=True)
 class Computed:
-    """A computed number with what its inputs leave open.
+    """A computed number with the uncertainty of its inputs.
 
     Attributes
     ----------
-    value : float
     allowance : float
-        How far it may be off because of its inputs or its method (rounded operands, neglected second order), zero if they are exact.
+        Largest error from its inputs or its method (rounded operands, neglected second order), zero if they are exact.
     because : str
-        What the allowance consists of, in a few words.
+        Sources of the allowance.
     allowance_if_padded, padding : float and str
-        Allowance if zeros at the end of an input are padding, and why they may be; not less than ``allowance``, equal without such inputs.
+        Allowance if trailing zeros of an input are padding, and the reason; not less than ``allowance``, equal without such inputs.
     """
 
     value: float
@@ -39,9 +38,9 @@ class Computed:
 
 
 def fit(computed: Computed, number: Printed) -> Fit:
-    """How a computed number agrees with the printed one.
+    """Agreement of a computed number with the printed one.
 
-    A bound speaks of a size; a rounded number itself, it holds when the size does not exceed it by more than half a unit of its last digit.
+    A bound limits the size of the number; it is rounded itself, so the size may exceed it by half a unit of its last digit.
     """
     slack = FLOAT * max(abs(computed.value), abs(number.value))
     if number.bound:
@@ -55,20 +54,19 @@ def fit(computed: Computed, number: Printed) -> Fit:
 
 
 def agrees(computed: Computed, number: Printed) -> bool:
-    """Whether a computed number is what was printed, to the digit or within the rounding of its inputs, without any assumption."""
+    """Whether a computed number equals the printed one, to the digit or within the rounding of its inputs, without any assumption."""
     return fit(computed, number) not in ("padding", "no")
 
 
 def within_if_padded(computed: Computed, number: Printed) -> float:
-    """How far the two may be apart if zeros at the end of printed numbers are padding."""
+    """Largest allowed difference if trailing zeros of printed numbers are padding."""
     return number.rounding_if_padded + max(computed.allowance, computed.allowance_if_padded)
 
 
 def computed_from(function: Callable[..., float], *inputs: Printed, because: str = OPERANDS) -> Computed:
-    """A function of printed numbers, with how far their rounding can move it.
+    """Value of a function of printed numbers, with the effect of their rounding as allowance.
 
-    The allowance is the sum over the inputs of the larger change when one of them moves by half a unit of its last digit: the worst case of
-    the first order.
+    The allowance is the first-order worst case: the sum over the inputs of the larger change for a shift by half a unit of the last digit.
     """
     at = [p.value for p in inputs]
     value = function(*at)

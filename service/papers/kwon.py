@@ -14,11 +14,11 @@ from abbe.service.papers.printed import Printed
 from abbe.service.papers.row import PaperRow, stated
 
 IK_BOUND_MM = 1e-7
-"""How near the inverse has to come to the commands of math.md's example."""
+"""Largest deviation of the inverse from the commands of math.md's example."""
 
 
 def rows() -> list[PaperRow]:
-    """Every row of the paper, in its order."""
+    """Every row of the paper, in printed order."""
     return [*_kinematics(), *_text(), *kwon_tables.rows()]
 
 
@@ -61,7 +61,7 @@ def _kinematics() -> list[PaperRow]:
 
 
 def checks() -> list[PaperCheck]:
-    """Whether the inverse gives back the commands whose ball centre math.md states."""
+    """Check that the inverse returns the commands whose ball centre math.md states."""
     command, there = paper.EXAMPLES[1]
     back = inverse(assumed_geometry(), np.array([[p.value for p in there]]))[0]
     why = (

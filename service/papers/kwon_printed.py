@@ -49,8 +49,8 @@ TABLE2_SUMS: dict[str, tuple[Printed, ...]] = {
     "e_y": (_padded("4.520e-2"), Printed("3.155e-4"), _padded("4.550e-2")),
     "e_z": (_padded("1.230e-2"), Printed("1.020e-4"), _padded("1.240e-2")),
 }
-"""Sums of squares: regression, residual, total. That the fourth digit of regression and total is padding is an assumption: it makes a row
-consistent at most."""
+"""Sums of squares: regression, residual, total. A padded fourth digit of regression and total is an assumption, so it can make a row
+consistent, not reproduced."""
 
 TABLE2_MEAN_SQUARES: dict[str, tuple[Printed, ...]] = {
     "e_x": printed("2.099e-3", "2.160e-6"),
@@ -69,7 +69,7 @@ LARGEST_UM: dict[str, Printed] = dict(zip(COMPONENTS, printed("51.2", "63.8", "6
 STEP_MM, TURN_BEFORE_DEG, TURN_AFTER_DEG, RESIDUAL_UM = printed("0.25", "2.1", "0.06", "2.0")
 REPEATABILITY_UM: dict[str, Printed] = dict(zip("xyz", printed("1.94", "2.05", "2.12"), strict=True))
 
-# What math.md 6 states: in-plane form of Table 1 at the implied plane, sums on the 9 x 9 grid, an example of the kinematics.
+# Numbers of math.md 6: in-plane form of Table 1 at the implied plane, sums on the 9 x 9 grid, an example of the kinematics.
 MATH_PLANE_MM, MATH_SPREAD_MM = printed("97.616", "0.018")
 MATH_IN_PLANE: dict[str, tuple[Printed, ...]] = {
     "e_x": printed(

@@ -1,4 +1,4 @@
-"""Kwon, Tables 1 and 2: what the printed coefficients and sums say about each other (math.md 6, FORENSICS and ANOVA)."""
+"""Kwon, Tables 1 and 2: consistency of the printed coefficients and sums (math.md 6, FORENSICS and ANOVA)."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ DAMAGED_ROW = (paper.COMPONENTS.index(paper.DAMAGED[0]), paper.DAMAGED[1])
 
 
 def rows() -> list[PaperRow]:
-    """Both tables, and the largest errors that the text names."""
+    """Rows of both tables, and of the largest errors in the text."""
     return [*_plane(), *_coefficients(), *_in_plane(), *_sums(), *_largest(), *_variance(), *_degrees_of_freedom()]
 
 
 @cache
 def plane() -> ImpliedPlane:
-    """Plane on which the coefficients of Table 1 were fitted, from all quotients but those of the damaged one."""
+    """Plane on which the coefficients of Table 1 were fitted, from all quotients without the damaged coefficient."""
     return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS]), leave_out=(DAMAGED_ROW,))
 
 
 def restored(component: str) -> tuple[Printed, ...]:
-    """Coefficients of a component with the damaged exponent put right."""
+    """Coefficients of a component with the damaged exponent restored."""
     numbers = paper.TABLE1[component]
     if component != paper.DAMAGED[0]:
         return numbers
@@ -56,7 +56,7 @@ def restored(component: str) -> tuple[Printed, ...]:
 
 
 def in_plane(component: str, z_mm: float) -> F1:
-    """The component as a cubic of x and y on a plane, order of IN_PLANE."""
+    """Coefficients of a component as a cubic of x and y on a plane, in the order of IN_PLANE."""
     return in_plane_coefficients(np.array(values(restored(component))), z_mm)
 
 
@@ -112,7 +112,7 @@ def _coefficients() -> list[PaperRow]:
 
 
 def _all_pairs() -> tuple[tuple[tuple[int, int, int], float], ...]:
-    """All quotients, the damaged ones too."""
+    """All quotients, including damaged ones."""
     return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS])).ratios_mm
 
 
@@ -129,7 +129,7 @@ def _in_plane() -> list[PaperRow]:
 
 
 def _on_grid(component: str, z_mm: float, figure: Callable[[GridSums], float]) -> Computed:
-    """A figure of a component's surface on the 9 x 9 grid, with what the rounding of its coefficients leaves open."""
+    """A figure of a component's surface on the 9 x 9 grid, with the allowance from the rounding of its coefficients."""
 
     def of(*beta: float) -> float:
         return figure(grid_sums(in_plane_coefficients(np.array(beta), z_mm)))
@@ -206,7 +206,7 @@ def _add(a: float, b: float) -> float:
 
 
 def _over_61(c: str) -> bool:
-    """Whether the residual's mean square of a component was divided by 61: only where the printed 60 do not give it and 61 do."""
+    """Whether the residual's mean square of a component results from a division by 61 and not by the printed 60."""
     residual, printed = paper.TABLE2_SUMS[c][1], paper.TABLE2_MEAN_SQUARES[c][1]
     n = int(paper.DOF_RESIDUAL.value)
     by_60, by_61 = computed_from(lambda s: s / n, residual), computed_from(lambda s: s / (n + 1), residual)
@@ -259,7 +259,7 @@ def _interval(found: Computed) -> str:
 
 
 def degrees_of_freedom() -> tuple[int, int]:
-    """Of regression and residual on the grid of the paper: rank - 1 and points - rank."""
+    """Degrees of freedom of regression and residual on the grid of the paper: rank - 1 and points - rank."""
     found = layout(square_grid(step_mm=paper.STEP_MM.value, z_mm=plane().z_mm))
     return found.rank - 1, found.n - found.rank
 

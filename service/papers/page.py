@@ -1,4 +1,4 @@
-"""The papers as one self-contained HTML page, written whole or not at all."""
+"""The papers as one self-contained HTML page, written atomically."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from abbe.service.rendering.palette import style_rules
 _MARKS = {"reproduced": "✔", "consistent": "≈", "differs": "≠", "input": "▷", "not reproducible": "○"}
 _CHECK_MARKS = {"holds": "✔", "fails": "✘"}
 _UNIT_AFTER = re.compile(r"(?<=\d) (?=(?:µm|mm|nm|µrad|mrad|rad|°|%)(?!\w))")
-"""Where a line must not break: between a number and its unit."""
+"""Space between a number and its unit, at which a line must not break."""
 
 
 def write_page(found: Sequence[PaperResult], target: Path) -> None:
-    """Write the page beside its place and move it there: a reader sees the old file or the whole new one.
+    """Write the page to a temporary file and rename it: a reader sees the old file or the whole new one.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def _trusted(pictures: Sequence[str]) -> list[Markup]:
 
 
 def _whole(text: str) -> str:
-    """The text with every number and its unit on one line."""
+    """Text with non-breaking spaces between numbers and units."""
     return _UNIT_AFTER.sub("\u00a0", text)
 
 

@@ -1,4 +1,4 @@
-"""Pahk, sections 3.2 and 4 (math.md 8): what little of the two machines and the probe can be computed, and why the rest cannot."""
+"""Pahk, sections 3.2 and 4 (math.md 8): the computable numbers of the two machines and the probe, and why the others are not."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ URAD = 1e-6
 
 
 def rows() -> list[PaperRow]:
-    """Every row of the paper, in its order."""
+    """Every row of the paper, in printed order."""
     return [*_probe(), *[r for cmm in paper.CMMS for r in _machine(cmm)]]
 
 
@@ -73,7 +73,7 @@ def _machine(cmm: Cmm) -> list[PaperRow]:
 
 
 def _known(cmm: Cmm) -> list[PaperRow]:
-    """What math.md says of the machine and what can be computed: the evidence behind "not reproducible"."""
+    """Rows of math.md's statements about the machine: the evidence for "not reproducible"."""
     where = f"8, {cmm.name}"
     volume, squareness = machine_inputs(cmm)
     alone = squareness_diagonals_mm(cmm.type_name, volume, squareness)
@@ -95,7 +95,7 @@ def _known(cmm: Cmm) -> list[PaperRow]:
 
 
 def diagonal_evidence(cmm: Cmm) -> str:
-    """Why the printed diagonals cannot be reproduced, with the numbers that show it."""
+    """Reason why the printed diagonals cannot be reproduced, with the numbers that show it."""
     volume, squareness = machine_inputs(cmm)
     alone = squareness_diagonals_mm(cmm.type_name, volume, squareness)
     misfit, _ = best_assignment(cmm.type_name, volume, squareness, [d.value * 1e-3 for d in cmm.diagonals_um])

@@ -9,7 +9,7 @@ from abbe.service.papers.printed import Printed, printed
 
 @dataclass(frozen=True, slots=True)
 class Cmm:
-    """What the paper prints of one machine.
+    """Printed numbers of one machine.
 
     Attributes
     ----------
@@ -19,9 +19,9 @@ class Cmm:
     squareness_urad : mapping
         XY, XZ, YZ.
     diagonals_um : four numbers
-        Deviations of the diagonal lengths, in the order printed; which is which is not said.
+        Deviations of the diagonal lengths, in printed order; the paper does not name the diagonals.
     random_um : up to four numbers
-        Random errors of the same.
+        Random errors of the diagonals.
     bands : mapping
         Width of the band and repeatability of single errors, with their unit.
     """
@@ -71,7 +71,7 @@ PROBE_LARGEST, PROBE_SMALLEST, PROBE_RMS = printed("6.6", "-9.0", "4.0")
 
 PATTERN_STEP_DEG, PATTERN_POINTS, PATTERN_CIRCLES, PATTERN_ON_CIRCLES = printed("18", "101", "5", "100")
 
-# What math.md 8 states about the two machines (it prints no more digits than these).
+# Numbers of math.md 8 about the two machines, with all its digits.
 MATH_DIAGONAL_MM: dict[str, Printed] = {"CMM A": Printed("1140.449"), "CMM B": Printed("1905.256")}
 MATH_MEAN_UM: dict[str, Printed] = {"CMM A": Printed("-3.2"), "CMM B": Printed("-16.95")}
 MATH_ALONE_UM: dict[str, tuple[Printed, ...]] = {
@@ -81,4 +81,4 @@ MATH_ALONE_UM: dict[str, tuple[Printed, ...]] = {
 """Diagonals ppp, npp, pnp, ppn of squareness alone."""
 
 MATH_MISFIT_URAD: dict[str, Printed] = {"CMM A": Printed("32"), "CMM B": Printed("42")}
-"""Nearest that any order of the printed diagonals comes to the printed squareness."""
+"""Smallest misfit of any order of the printed diagonals to the printed squareness."""

@@ -1,4 +1,4 @@
-"""The pictures that the papers show, drawn from what is left of their inputs. Every caption says what is missing."""
+"""The papers' pictures, drawn from the available inputs. Every caption names the missing ones."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from abbe.service.rendering.plots.signed import SignedScale
 
 NODES = 5
 SURFACE_NODES = 41
-"""Of a side of Kwon's square: the paper's nine and four between neighbours; both pictures of a surface share them."""
+"""Nodes per side of Kwon's square in both pictures of a surface: the paper's nine, and four between neighbours."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class PaperFigure:
 
 
 def figures(paper: Paper) -> list[PaperFigure]:
-    """Pictures of one paper, in its order."""
+    """Pictures of one paper, in printed order."""
     if paper == "pahk":
         return [_probe(), _machines()]
     if paper == "yang":
@@ -78,7 +78,7 @@ def _surface(component: str, z_mm: float) -> Surface:
 
 
 def _hemisphere(step_deg: float) -> tuple[F1, F1]:
-    """Colatitudes and longitudes of the upper half of a sphere, rad, equator and full turn included."""
+    """Colatitudes and longitudes of the upper half of a sphere, rad, including equator and full turn."""
     low, around = (np.deg2rad(np.arange(0.0, end + step_deg / 2, step_deg)) for end in (90.0, 360.0))
     return low, around
 

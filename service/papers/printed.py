@@ -1,4 +1,4 @@
-"""A number as it stands in print: the digits say how far it was rounded."""
+"""A printed number, whose digits define its rounding."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from decimal import Decimal
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """One printed number, typed as it stands.
+    """One printed number, exactly as printed.
 
     Parameters
     ----------
     text : str
         Digits as printed, e.g. ``"-8.5619E-05"``; trailing zeros count.
     bound : bool
-        The paper says "smaller than this", not "this".
+        The paper prints an upper bound, not the number.
     last : str, optional
-        Unit of the last digit where the text alone does not show it: ``"0.1"`` for a ``"0"`` in a column of tenths.
+        Unit of the last digit if the text does not show it: ``"0.1"`` for a ``"0"`` in a column of tenths.
     digits, padding : int and str, optional
-        Significant digits that are real if the zeros after them are padding, and why they may be. An assumption: nothing is called
-        reproduced on its strength.
+        Number of significant digits if the zeros after them are padding, and the reason. An assumption, which never makes a number
+        reproduced.
     """
 
     text: str
@@ -30,13 +30,13 @@ class Printed:
     padding: str = ""
 
     def __post_init__(self) -> None:
-        """An assumption needs its reason."""
+        """Check that digits and padding are given together."""
         if (self.digits is None) != (self.padding == ""):
             raise ValueError(f"{self.text}: digits and the reason why zeros are padding belong together")
 
     @property
     def value(self) -> float:
-        """The number."""
+        """Value of the number."""
         return float(self.text)
 
     @property
@@ -49,12 +49,12 @@ class Printed:
 
     @property
     def rounding(self) -> float:
-        """Half a unit of the last printed digit: how far the rounded number may be from what was rounded."""
+        """Half a unit of the last printed digit, the largest rounding error."""
         return _half(self.exponent)
 
     @property
     def rounding_if_padded(self) -> float:
-        """The same of the last digit that is real, if the zeros after it are padding."""
+        """Half a unit of the last significant digit if the zeros after it are padding."""
         number = Decimal(self.text)
         return self.rounding if self.digits is None or number == 0 else _half(number.adjusted() - self.digits + 1)
 
@@ -69,5 +69,5 @@ def printed(*texts: str) -> tuple[Printed, ...]:
 
 
 def values(numbers: tuple[Printed, ...]) -> list[float]:
-    """Their values."""
+    """Values of printed numbers."""
     return [n.value for n in numbers]

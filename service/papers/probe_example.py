@@ -1,4 +1,4 @@
-"""A probe like the one of Pahk 3.2, with a lobing that is declared here because the paper's own map is lost."""
+"""A probe like the one of Pahk 3.2 with an assumed lobing, because the paper's map is not available."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EXAMPLE = "5 µm · sin²φ cos 3θ + 2.5 µm · cos 2φ, less what centre and r
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Example:
-    """The calibrated example, and how far its map is from the declared lobing, mm."""
+    """The calibrated example, and the largest deviation of its map from the assumed lobing, mm."""
 
     calibration: ProbeCalibration
     largest_mm: float
@@ -35,13 +35,13 @@ def pattern() -> F2:
 
 
 def example_lobing_mm(directions_rad: F2) -> F1:
-    """The declared lobing: three lobes as a kinematic touch-trigger probe has, and a difference between pole and equator."""
+    """The assumed lobing: the three lobes of a kinematic touch-trigger probe, and a difference between pole and equator."""
     phi, theta = directions_rad.T
     return without_absorbed(directions_rad, THREE_LOBES_MM * np.sin(phi) ** 2 * np.cos(3.0 * theta) + POLE_MM * np.cos(2.0 * phi))
 
 
 def example() -> Example:
-    """Touch the printed master sphere with the printed ball and pattern and the declared lobing, and calibrate."""
+    """Calibrate a probe with the assumed lobing on the printed master sphere with the printed ball and pattern."""
     angles = pattern()
     normal = direction(angles[:, 0], angles[:, 1])
     lobing = example_lobing_mm(angles)

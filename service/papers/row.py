@@ -1,4 +1,4 @@
-"""Printed against computed: one row a number. What became of it is decided here, from the numbers, and nowhere else."""
+"""Printed against computed: one row per number. Only this module decides the status of a number."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OF_FIT: dict[Fit, Status] = {
 
 @dataclass(frozen=True, slots=True)
 class Erratum:
-    """What is wrong in print, and the number computed again with that taken into account (None where it cannot be computed)."""
+    """A misprint, and the number computed with its correction (None if not computable)."""
 
     text: str
     again: Computed | None = None
@@ -31,29 +31,26 @@ class Erratum:
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One printed number beside ours.
+    """One printed number with the computed one.
 
     Attributes
     ----------
     paper, where : str
-        Which paper, and its table, equation or section.
-    quantity, unit : str
-    printed : Printed
+        The paper, and its table, equation or section.
     computed : Computed or None
-        In ``unit``; None for an input, and when the paper does not hold what it takes.
+        In ``unit``; None for an input, and if the paper lacks the inputs.
     how : str
-        From which inputs, through which function.
+        Inputs and function of the computation.
     why : str
-        Why it differs or cannot be computed, or what the row shows. Never empty for a number that is not computed.
-    erratum : Erratum, optional
+        Why the number differs or cannot be computed, or what the row shows. Never empty for a number that is not computed.
     series : str
-        Name of the column a row belongs to; people see a column in one line when all of it ends alike.
+        Column of the row; a column with one status is shown in one line.
     again : bool
-        Another row already stands for this printed number: this one looks at it in another way and is not counted.
+        A further view of a printed number that already has a row; not counted.
     source : "paper" | "math.md"
-        Who printed it.
+        Source of the printed number.
     given : bool
-        An input, or zero by construction: there is nothing to compute, so it proves nothing.
+        An input, or zero by construction: not computed, so no evidence.
     """
 
     paper: Paper
@@ -71,13 +68,13 @@ class PaperRow:
     given: bool = False
 
     def __post_init__(self) -> None:
-        """A number that is not computed needs a reason; one that is needs its origin and is no input."""
+        """Check that a number without computation has a reason, and a computed one an origin and is no input."""
         if self.computed is None and not self.why:
-            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is not computed and nobody says why")
+            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is not computed and has no reason")
         if self.computed is not None and not self.how:
-            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is computed and nobody says from what")
+            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is computed and has no origin")
         if self.computed is not None and self.given:
-            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is an input and is computed all the same")
+            raise ValueError(f"{self.paper} {self.where}: {self.quantity} is an input and must not be computed")
 
     @property
     def difference(self) -> float | None:
@@ -86,16 +83,16 @@ class PaperRow:
 
     @property
     def fit(self) -> Fit | None:
-        """How print and computation agree; None where nothing is computed."""
+        """Agreement of print and computation; None without a computation."""
         return None if self.computed is None else fit(self.computed, self.printed)
 
     @property
     def status(self) -> Status:
-        """What the numbers say.
+        """Status of the number.
 
-        Reproduced: equal to the last printed digit. Consistent: not equal, but no farther apart than the rounding of the inputs allows, so
-        print and computation neither confirm nor refute each other to the last digit; the same if that takes zeros that are padding
-        (`remark` says so), and for a bound that holds: it confirms no digit. Input: given, nothing to compute.
+        Reproduced: equal to the last printed digit. Consistent: not equal, but within the rounding of the inputs, so print and computation
+        neither confirm nor refute each other to the last digit; also if that assumes padded zeros (noted in `remark`), and for a bound
+        that holds, since a bound confirms no digit. Input: given, not computed.
         """
         if self.fit is None:
             return "input" if self.given else "not reproducible"
@@ -103,7 +100,7 @@ class PaperRow:
 
     @property
     def within(self) -> float | None:
-        """How far the two may be apart with this status; None for a bound and where nothing is computed."""
+        """Largest difference allowed by this status; None for a bound and without a computation."""
         if self.computed is None or self.printed.bound:
             return None
         if self.fit == "padding":
@@ -112,7 +109,7 @@ class PaperRow:
 
     @property
     def remark(self) -> str:
-        """What the status rests on where it is more than a comparison of digits; empty otherwise."""
+        """Basis of the status if it is more than a comparison of digits; else empty."""
         if self.computed is None:
             return ""
         if self.printed.bound:
@@ -121,17 +118,17 @@ class PaperRow:
 
     @property
     def again_fit(self) -> Fit | None:
-        """How the erratum, taken into account, agrees with print; None without an erratum that can be computed."""
+        """Agreement of the number computed with the erratum; None without a computable erratum."""
         return None if self.erratum is None or self.erratum.again is None else fit(self.erratum.again, self.printed)
 
     @property
     def explained(self) -> bool | None:
-        """Whether the erratum gives the printed number without any assumption about zeros (`gap` says what it takes)."""
+        """Whether the erratum gives the printed number without an assumption about zeros (see `gap`)."""
         return None if self.again_fit is None else self.again_fit not in ("padding", "no")
 
     @property
     def gap(self) -> str:
-        """The same in words; empty without an erratum that can be computed."""
+        """Text about the agreement with the erratum; empty without a computable erratum."""
         if self.erratum is None or self.erratum.again is None or self.again_fit is None:
             return ""
         if self.again_fit == "padding":
@@ -144,7 +141,7 @@ class PaperRow:
         }[self.again_fit]
 
     def doc(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """JSON value for ``--json``."""
         return {
             "paper": self.paper,
             "where": self.where,
@@ -174,7 +171,7 @@ class PaperRow:
 
 
 def stated(paper: Paper, where: str, quantity: str, unit: str, number: Printed, value: float, how: str) -> PaperRow:
-    """Row for a number that math.md states. Where it differs, math.md may have rounded an already rounded number: that is tried."""
+    """Row for a number stated in math.md. If it differs, double rounding in math.md is tried as explanation."""
     computed = Computed(value)
     if agrees(computed, number):
         return PaperRow(paper, where, quantity, unit, number, computed, how, source="math.md")

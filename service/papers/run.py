@@ -18,12 +18,12 @@ TITLES: dict[Paper, str] = {
 }
 FORMAT = "abbe-papers/1"
 CHECKED: frozenset[Paper] = frozenset({"kwon", "yang"})
-"""Papers on whose numbers our functions are tried."""
+"""Papers with checks of Abbe's functions."""
 
 
 @dataclass(frozen=True, slots=True)
 class PaperResult:
-    """One paper with its rows and with what is tried on its numbers (`checks`), which is not counted among them."""
+    """One paper with its rows and with checks of Abbe's functions, which are counted separately."""
 
     paper: Paper
     title: str
@@ -31,12 +31,12 @@ class PaperResult:
     checks: tuple[PaperCheck, ...]
 
     def counts(self, source: Source = "paper") -> dict[Status, int]:
-        """Numbers by status: those that the paper prints, or those that math.md adds."""
+        """Count of numbers by status: those of the paper, or those that math.md adds."""
         rows = [r for r in self.rows if r.source == source and not r.again]
         return {status: sum(1 for r in rows if r.status == status) for status in get_args(Status)}
 
     def check_counts(self) -> dict[Outcome, int]:
-        """Our own checks by outcome."""
+        """Count of checks by outcome."""
         return count(self.checks)
 
     def doc(self) -> dict[str, Any]:
@@ -53,12 +53,12 @@ class PaperResult:
 
 
 def results(papers: Iterable[Paper] = tuple(TITLES)) -> list[PaperResult]:
-    """Compute the rows of papers, in the order of `TITLES`; what the paper prints first, then what math.md adds."""
+    """Compute the rows of papers in the order of `TITLES`: first the printed numbers, then those that math.md adds."""
     wanted = set(papers)
     found = []
     for paper, title in TITLES.items():
         if paper in wanted:
-            # A paper's module is loaded when it is asked for: scipy takes its time.
+            # Load a paper's module on demand: scipy loads slowly.
             module = import_module(f"abbe.service.papers.{paper}")
             rows: list[PaperRow] = module.rows()
             checks: list[PaperCheck] = module.checks() if paper in CHECKED else []
@@ -68,5 +68,5 @@ def results(papers: Iterable[Paper] = tuple(TITLES)) -> list[PaperResult]:
 
 
 def document(found: Sequence[PaperResult]) -> dict[str, Any]:
-    """The whole answer for ``--json``."""
+    """JSON document for ``--json``."""
     return {"format": FORMAT, "papers": [f.doc() for f in found]}

@@ -1,4 +1,4 @@
-"""Rows as people read them: numbers with the digits that matter, columns of a table in one line, notes below."""
+"""Rows as text: numbers with their significant digits, columns of a table in one line, notes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HYPHEN = re.compile(r"(?<![\w.])-(?=\d)|(?<=\de)-(?=\d)")
 
 @dataclass(frozen=True, slots=True)
 class PrintedLine:
-    """One line of a table: of a row, or of a whole column whose rows end alike."""
+    """One line of a table: a row, or a whole column whose rows have one status."""
 
     where: str
     quantity: str
@@ -46,7 +46,7 @@ def short(value: float) -> str:
 
 
 def note(row: PaperRow) -> str:
-    """What the status rests on, why, and what the erratum explains."""
+    """Basis and reason of the status, and the effect of the erratum."""
     parts = [part for part in (row.remark, row.why) if part]
     if row.erratum is not None:
         again = ""
@@ -72,7 +72,7 @@ def _line(row: PaperRow) -> PrintedLine:
 
 
 def computed_cells(row: PaperRow) -> tuple[str, str, str]:
-    """Computed value, difference, and within what the two have to agree."""
+    """Computed value, difference and allowed difference."""
     if row.computed is None or row.difference is None:
         return NONE, NONE, NONE
     within = NONE if row.within is None else short(row.within)
@@ -94,7 +94,7 @@ def _column(rows: list[PaperRow]) -> PrintedLine:
 
 
 def check_lines(checks: Sequence[PaperCheck]) -> Iterator[tuple[str, ...]]:
-    """Cells of the table of checks: a group in one line with the check that comes nearest to its bound, or breaks it most."""
+    """Cells of the table of checks: one line per group with the check nearest to its bound or farthest beyond it."""
     for series, group in groupby(checks, key=lambda c: c.series):
         members = list(group)
         worst = max(members, key=lambda c: abs(c.deviation) / c.bound)
@@ -103,7 +103,7 @@ def check_lines(checks: Sequence[PaperCheck]) -> Iterator[tuple[str, ...]]:
 
 
 def check_cells(check: PaperCheck) -> tuple[str, str, str, str]:
-    """What was put in, what came back, how far that is off and how far it may be, with their unit."""
+    """Expected and found value, deviation and bound, with their unit."""
     unit = f" {check.unit}"
     digits = max(0, 1 - math.floor(math.log10(check.bound)))
     given, found = (minus(f"{value:.{digits}f}") + unit for value in (check.expected, check.found))

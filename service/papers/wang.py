@@ -15,7 +15,7 @@ CUBE = np.ones(3)
 
 
 def rows() -> list[PaperRow]:
-    """Every row of the paper, in its order."""
+    """Every row of the paper, in printed order."""
     share = float(projection_factors(CUBE)[0])
     # The text writes the factor as "one over root three squared": read literally a third.
     literal = Erratum("the text writes 1/√3²; 1/√3 is meant", Computed(share))

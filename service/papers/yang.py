@@ -21,13 +21,13 @@ _RAW = {
 
 
 def rows() -> list[PaperRow]:
-    """Every row of the paper, in its order."""
+    """Every row of the paper, in printed order."""
     table3 = yang_table3.rows()
     return [*_table1(), *_table2(), *table3, *_table4(), *_table5(), *_table6()]
 
 
 def checks() -> list[PaperCheck]:
-    """What is tried on the paper's numbers and proves our functions only."""
+    """Checks of Abbe's functions on the paper's numbers."""
     return yang_simulation.checks()
 
 

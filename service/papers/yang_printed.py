@@ -33,7 +33,7 @@ TABLE3_X = printed(
 """Positions, mm; the eighth is damaged."""
 
 _ZERO = Printed("0", last="0.1")
-"""As the columns of Table 3 begin: they go on in tenths."""
+"""First number of the columns of Table 3, which continue in tenths."""
 
 TABLE3_LASER = (
     _ZERO,
@@ -65,7 +65,7 @@ TABLE3_MAX, TABLE3_MEAN, LINES_AT_END = printed("8.4", "2.8", "1.3")
 """Largest and mean absolute difference; difference of the two lines at the end of the travel (text of 3.3), um."""
 
 TABLE4: dict[str, tuple[Printed, ...]] = {"dyy": printed("-5.1", "127", "2.9"), "dzz": printed("-6.4", "254", "3.3")}
-"""Largest difference (um), where (mm), mean difference (um)."""
+"""Largest difference (um), its position (mm), mean difference (um)."""
 
 TABLE5: dict[str, tuple[Printed, ...]] = {"Sxy": printed("-2.65746E-05", "-1.94474E-05", "495", "-0.0132", "-0.0096", "-3.6")}
 TABLE6: dict[str, tuple[Printed, ...]] = {

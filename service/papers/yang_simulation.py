@@ -1,8 +1,8 @@
-"""Yang and Kim, a check of the method: the laser's column of Table 2 as truth, seen by a helix, fitted back.
+"""Yang and Kim, a check of the method: the laser's column of Table 2 as truth, simulated on a helix and fitted.
 
-The ball-bar column itself cannot be recomputed (15 more error functions, origins and tool are not printed). What can be tried is the
-method: a machine with the six errors of the laser column, exact bar lengths on the hemispherical helix, and the paper's linear fit.
-What comes back is what was put in, so nothing printed is reproduced by it.
+The ball-bar column cannot be recomputed (15 more error functions, origins and tool are not printed). The method can be checked: a machine
+with the six errors of the laser column, exact bar lengths on the hemispherical helix, and the paper's linear fit. This is a round trip, so
+it reproduces no printed number.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BOUND_URAD = 0.02
 
 @dataclass(frozen=True, slots=True)
 class RecoveredErrors:
-    """The six parameters of the paper as the helix of one radius returns them, and how much the neglected second order may move each."""
+    """The six fitted parameters for the helix of one radius, and the effect of the neglected second order on each."""
 
     radius_mm: float
     values: dict[str, float]
@@ -42,13 +42,7 @@ class RecoveredErrors:
 
 
 def recover(radius_mm: float) -> RecoveredErrors:
-    """Simulate the exact bar lengths of a machine with the laser column's errors and fit the paper's six parameters.
-
-    Parameters
-    ----------
-    radius_mm : float
-        175 or 100 in the paper.
-    """
+    """Simulate exact bar lengths of a machine with the laser column's errors and fit the six parameters (paper: 175 and 100 mm)."""
     truth = {name: row[0].value for name, row in paper.TABLE2.items()}
     points = helix_points(CENTRE_MM, radius_mm, turns=TURNS, n=paper.POINTS)
     moved = _deviation_mm(truth, points) - _deviation_mm(truth, CENTRE_MM[None])
@@ -72,7 +66,7 @@ def _deviation_mm(truth: dict[str, float], points_mm: F2) -> F2:
 
 
 def checks() -> list[PaperCheck]:
-    """The laser column put into a machine, and what the helix gives back, by radius, in urad (a slope of 1e-6 counts as 1 urad)."""
+    """Laser column and fitted parameters by radius, in urad (a slope of 1e-6 counts as 1 urad)."""
     out = []
     for radius in paper.BAR_RADII:
         found = recover(radius.value)

@@ -12,20 +12,20 @@ from abbe.service.papers.row import Erratum, PaperRow
 
 
 def restored_x_mm() -> list[float]:
-    """Positions of Table 3 with the damaged one between its neighbours: the positions around it are equally spaced."""
+    """Positions of Table 3 with the damaged one replaced by the mean of its neighbours, which are equally spaced."""
     x = values(paper.TABLE3_X)
     x[paper.DAMAGED] = 0.5 * (x[paper.DAMAGED - 1] + x[paper.DAMAGED + 1])
     return x
 
 
 def bar_line_um() -> list[float]:
-    """The ball bar's line at the positions of the laser's readings."""
+    """The ball bar's line at the positions of the laser's readings, um."""
     slope = paper.TABLE2["dxx"][1].value
     return [slope * x * 1e3 for x in restored_x_mm()]
 
 
 def laser_slope_rows(printed: Printed) -> list[PaperRow]:
-    """The laser's slope of Table 2 from the readings of Table 3: a line through the origin gives it, an ordinary one does not."""
+    """The laser's slope of Table 2 from the readings of Table 3: only a line through the origin reproduces it."""
     x = np.array(restored_x_mm())
     by_origin = computed_from(
         lambda *y: slope_through_origin(x, np.array(y)) * 1e-3, *paper.TABLE3_LASER, because="readings rounded to 0.1 µm"
@@ -59,7 +59,7 @@ def laser_slope_rows(printed: Printed) -> list[PaperRow]:
 
 
 def rows() -> list[PaperRow]:
-    """Positions, three columns, and the figures that the text draws from them."""
+    """Rows of the positions, of the three columns, and of the figures derived from them in the text."""
     return [_position(), *_laser_column(), *_bar_column(), *_difference_column(), *_figures()]
 
 
@@ -95,7 +95,7 @@ def _difference_column() -> list[PaperRow]:
 
 
 def _in_column(name: str, x_mm: float, number: Printed, value_um: float, how: str) -> PaperRow:
-    """A number of a column; the one at the origin is zero whatever the slope and the readings are, so it is no evidence."""
+    """Row of a column; the number at the origin is always zero, so it is no evidence."""
     quantity, series = f"{name} at {x_mm:g} mm", f"{name} column"
     if x_mm == 0.0:
         why = "zero by construction: readings and lines start at the origin"

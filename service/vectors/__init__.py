@@ -1,1 +1,1 @@
-"""`abbe vectors`: independent vector files through the public functions."""
+"""`abbe vectors`: check of the public functions with independent vector files."""

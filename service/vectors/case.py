@@ -1,4 +1,4 @@
-"""A vector file as its reader sees it: every number that is looked at is remembered, so that nothing is left out unnoticed."""
+"""Access to a vector file that records every number read, so that unread numbers are detected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAYOUT = "compare the file with the layout of shared/vectors"
 
 
 class VectorResult(set[Path]):
-    """Paths of the numbers of a file that were read so far, and the last part that was looked at, for messages."""
+    """Paths of the numbers read so far, and the last part accessed, for messages."""
 
     last: Path = ()
 
@@ -41,22 +41,16 @@ class VectorCase:
 
     @property
     def label(self) -> str:
-        """Where this stands, as a person reads it."""
+        """Path of this part for messages."""
         return "/".join(str(p) for p in self.path)
 
     @property
     def last(self) -> str:
-        """Part of the file that was looked at last."""
+        """Part of the file accessed last."""
         return "/".join(str(p) for p in self._seen.last or self.path)
 
     def at(self, *keys: str | int) -> VectorCase:
-        """Part under nested keys or indices.
-
-        Raises
-        ------
-        FileFormatError
-            There is none.
-        """
+        """Part under nested keys or indices; raises `FileFormatError` if it is missing."""
         here: Any = self.value
         for k, key in enumerate(keys):
             try:
@@ -77,7 +71,7 @@ class VectorCase:
         Raises
         ------
         FileFormatError
-            It is no object, or an empty one: nothing would be compared, unnoticed.
+            It is no object, or an empty one, which would skip the comparison silently.
         """
         if not isinstance(self.value, dict):
             raise FileFormatError(f"{self.label}: expected an object, got {type(self.value).__name__}", LAYOUT)
@@ -86,12 +80,12 @@ class VectorCase:
         return list(self.value)
 
     def items(self) -> Iterator[tuple[str, VectorCase]]:
-        """Key and part of an object, in file order; never of an empty one."""
+        """Keys and parts of a non-empty object, in file order."""
         for key in self.keys():
             yield key, self.at(key)
 
     def named(self, *names: str) -> Iterator[tuple[str, VectorCase]]:
-        """Key and part of an object that must have these keys and no others, in the order of ``names``.
+        """Keys and parts, in the order of ``names``, of an object that must have exactly these keys.
 
         Raises
         ------
@@ -110,7 +104,7 @@ class VectorCase:
         Raises
         ------
         FileFormatError
-            It is no list, or (unless ``or_none``) an empty one: nothing would be compared, unnoticed.
+            It is no list, or (unless ``or_none``) an empty one, which would skip the comparison silently.
         """
         if not isinstance(self.value, list):
             raise FileFormatError(f"{self.label}: expected a list, got {type(self.value).__name__}", LAYOUT)
@@ -119,13 +113,7 @@ class VectorCase:
         return [self.at(k) for k in range(len(self.value))]
 
     def number(self, *keys: str | int) -> float:
-        """One finite number under nested keys.
-
-        Raises
-        ------
-        FileFormatError
-            It is missing or no finite number.
-        """
+        """One finite number under nested keys; raises `FileFormatError` if it is missing or not finite."""
         part = self.at(*keys) if keys else self
         values = list(_leaves(part.value, part.path))
         if len(values) != 1 or isinstance(part.value, (list, dict)):
@@ -138,14 +126,14 @@ class VectorCase:
         Parameters
         ----------
         *keys : str or int
-            Where it is.
+            Path of the list.
         shape : tuple, optional
-            What it must be, None where any length will do.
+            Required shape, with None for any length.
 
         Raises
         ------
         FileFormatError
-            It is missing, empty, ragged, of another shape, or holds something that is no finite number.
+            The list is missing, empty, ragged, of another shape, or holds something that is no finite number.
         """
         part = self.at(*keys) if keys else self
         for path, value in _leaves(part.value, part.path):
@@ -172,12 +160,12 @@ class VectorCase:
         return part.value
 
     def skip(self) -> int:
-        """Mark all numbers of this part as looked at without comparing them; their count. For `Checks.not_computable` only.
+        """Mark all numbers of this part as read without a comparison; return their count. For `Checks.not_computable` only.
 
         Raises
         ------
         FileFormatError
-            One of them is no finite number.
+            A number is not finite.
         """
         numbers = [(path, value) for path, value in _leaves(self.value, self.path) if not isinstance(value, str | None)]
         if not numbers:
@@ -188,7 +176,7 @@ class VectorCase:
         return len(numbers)
 
     def unread(self) -> list[str]:
-        """Numbers of this part that nobody has looked at."""
+        """Unread numbers of this part."""
         return [
             "/".join(map(str, path))
             for path, value in _leaves(self.value, self.path)

@@ -1,4 +1,4 @@
-"""Computed against stored: what was compared, how far off it was, and what the file does not allow to compute."""
+"""Computed against stored numbers: comparisons, deviations, and numbers that the file's inputs do not determine."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from abbe.service.vectors.case import VectorCase
 
 Unit = Literal["mm", "rad", "1"]
 LIMIT: dict[str, float] = {"mm": 1e-9, "rad": 1e-12, "1": np.inf}
-"""Largest deviation that is ever accepted unless a coarser rounding of the vector is stated (issue: 1e-9 mm, 1e-12 rad)."""
+"""Largest accepted deviation, unless a coarser rounding of the vector is stated (issue: 1e-9 mm, 1e-12 rad)."""
 RELATIVE = 1e-11
-"""Of the stored value. An altered 8th digit is 1e-8 or more of an output; the rest of the margin catches most altered inputs as well."""
+"""Share of the stored value. An altered 8th digit changes an output by 1e-8 or more; the margin catches most altered inputs."""
 
 
 @dataclass
 class Quantity:
     """All comparisons of one quantity of one file.
 
-    ``floor`` is the rounding of the stored number itself in ``unit``, with its reason in ``rounding``; a comparison holds when it is off by
-    no more than the larger of ``floor`` and ``relative`` times the stored value, and never by more than the larger of ``floor`` and LIMIT.
-    Where comparisons of one quantity have different roundings each is held to its own, and the largest is shown. ``allowed`` is what acted
-    where the quantity was farthest off (``worst``).
+    ``floor`` is the rounding of the stored number in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation does not
+    exceed the larger of ``floor`` and ``relative`` times the stored value, nor the larger of ``floor`` and LIMIT. Comparisons of one
+    quantity may have different roundings; the largest is shown. ``allowed`` is the tolerance at the largest deviation (``worst``).
     """
 
     name: str
@@ -46,7 +45,7 @@ class Quantity:
         return not self.failures
 
     def doc(self) -> dict[str, Any]:
-        """For ``--json``; a deviation that is no number (nothing was computed) is null."""
+        """JSON value for ``--json``; a deviation that is not finite (nothing was computed) is null."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -80,15 +79,15 @@ class Checks:
     file: str
     quantities: dict[str, Quantity] = field(default_factory=dict)
     forms: dict[str, Quantity] = field(default_factory=dict)
-    """Inputs that nothing computes, held to the form that they must have."""
+    """Inputs that are only checked for their form."""
     not_computable: list[NotComputable] = field(default_factory=list)
     assumptions: list[str] = field(default_factory=list)
-    """Layout facts that the file does not state, found by trial."""
+    """Facts of the layout that the file does not state, found by trial."""
     unread: list[str] = field(default_factory=list)
     refused: str = ""
-    """Why a public function would not take the inputs of the file, if so."""
+    """Why a public function refused the inputs of the file; else empty."""
     error: str = ""
-    """Why the file is unusable (unreadable, another layout), if so; what was compared before that still stands."""
+    """Why the file is unusable (unreadable, another layout); else empty. Earlier comparisons remain valid."""
 
     def compare(
         self,
@@ -110,12 +109,11 @@ class Checks:
         computed : array_like
             From the public functions, using the inputs of the case only.
         stored : VectorCase
-            The part of the file that holds the expected value.
-        unit : "mm" | "rad" | "1"
+            Part of the file with the expected value.
         floor : float
             Rounding of the stored value in ``unit``.
         rounding : str
-            Why it is that large, in a few words.
+            Reason of the floor.
         relative : float
             Rounding as a share of the stored value: larger for ill-conditioned figures, smaller for plain sums.
         """
@@ -124,14 +122,10 @@ class Checks:
     def check_form(
         self, name: str, expected: ArrayLike, stored: VectorCase, *, unit: Unit = "1", floor: float = 1e-18, rounding: str = ""
     ) -> None:
-        """Check numbers that nothing computes against the form that they must have: digits of print, a rotation, a grid.
+        """Check the form of numbers that are not computed: printed digits, a rotation, a grid.
 
-        ``expected`` comes from the stored numbers themselves, therefore it is reported apart from what was computed and compared.
-
-        Parameters
-        ----------
-        name, expected, stored, unit, floor, rounding
-            As in `compare`; no share of the value is granted.
+        ``expected`` comes from the stored numbers themselves, so the result is reported separately. Parameters as in `compare`, without a
+        relative tolerance.
         """
         self._compare(self.forms, Quantity(name, unit, floor, rounding, 0.0), expected, stored)
 
@@ -164,22 +158,22 @@ class Checks:
             q.failures.append(f"{stored.label}{where}: stored {float(expected.ravel()[i])!r}, computed {float(got.ravel()[i])!r}")
 
     def assume(self, text: str) -> None:
-        """State a fact of the layout that the file does not, and that was found by trial: with it, and only so, the figures agree."""
+        """Record a fact of the layout that the file does not state, found by trial: the figures agree only with it."""
         if text not in self.assumptions:
             self.assumptions.append(text)
 
     def leave_out(self, name: str, part: VectorCase, why: str) -> None:
-        """State that numbers of a file cannot be computed from its inputs, and why."""
+        """Record that numbers of a file cannot be computed from its inputs, and why."""
         self.not_computable.append(NotComputable(name, part.skip(), why))
 
     @property
     def ok(self) -> bool:
-        """Every comparison and form held, every number of the file was used, no input was refused, the file could be read."""
+        """Whether every comparison and form holds, every number was used, no input was refused, and the file was readable."""
         held = all(q.ok for q in (*self.quantities.values(), *self.forms.values()))
         return held and bool(self.quantities) and not (self.error or self.refused or self.unread)
 
     def doc(self) -> dict[str, Any]:
-        """For ``--json``."""
+        """JSON value for ``--json``."""
         return {
             "file": self.file,
             "ok": self.ok,

@@ -43,7 +43,7 @@ def _geometry(part: VectorCase) -> Geometry:
 def _pose(geometry: Geometry, part: VectorCase, checks: Checks) -> None:
     command, p = part.array("lambda", shape=(3,))[None], part.array("P", shape=(3,))[None]
     checks.compare("forward solution", forward(geometry, command)[0], part.at("P"), unit="mm", floor=2e-13, rounding=ROOTS)
-    for name in ("ik", "lambda"):  # the inverse solution has to return the command
+    for name in ("ik", "lambda"):  # the inverse solution must return the command
         checks.compare("inverse solution", inverse(geometry, p)[0], part.at(name), unit="mm", floor=2e-13, rounding=ROOTS)
     checks.compare("dP/dlambda", jacobian(geometry, command)[0], part.at("J"), unit="1", floor=2e-15)
     printed = forward_as_printed(geometry, command)[0]
@@ -72,7 +72,7 @@ def _frame(part: VectorCase, checks: Checks) -> None:
 
 
 def _truth(part: VectorCase, checks: Checks) -> None:
-    """The placement behind the measured points: a rotation it must be; where it stands only the unknown machine errors could tell."""
+    """Check that the placement of the measured points is a rotation; its position depends on unknown machine errors."""
     rotation = part.array(shape=(4, 4))[:3, :3]
     for i, row in enumerate(nearest_rotation(rotation)):
         for k, value in enumerate(row):

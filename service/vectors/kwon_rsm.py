@@ -1,7 +1,7 @@
 """`kwon_rsm.json`: Kwon's Tables 1 and 2 evaluated, ranks of the response surface, one analysis of variance (math.md 6).
 
-Table 1 is not in the file. Its coefficients are recovered from their values on two planes, because they were printed with four digits; then
-both planes are computed from them.
+Table 1 is not in the file. Its coefficients, printed with four digits, are recovered from their values on two planes; both planes are then
+computed from them.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from abbe.service.vectors.checks import Checks
 DIGITS = 4
 """Significant digits of Table 1 in print."""
 PRINTED_DIGITS = 7
-"""No number of Table 2 has more significant digits; one that has is not as printed."""
+"""Largest number of significant digits in Table 2."""
 SUM_DIGITS = 3
-"""Of the sums of squares of Table 2 and their total three digits hold (math.md 6: 4.240e-2, 4.250e-2)."""
+"""Valid digits of the sums of squares of Table 2 and of their total (math.md 6: 4.240e-2, 4.250e-2)."""
 COMPONENTS = ("ex", "ey", "ez")
 PLANES = ("rank plane 9x9, Z=const", "rank 2 planes", "rank 3 planes", "rank 4 planes")
 NEAR_F = 1e-3
-"""The printed F agree with one of the quotients of the other printed numbers to this share, and no better: they were rounded first."""
+"""Relative agreement of the printed F with a quotient of the other printed numbers, limited by their rounding."""
 REGRESSION_DOF, RESIDUAL_DOF = 20, 60
-"""The paper's, by which the file's mean squares were divided."""
+"""Degrees of freedom of the paper, used for the file's mean squares."""
 POINTS = 81
 RANK = 10
 UM = 1e3
 NEAR_MM = 1e-3
-"""Points this near to the paper's grid are meant to be that grid."""
+"""Points within this distance of the paper's grid count as that grid."""
 PRINT = "quotient of two numbers of four digits"
 
 
@@ -82,7 +82,7 @@ def _planes(case: VectorCase, component: str, checks: Checks) -> None:
             checks.compare("Table 1 on a plane", value, part.at("coef", in_plane_label(term)), unit="1", floor=1e-16)
         _sums(part, checks)
     for up, low in LADDER:
-        if low:  # beta_0 itself is below the rounding of float64
+        if low:  # beta_0 is below the rounding of float64
             checks.compare(
                 "quotients of Table 1, mm", beta[up] / beta[low], case.at("implied_plane_Z"), unit="1", floor=0.1, rounding=PRINT
             )
@@ -165,5 +165,5 @@ def _printed(value: float) -> float:
 
 
 def _half_unit(value: float) -> float:
-    """Half a unit of the last digit of a sum of squares that holds."""
+    """Half a unit of the last valid digit of a sum of squares."""
     return float(0.5 * 10.0 ** (np.floor(np.log10(max(abs(value), 1e-300))) + 1 - SUM_DIGITS))

@@ -1,4 +1,4 @@
-"""`pahk_abbe.json`: what instruments on offset lines see of ten machines, and back to the origin (math.md 2.1)."""
+"""`pahk_abbe.json`: errors of ten machines as measured on offset lines, and their reduction to the origin (math.md 2.1)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SUBTRACTED = "coordinates of up to 900 mm were subtracted"
 LINE = "a line was fitted to the values and taken off"
 LAST = "last digit of a cubic polynomial"
 FLOORS = {"positioning": (1.2e-13, SUBTRACTED, LAST), "straightness": (1e-16, LINE, LINE)}
-"""Rounding of the stored number in mm, its reason, and the reason of the parameters' own."""
+"""Rounding of the stored number in mm, its reason, and the reason of the rounding of the parameters."""
 FLOOR_RAD = 2e-19
 
 
 def read(case: VectorCase, checks: Checks) -> None:
-    """Compare what the file's "measured" and "true" values hold, in both directions."""
+    """Compare the file's "measured" and "true" values in both directions."""
     length = case.array("L", shape=(3,))
     for name, part in case.at("types").items():
         count = len(part.at("true_translational", "XX").parts())
@@ -79,7 +79,7 @@ def _cubic(u: F1, coefficients: F2) -> F2:
 
 
 def _translations(x: F1, length: float, coefficients: F2, axis: int) -> F2:
-    """Positioning as it is, straightness less its least-squares line with intercept, as the file's text says."""
+    """Positioning unchanged, straightness minus its least-squares line with intercept, as the file's text states."""
     d = _cubic(x / length, coefficients)
     for i in set(range(3)) - {axis}:
         slope, start = straight_line(x, d[:, i])

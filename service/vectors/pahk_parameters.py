@@ -1,4 +1,4 @@
-"""How the Pahk vector files write their parameters: ``d/YX`` is d_y(X), ``E/YX`` is E_y(X)."""
+"""Parameters in the Pahk vector files: ``d/YX`` is d_y(X), ``E/YX`` is E_y(X)."""
 
 from __future__ import annotations
 

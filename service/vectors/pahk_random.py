@@ -9,14 +9,14 @@ from abbe.service.vectors.checks import Checks
 from abbe.service.vectors.pahk_parameters import pair, squareness
 
 FLOAT64 = 4e-15
-"""A root of a sum of 21 squares: nothing cancels, so a few units in the last place are all that may be lost."""
+"""Tolerance of a root of a sum of 21 squares: nothing cancels, so it is a few units in the last place."""
 
 PRINTED_TYPE = "MB1"
-"""P (5) is printed for this machine: its cases must have it."""
+"""Machine with a printed P (5), which its cases must hold."""
 
 
 def read(case: VectorCase, checks: Checks) -> None:
-    """Compare RX, RY, RZ of every case; the coverage factor is the inputs', whatever it is."""
+    """Compare RX, RY, RZ of every case, with the coverage factor of the inputs."""
     for name, part in case.at("types").items():
         for point in part.parts():
             axes, probe, given = point.array("X", shape=(3,))[None], point.array("probe", shape=(3,)), point.at("R")

@@ -1,4 +1,4 @@
-"""`paper_tables.json`: tables that the papers print, and what follows from them (math.md 8).
+"""`paper_tables.json`: tables of the papers, and results derived from them (math.md 8).
 
 Lengths that the file gives in um stay in um: their floors are in um, and the unit column says "1".
 """
@@ -26,7 +26,7 @@ ROWS = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
 """Rows of Table 2: laser, bar, difference."""
 
 TYPES = {"pahk_A": "MB1", "pahk_B": "MH2"}
-"""Pahk's machines (section 4); where only squareness acts, all types with X on the tool side give the same diagonals."""
+"""Pahk's machines (section 4); for squareness alone, all types with X on the tool side have the same diagonals."""
 
 
 def read(case: VectorCase, checks: Checks) -> None:
@@ -56,7 +56,7 @@ def _table2(table: VectorCase, checks: Checks) -> None:
     for name, row in table.named(*ROWS):
         laser, bar, difference = row.array(shape=(3,))
         sign = -1.0 if name in REVERSED else 1.0
-        # Each printed number may be off by half a unit of its fifth digit: nothing sharper can be asked of a difference of two.
+        # Each printed number is rounded to half a unit of its fifth digit, which limits a difference of two.
         floor = max(_unit(np.array([laser, bar, difference])).sum() / 2, 1e-12)
         checks.compare(f"difference {name}", sign * (laser - bar), row.at(2), unit="1", floor=floor, rounding="5 digits are printed")
         checks.check_form("five digits as printed", _as_printed(row.array()), row, floor=1e-20, rounding="decimal as float64")
@@ -79,5 +79,5 @@ def _unit(values: F1) -> F1:
 
 
 def _as_printed(values: F1) -> F1:
-    """The numbers with the digits that Table 2 prints: a number with more digits is not from the paper."""
+    """Numbers rounded to the digits of Table 2."""
     return np.array([float(f"{v:.{DIGITS - 1}e}") for v in values])

@@ -17,7 +17,7 @@ from abbe.service.vectors.checks import Checks
 Lobe = Callable[[F1, F1], F1]
 NUMBER = r"([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)"
 LOBE = re.compile(rf"lobe\(ph,th\)={NUMBER} sin\(ph\)\^2 cos\(3th\+{NUMBER}\)\+{NUMBER}\(cos\(ph\)\^2-1/3\)\+{NUMBER} sin\(2ph\)cos\(th\)")
-"""The lobing that the file's own text states; its four numbers may be others."""
+"""Text of the lobing in the file, with its four numbers as groups."""
 COORDINATES = "coordinates of up to 150 mm were subtracted"
 
 
@@ -32,7 +32,7 @@ def read(case: VectorCase, checks: Checks) -> None:
 
 
 def stated_lobe(note: str) -> Lobe | None:
-    """The lobing function of the file's text, mm over colatitude and longitude; nothing if the text states another kind."""
+    """Lobing function of the file's text, mm over colatitude and longitude; None for another kind."""
     found = LOBE.search(note)
     if found is None:
         return None
@@ -64,7 +64,7 @@ def _sphere(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
         along = middle + away[:, None] * normal
         checks.check_form("ball centres along their directions", along, stored, unit="mm", floor=5e-14, rounding=COORDINATES)
     else:
-        # A touch ends where sphere and ball, less the probe's own error there, meet.
+        # A touch ends at the contact of sphere and ball, minus the probe's error there.
         error = lobe(angles[:, 0], angles[:, 1])
         radius = float(np.median(away + error))
         tip = radius - part.number("Rs")
@@ -85,7 +85,7 @@ def _combined(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
     n, off = part.array("n_outward", shape=(3,)), part.array("Delta", shape=(3,))
     frame = probe_frame(part.array("A"), part.array("B"))
     if lobe is None:
-        # Touches may lie below the equator, where the calibration of the file has no data.
+        # Touches may lie below the equator, outside the calibration of the file.
         checks.leave_out("probe error of a touch", part.at("probe"), "the file's text states no lobing function that is known here")
         probe = part.array("probe")
     else:

@@ -1,4 +1,4 @@
-"""Every vector file of a folder through its reader."""
+"""Check of every vector file of a folder."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ READERS: dict[str, Reader] = {
     "wang_step_diagonal.json": wang_step_diagonal.read,
     "paper_tables.json": paper_tables.read,
 }
-"""File name and what knows its layout."""
+"""Reader by file name."""
 
 
 def check_file(path: Path) -> Checks:
-    """One vector file through the public functions.
+    """Check one vector file.
 
     Raises
     ------
     FileFormatError
-        It cannot be read, is no JSON, has no reader, or lacks something that its layout demands.
+        The file cannot be read, is no JSON, has no reader, or lacks a part of its layout.
     """
     checks = Checks(path.name)
     _read(path, checks)
@@ -65,7 +65,7 @@ def check_file(path: Path) -> Checks:
 
 
 def examine(path: Path) -> Checks:
-    """One vector file like `check_file`; that it is unusable stands in its ``error``, so that the others of a folder still run."""
+    """Check one vector file like `check_file`, but record an unusable file in ``error``, so that the other files still run."""
     checks = Checks(path.name)
     try:
         _read(path, checks)
@@ -79,15 +79,15 @@ def _read(path: Path, checks: Checks) -> None:
         raise FileFormatError(f"{path}: there is no reader for this name", f"known names: {', '.join(READERS)}")
     case = VectorCase(_document(path), (path.name,))
     try:
-        # What cannot be computed is a deviation in the answer and not a line of numpy's on stderr.
+        # A failed computation becomes a deviation in the result, not a warning of numpy on stderr.
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             READERS[path.name](case, checks)
     except (LookupError, TypeError, RecursionError) as error:
-        # A reader found another kind of thing than the layout has there: a number for a list, a key that no function knows.
+        # The layout differs: a number in place of a list, or an unknown key.
         what = f"{type(error).__name__} {error}".strip()
         raise FileFormatError(f"{path}: another layout than expected at {case.last} ({what})", LAYOUT) from None
-    except (ValueError, ArithmeticError) as error:  # of numpy's, LinAlgError is a ValueError
+    except (ValueError, ArithmeticError) as error:  # numpy's LinAlgError is a ValueError
         checks.refused = f"{case.last}: {error}"
     checks.unread = case.unread()
 
@@ -105,12 +105,12 @@ def _document(path: Path) -> dict[str, Any]:
 
 
 def vector_files(folder: Path) -> list[Path]:
-    """Files of a folder that are vectors, by name.
+    """Vector files of a folder, sorted by name.
 
     Raises
     ------
     FileFormatError
-        There is no such folder, or no ``.json`` file in it.
+        The folder does not exist or holds no ``.json`` file.
     """
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: there is no such folder", "give the folder of the vector files")

@@ -20,12 +20,12 @@ from abbe.service.errors import FileFormatError
 from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
-# wang_step_diagonal.json, last parts: plans behind its ranks, and its demonstration of what compensation leaves (math.md 5.5).
+# wang_step_diagonal.json, last parts: plans of its ranks, and its demonstration of residual errors after compensation (math.md 5.5).
 
 
 RANK_STEPS = 20
 RANK_POSITIONS = 20
-"""math.md 4.6 has 20 steps; with 20 positions per line, and only so, all effective ranks of the file come out."""
+"""math.md 4.6 has 20 steps; the effective ranks of the file result only with 20 positions per line."""
 ORDERS2 = ("XYZ", "ZYX")
 RANK_PLANS: dict[str, Callable[[F1], WangPlan]] = {
     "ideal mirror": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, tilts=False),
@@ -55,7 +55,7 @@ UM = 1e3
 
 
 def demonstration(case: VectorCase, checks: Checks, n: int, inc: F1, errors_of: Callable[[VectorCase, F2, F1], ErrorArrays]) -> None:
-    """Worst error of all distances in a grid before and after each compensation, of the machine ``with_angles`` (found out: it fits)."""
+    """Worst error of all distances in a grid before and after each compensation, of the machine ``with_angles`` (found by trial)."""
     travel, demo, machine = n * inc, case.at("compensation_demo"), case.at("cases", TILTED)
     grid = volume_grid(np.stack([np.zeros(3), travel], axis=1), NODES)
 
@@ -106,7 +106,7 @@ def read(case: VectorCase, checks: Checks) -> None:
         raise FileFormatError(f"{case.label}/n: expected a whole number, got {n!r}", "")
     inc = case.array("inc", shape=(3,))
     for _ in case.at("compensation_demo").named("metric", *DEMO_PLANS):
-        pass  # all must be there; they are computed last
+        pass  # all must exist; they are computed last
     for _, part in case.at("cases").items():
         _readings(part, checks, int(n), inc)
         _curves(part, checks, int(n), inc)
@@ -138,7 +138,7 @@ def errors_of(part: VectorCase, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
 
 
 def tilts_of(part: VectorCase) -> dict[str, F1]:
-    """Mirror tilts of a case, two angles per diagonal; none: ideal mirrors."""
+    """Mirror tilts of a case, two angles per diagonal; empty: ideal mirrors."""
     if not part.at("tilt").value:
         return {}
     return {name: angles.array(shape=(2,)) for name, angles in part.at("tilt").named(*DIAGONALS)}
@@ -157,7 +157,7 @@ def _readings(part: VectorCase, checks: Checks, n: int, inc: F1) -> None:
 
 
 def _curves(part: VectorCase, checks: Checks, n: int, inc: F1) -> None:
-    """Everything that follows from the readings of the file themselves."""
+    """Compare everything derived from the stored readings."""
     q = increments({name: part.array("readings", name) for name in DIAGONALS})
     for name, values in q.items():
         checks.compare("q", values, part.at("q", name), unit="mm", floor=1e-17, rounding=LAST)

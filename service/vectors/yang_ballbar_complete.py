@@ -1,4 +1,4 @@
-"""yang_ballbar_complete.json: ball-bar readings of a machine with all 21 errors, what fits make of them, and noise gains of experiments."""
+"""yang_ballbar_complete.json: ball-bar readings of a machine with all 21 errors, fits to them, and noise gains of experiments."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 RADII_MM = (175.0, 100.0)
-"""Two bars at every origin (math.md 4.3); the file lists the runs of one and the figures are of both, the ball being where it was."""
+"""Two bars at every origin (math.md 4.3). The file lists the runs of one bar; its figures use both, with the ball unmoved."""
 INNER = (0.1, 0.9)
 NODES = 4
-"""Nodes per axis over the inner 80 % of the travels: where the file's figures of the map are taken (found out: only these fit)."""
+"""Nodes per axis over the inner 80 % of the travels for the file's figures of the map (found by trial)."""
 STEPS = 20
 DEGREES = 4
-"""Of the noise gains: the file's key says d1 to d4."""
+"""Degrees of the noise gains: d1 to d4 in the file's key."""
 UM = 1e3
 
 
@@ -77,7 +77,7 @@ def _cups(case: VectorCase) -> list[VectorCase]:
 
 
 def _nodes(plan: YangPlan) -> F2:
-    """Scales at which the file's figures of the map are taken."""
+    """Scale readings of the nodes for the file's figures of the map."""
     return volume_grid(np.outer(plan.travel_mm, INNER), NODES)
 
 
@@ -86,7 +86,7 @@ def _errors(case: VectorCase, terms: tuple[Monomial, ...], slide_mm: F2) -> Yang
 
 
 def _tip(case: VectorCase, terms: tuple[Monomial, ...], slide_mm: F2) -> F2:
-    """Actual tool tip over the workpiece for scales."""
+    """Actual position of the tool tip relative to the workpiece for scale readings."""
     tool = case.array("tool")
     return np.asarray(workpiece_mm(slide_mm) + tool + delta_exact(_errors(case, terms, slide_mm), slide_mm, tool))
 

@@ -16,7 +16,7 @@ from abbe.service.vectors.checks import Checks
 RADII_MM = (175.0, 100.0)
 POINTS = 63
 TURNS = 5
-"""Layout of the file: 63 points, 175 mm, with two bars also 100 mm; 5 turns where its key does not say otherwise."""
+"""Layout of the file: 63 points, 175 mm, with two bars also 100 mm; 5 turns unless its key differs."""
 KINDS = ("six_angle_", "six_area_", "ten_", "corr9_", "two_radii")
 TWO_BARS = tuple(f"centre_{c}_radius_{r}" for c in ("common", "separate") for r in ("common", "separate"))
 ORIGIN = np.zeros(3)

@@ -1,4 +1,4 @@
-"""yang_ranks.json: rank and effective rank of the experiments of math.md 4.6, and combinations that they do not see."""
+"""yang_ranks.json: rank and effective rank of the experiments of math.md 4.6, and combinations that they cannot observe."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from abbe.service.vectors.case import LAYOUT, VectorCase
 from abbe.service.vectors.checks import Checks
 
 DECIMALS = 4
-"""The file states the combinations with four decimals; ours are rounded like that and must then agree in full."""
+"""Decimals of the combinations in the file; the computed ones are rounded to them and must then be equal."""
 NO_TRACE = 1e-9
 
 
@@ -56,7 +56,7 @@ def plan_of(case: VectorCase, degree: int) -> YangPlan:
 
 
 def experiment(case: VectorCase, key: str) -> Experiment:
-    """Experiment of a key such as ``c1 helix(1)+step diagonals, ideal mirror``: its first word names it."""
+    """Experiment of a key such as ``c1 helix(1)+step diagonals, ideal mirror``, named by its first word."""
     code = key.split()[0]
     if code not in EXPERIMENTS:
         raise FileFormatError(f"{case.label}: experiment {code!r} is unknown", f"known: {', '.join(EXPERIMENTS)}")
@@ -64,7 +64,7 @@ def experiment(case: VectorCase, key: str) -> Experiment:
 
 
 def _null_vector(case: VectorCase, checks: Checks, problem: Problem) -> None:
-    """The names say which parameters hang together; their ratios, up to the common sign, and that they leave no trace are computed."""
+    """Compare the ratios of the named parameters, up to the common sign, and check that their combination is unobservable."""
     names = [t.name for t in monomials(1)]
     stored = dict(case.items())
     if not set(stored) <= set(names):

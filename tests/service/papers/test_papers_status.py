@@ -60,9 +60,9 @@ def test_status_follows_the_numbers():
 
 def test_status_cannot_be_typed_in():
     assert "status" not in {f.name for f in dataclasses.fields(PaperRow)}
-    with pytest.raises(ValueError, match="nobody says why"):
+    with pytest.raises(ValueError, match="has no reason"):
         PaperRow("yang", "Table 0", "q", "µm", Printed("1"))
-    with pytest.raises(ValueError, match="nobody says from what"):
+    with pytest.raises(ValueError, match="has no origin"):
         PaperRow("yang", "Table 0", "q", "µm", Printed("1"), Computed(1.0))
     with pytest.raises(ValueError, match="computed all the same"):
         row("1", 1.0, given=True)
