@@ -43,7 +43,7 @@ def _anew(result: HiddenDemo) -> list[str]:
     if result.anew is None:
         return []
     runs = [f"  {label}: {_gap_text(r)}" for label, r in result.anew.runs.items()]
-    return [f"measured anew at places that no fit has used, later: {_gap_text(result.anew.gap)}", *runs]
+    return [f"new measurement at positions that no fit has used: {_gap_text(result.anew.gap)}", *runs]
 
 
 def _tables(result: HiddenDemo) -> list[str]:
@@ -72,7 +72,7 @@ def judged(result: HiddenDemo) -> tuple[bool, str]:
     named = [e.label for e in finding.effects]
     if label is None:
         right = finding.verdict == "none"
-        return right, "nothing was hidden" + ("" if right else f", and yet it was said: {', '.join(named) or finding.verdict}")
+        return right, "nothing was hidden" + ("" if right else f"; the answer was {', '.join(named) or finding.verdict}")
     if result.truth["hidden"]["name"] not in {e.name for e in catalogue()}:
         right = finding.verdict == "unknown" and not named
         return right, f"hidden was {label}, which no catalogue names; the answer was {', '.join([finding.verdict, *named])}"

@@ -74,19 +74,19 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show
         site = demo_site(simulator.ready)
         machine_file = write_machine_file(site, folder)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-            show("what the control does with a table is proved first: abbe comp commission")
+            show("commissioning proves how the control applies tables: abbe comp commission")
             async with open_session(site.urls) as session:
                 await commission_levels(session.controller, store, site)
                 await commission(session, store, site, progress=ignore_progress)
-                show("what the machine does today is what its limits shall allow: a verification")
+                show("a verification sets the limits to the present errors of the machine")
                 limits_um = await measured_limits(session, store, site, bar_rate_hz(speed))
-                show("what its errors are today is kept, to tell later what has changed: an identification")
+                show("an identification stores the present errors for later comparison")
                 await store_baseline(session, store, site, bar_rate_hz(speed))
             async with served(machine_file, store, port, limits_um) as serving:
                 show(f"page: {serving.page}")
-                show(f"   log in as {serving.user} with {serving.password} (what the service writes: {serving.log})")
+                show(f"   log in as {serving.user} with {serving.password} (log of the service: {serving.log})")
                 await narrate(simulator, site.name, store, serving, show)
-                show("the service goes on: Ctrl-C ends it")
+                show("the service keeps running: Ctrl-C stops it")
                 await asyncio.Event().wait()
 
 
@@ -192,7 +192,7 @@ async def _answers(process: asyncio.subprocess.Process, port: int, log: Path) ->
                 return
     except TimeoutError:
         pass
-    raise AbbeError("the service did not start", f"{log} says why")
+    raise AbbeError("the service did not start", f"see {log}")
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
@@ -241,7 +241,7 @@ async def narrate(simulator: SimulatorProcess, machine: str, store: Store, servi
     proposal = int(proposed.doc.get("proposal", 0))
     show(f"   {proposed.doc['text']}")
     if proposed.kind is not AlarmKind.PROPOSED:
-        raise AbbeError("the story ends here: the service proposes nothing", f"{serving.log} says more; try another --seed")
+        raise AbbeError("the service proposes nothing", f"see {serving.log}; try another --seed")
     show(f"   approve it at {serving.page}proposal?id={proposal}")
     who = (await _until(lambda: store.proposals.approvals(proposal)))[-1].name
     show(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")

@@ -36,12 +36,12 @@ SIGNS: dict[str, SignRule] = {
     "linuxcnc-0": SignRule(1, True, "verified by execution", True, "the position that was reached: nominal + e"),
     "linuxcnc-hal": SignRule(-1, False, "verified by execution", True, "what is added to the drive's command: −e"),
     "siemens-eec": SignRule(1, False, "by manual", True, "corrects the ACTUAL value; a positive number moves the axis in −: +e"),
-    "siemens-cec": SignRule(-1, False, "by manual", False, "added to the setpoint of the compensated axis: −e; not said in a manual"),
-    "fanuc-pitch": SignRule(-1, False, "by manual", False, "pulses that are added from point to point: −Δe; not said in a manual"),
-    "fanuc-lattice": SignRule(-1, False, "by manual", False, "pulses that are added: −e; not said in a manual"),
+    "siemens-cec": SignRule(-1, False, "by manual", False, "added to the setpoint of the compensated axis: −e; not stated in a manual"),
+    "fanuc-pitch": SignRule(-1, False, "by manual", False, "pulses that are added from point to point: −Δe; not stated in a manual"),
+    "fanuc-lattice": SignRule(-1, False, "by manual", False, "pulses that are added: −e; not stated in a manual"),
     "heidenhain": SignRule(-1, False, "by manual", False, "compensation value: −e; manuals differ (error or correction)"),
     "mach4": SignRule(-1, False, "by manual", True, "expected − actual: −e"),
-    "centroid": SignRule(-1, False, "by manual", False, "amount of correction to apply: −e; not said in a manual"),
+    "centroid": SignRule(-1, False, "by manual", False, "amount of correction to apply: −e; not stated in a manual"),
 }
 
 

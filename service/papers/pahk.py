@@ -102,7 +102,7 @@ def diagonal_evidence(cmm: Cmm) -> str:
     sizes = ", ".join(f"{name} {minus(f'{1e3 * value:.1f}')}" for name, value in alone.items())
     mean = float(np.mean(values(cmm.diagonals_um)))
     return (
-        f"only squareness is printed, the curves of the other errors are lost and it is not said which diagonal is which."
+        f"only squareness is printed, the curves of the other errors are lost and the paper does not name the diagonals."
         f" Squareness alone gives {sizes} µm (mean 0, printed mean {minus(f'{mean:.2f}')}); none of 24 orders and 2 senses of angle brings"
         f" the printed four nearer than {misfit / URAD:.0f} µrad to the printed squareness"
     )

@@ -56,8 +56,8 @@ def _drawn(order: int, test: TestPlan) -> DrawnTest:
     path = np.array(_read_places(test))
     mount = np.array(test.setup["centre_mm"] if bar else test.setup["start_mm"], dtype=np.float64)
     radius = float(test.setup["radius_mm"]) if bar else 0.0
-    hung = ", bar hung in here" if any(isinstance(s, MountBar) for s in test.steps) else ""
-    text = f"{test.label}: {NAMES.get(test.test, test.test)}{hung}"
+    mounted = ", bar mounted here" if any(isinstance(s, MountBar) for s in test.steps) else ""
+    text = f"{test.label}: {NAMES.get(test.test, test.test)}{mounted}"
     return DrawnTest(order, "bar" if bar else "laser", text, path, mount, radius, test.mounts)
 
 

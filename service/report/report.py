@@ -51,7 +51,7 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
     if len(having) != 1:
         if not having:
             raise NotStored(f"no push {number} in the database", "abbe correct pushes tables; pushes count from 1")
-        raise StoreError(f"machines {', '.join(having)} each have a push {number}", "say of which machine: --of NAME")
+        raise StoreError(f"machines {', '.join(having)} each have a push {number}", "name the machine: --of NAME")
     return push_report(store, having[0], number, rules)
 
 

@@ -176,9 +176,9 @@ def _parameters(doc: Doc, group: str) -> list[ReportFigure]:
 def _solution_verdict(solution: SolutionResult | None) -> tuple[Sign, str, str]:
     if solution is None:
         return "open", "Not judged", NOT_JUDGED
-    evaluated = solution.doc["verdict"]
-    word = str(evaluated["word"])
-    return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(evaluated["text"])
+    verdict = solution.doc["verdict"]
+    word = str(verdict["word"])
+    return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(verdict["text"])
 
 
 def _made(solution: SolutionResult | None) -> dict[str, str] | None:

@@ -26,8 +26,8 @@ SIGNS: Mapping[Verdict, tuple[Sign, str]] = {
 }
 VERIFICATION = "verification"
 VERIFICATION_STATEMENT = (
-    "U of verification figures holds noise, wavelength and, for the helix, that the bar is hung in again, but not the temperature of the "
-    "scales: they compare one machine with itself. ISO 230-6 figures of the same diagonals hold it, so their U is larger."
+    "U of verification figures includes noise, wavelength and, for the helix, remounting of the bar, but not the temperature of the "
+    "scales: they compare one machine with itself. ISO 230-6 figures of the same diagonals include it, so their U is larger."
 )
 SENSORS = (
     ("temp_air_C", "air temperature", "°C"),

@@ -58,9 +58,9 @@ def _remark(crc: int, known: KnownTables, chain: str) -> str:
     """Origin of the table and who accepted it for this machine; empty if this machine's journal endorses it."""
     elsewhere, here, push = known.elsewhere(crc, chain), known.endorsed.get(crc, {}).get(chain), known.pushed.get(crc)
     if elsewhere is not None:
-        return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: nobody has accepted it"
+        return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: not accepted"
     if here is not None and (here.how != "accepted" or (push is not None and push.chain == chain)):
         return ""
-    who = "nobody has accepted it" if here is None else f"accepted by {here.by or 'a person'} at {here.utc}"
+    who = "not accepted" if here is None else f"accepted by {here.by or 'a person'} at {here.utc}"
     what = STRANGE if push is None else f"a table of machine {push.machine!r}"
     return f"measured with {what} (CRC {crc:08X}): {who}"

@@ -22,7 +22,7 @@ PURPOSE = b"abbe compensation files\x00"
 """Prefix of the signed bytes, so that a signature made for another purpose is invalid here."""
 LARGEST = 1_000_000
 NO_BASE = "none"
-FILE_REMEDY = "get the files and their .sig again from who signed them; nothing was taken in"
+FILE_REMEDY = "get the files and their .sig again from the signer; nothing was imported"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +81,13 @@ def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, 
     key, claims, signature = _parts(sealed)
     if key not in expected.trusted:
         raise SignatureRefused(
-            f"signed by {key[:16]}…, whom nobody here trusts", "put the public key under [signatures] trusted, or do not take it in"
+            f"signed by {key[:16]}…, a key that is not trusted here",
+            "put the public key under [signatures] trusted, or do not import the files",
         )
     try:
         Ed25519PublicKey.from_public_bytes(bytes.fromhex(key)).verify(signature, PURPOSE + canonical(asdict(claims)))
     except (InvalidSignature, ValueError):
-        raise SignatureRefused("the signature does not belong to what it stands under", FILE_REMEDY) from None
+        raise SignatureRefused("the signature does not match the claims", FILE_REMEDY) from None
     _check_files(claims, files)
     for what, claimed, here in (
         ("machine", claims.machine, expected.machine),

@@ -18,7 +18,7 @@ KIND_AT, NO_CORRECTION = slice(4, 6), 0
 """Bytes of an image that hold its kind (docs/protocols/cnc.md, word 2), and the kind without correction."""
 Images = Callable[[int], bytes | None]
 REMEDY = "measure again without a table in force; or, where the control has Abbe's register map, let abbe correct add the tables"
-CONFIRM_REMEDY = "if none was, say so: --without-table"
+CONFIRM_REMEDY = "if no correction was in force, confirm with --without-table"
 
 
 def distinct(tables: Iterable[Doc]) -> list[Doc]:
@@ -80,7 +80,9 @@ def check_fresh(tables: list[Doc], images: Images, *, confirmed_none: bool = Fal
             acts = int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
         name = f"table {table['crc']:08X}"
         if acts:
-            raise FormatRefused(f"this solution was measured while {name} corrected the machine: alone it would take that away", REMEDY)
+            raise FormatRefused(
+                f"this solution was measured while {name} corrected the machine: its files alone would remove that correction", REMEDY
+            )
         if acts is None and not confirmed_none:
             raise FormatRefused(f"this solution was measured with {name}, and nothing says whether it corrected anything", CONFIRM_REMEDY)
     return bool(tables) or confirmed_none

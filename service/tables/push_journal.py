@@ -241,7 +241,7 @@ class JournalView:
         if self.origin(kept[-1]).kind == KIND:
             raise TableRefused(
                 f"the last kept push ({kept[-1][-1].push}) was a rollback itself",
-                f"say how far with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
+                f"name the push with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
             )
         return kept[-1]
 
@@ -264,7 +264,7 @@ class JournalView:
         if known.crc != crc:
             raise TableRefused(
                 f"the table in force ({crc:08X}) is not the one of push {last[-1].push}, the last that was kept",
-                f"say which with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
+                f"name the push with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
             )
         return RollbackOffer(last[-1].push, crc, known.base_crc)
 

@@ -31,13 +31,13 @@ class VectorCase:
     ----------
     value : JSON value
     path : tuple of keys and indices from the top of the file, the file name first
-    seen : paths of the numbers read so far, shared by all parts of a file
+    read : paths of the numbers read so far, shared by all parts of a file
     """
 
-    def __init__(self, value: Any, path: Path, seen: VectorResult | None = None) -> None:
+    def __init__(self, value: Any, path: Path, read: VectorResult | None = None) -> None:
         self.value = value
         self.path = path
-        self._seen = VectorResult() if seen is None else seen
+        self._read = VectorResult() if read is None else read
 
     @property
     def label(self) -> str:
@@ -47,7 +47,7 @@ class VectorCase:
     @property
     def last(self) -> str:
         """Part of the file accessed last."""
-        return "/".join(str(p) for p in self._seen.last or self.path)
+        return "/".join(str(p) for p in self._read.last or self.path)
 
     def at(self, *keys: str | int) -> VectorCase:
         """Part under nested keys or indices; raises `FileFormatError` if it is missing."""
@@ -58,8 +58,8 @@ class VectorCase:
             except (KeyError, IndexError, TypeError):
                 where = "/".join(str(p) for p in (*self.path, *keys[:k]))
                 raise FileFormatError(f"{where}: {key!r} is missing", LAYOUT) from None
-        self._seen.last = (*self.path, *keys)
-        return VectorCase(here, (*self.path, *keys), self._seen)
+        self._read.last = (*self.path, *keys)
+        return VectorCase(here, (*self.path, *keys), self._read)
 
     def has(self, key: str) -> bool:
         """Whether an object holds a key."""
@@ -138,7 +138,7 @@ class VectorCase:
         part = self.at(*keys) if keys else self
         for path, value in _leaves(part.value, part.path):
             _demand_number(path, value)
-            self._seen.add(path)
+            self._read.add(path)
         try:
             found = np.asarray(part.value, dtype=np.float64)
         except (TypeError, ValueError):
@@ -172,7 +172,7 @@ class VectorCase:
             raise FileFormatError(f"{self.label}: expected numbers", LAYOUT)
         for path, value in numbers:
             _demand_number(path, value)
-            self._seen.add(path)
+            self._read.add(path)
         return len(numbers)
 
     def unread(self) -> list[str]:
@@ -180,7 +180,7 @@ class VectorCase:
         return [
             "/".join(map(str, path))
             for path, value in _leaves(self.value, self.path)
-            if not isinstance(value, str | None) and path not in self._seen
+            if not isinstance(value, str | None) and path not in self._read
         ]
 
 

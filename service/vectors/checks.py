@@ -21,8 +21,8 @@ RELATIVE = 1e-11
 class Quantity:
     """All comparisons of one quantity of one file.
 
-    ``floor`` is the rounding of the stored number in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation does not
-    exceed the larger of ``floor`` and ``relative`` times the stored value, nor the larger of ``floor`` and LIMIT. Comparisons of one
+    ``floor`` is the rounding of the stored number in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation does
+    not exceed the larger of ``floor`` and ``relative`` times the stored value, nor the larger of ``floor`` and LIMIT. Comparisons of one
     quantity may have different roundings; the largest is shown. ``allowed`` is the tolerance at the largest deviation (``worst``).
     """
 

@@ -45,7 +45,7 @@ def _machine(name: str, part: VectorCase, length: F1, grid: F2, checks: Checks) 
     )
     setup = OffsetSetup(offset)
     still = np.stack([_cubic(offset[j : j + 1] / length[j], _coefficients(part, "E", j))[0] for j in range(3)])
-    seen = as_measured(kind, truth, setup, still)
+    computed = as_measured(kind, truth, setup, still)
     measured = ParameterTables(truth.positions_mm, _tables(part.at("measured")), truth.e_rad, squareness(part.at("squareness_measured")))
     origin = refer_to_origin(kind, measured, setup, still)
     for j, axis in enumerate(AXES):
@@ -55,11 +55,11 @@ def _machine(name: str, part: VectorCase, length: F1, grid: F2, checks: Checks) 
             floor, why, why_true = FLOORS[what]
             stored, true = part.at("measured", key), part.at("true_translational", key)
             checks.compare(f"{what} of the parameters", truth.d_mm[j][:, i], true, unit="mm", floor=1e-16, rounding=why_true)
-            checks.compare(f"{what} as measured", seen.d_mm[j][:, i], stored, unit="mm", floor=floor, rounding=why)
+            checks.compare(f"{what} as measured", computed.d_mm[j][:, i], stored, unit="mm", floor=floor, rounding=why)
             checks.compare(f"{what} of the origin", origin.d_mm[j][:, i], true, unit="mm", floor=floor, rounding=why)
     for k, key in enumerate(("alpha", "beta1", "beta2")):
         stored, true = part.at("squareness_measured", key), part.at("squareness_true", key)
-        checks.compare("squareness as measured", seen.squareness_rad[k], stored, unit="rad", floor=FLOOR_RAD, rounding=LINE)
+        checks.compare("squareness as measured", computed.squareness_rad[k], stored, unit="rad", floor=FLOOR_RAD, rounding=LINE)
         checks.compare("squareness of the origin", origin.squareness_rad[k], true, unit="rad", floor=FLOOR_RAD, rounding=LINE)
 
 

@@ -48,9 +48,9 @@ def stated_lobe(note: str) -> Lobe | None:
 def _direction(part: VectorCase, checks: Checks) -> None:
     frame = probe_frame(part.array("A"), part.array("B"))
     checks.compare("Tp", frame, part.at("Tp"), unit="1", floor=4e-16)
-    seen = to_probe(frame, part.array("n_machine", shape=(3,)))
-    checks.compare("direction in the probe frame", seen, part.at("n_probe"), unit="1", floor=4e-16)
-    colatitude, longitude = direction_angles(seen)
+    in_probe = to_probe(frame, part.array("n_machine", shape=(3,)))
+    checks.compare("direction in the probe frame", in_probe, part.at("n_probe"), unit="1", floor=4e-16)
+    colatitude, longitude = direction_angles(in_probe)
     checks.compare("colatitude", colatitude, part.at("colatitude"), unit="rad", floor=1e-15)
     checks.compare("longitude", longitude, part.at("longitude"), unit="rad", floor=2e-15)
 

@@ -25,13 +25,13 @@ from abbe.service.verification.iso_readings import AxisTest, CircleTest, circle_
 UM = 1e3
 POLAR_POINTS = 720
 LASER_STATEMENT = (
-    "U of ISO 230-2 and 230-6 figures holds the scatter of the cycles, as far as repeats show it, the wavelength ({wave:g} µm/m), the "
+    "U of ISO 230-2 and 230-6 figures includes the scatter of the cycles, as far as repeats show it, the wavelength ({wave:g} µm/m), the "
     "temperature of the scales (known to {kelvin:g} K at {expansion:g} µm/m/K) and the resolution, propagated through the figure's own "
     "formula (idea of ISO/TR 230-9). Deviations are as measured, not reduced to 20 °C. Where there is one cycle, "
     "the scatter is that of the reversals about their mean."
 )
 BAR_STATEMENT = (
-    "U of ISO 230-4 figures holds the noise of a reading, {repeat:g} µm for a bar that is hung in again (an assumption) and, for F alone, "
+    "U of ISO 230-4 figures includes the noise of a reading, {repeat:g} µm for remounting the bar (an assumption) and, for F alone, "
     "the length of the bar. G takes extremes of single readings: noise makes it larger, never smaller."
 )
 

@@ -147,11 +147,11 @@ def _reported_strange(store: Store, machine: str, journal: JournalView, checks: 
     heartbeat = store.heartbeats.all().get(machine)
     if heartbeat is None or not strange_table(heartbeat.doc.get("attention") or []):
         return False
-    seen = datetime.fromisoformat(heartbeat.seen_utc)
+    heartbeat_utc = datetime.fromisoformat(heartbeat.seen_utc)
     last = _last_measured(checks)
-    if last is not None and _measured_with(store, last, journal.wanted[0], seen):
+    if last is not None and _measured_with(store, last, journal.wanted[0], heartbeat_utc):
         return False
-    return all(datetime.fromisoformat(e.utc) <= seen for e in journal.changes)
+    return all(datetime.fromisoformat(e.utc) <= heartbeat_utc for e in journal.changes)
 
 
 def _of_journal(store: Store, journal: JournalView, checks: Sequence[VerificationRecord], *, strange: bool) -> VerifiedBy:

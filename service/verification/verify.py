@@ -117,10 +117,8 @@ def incomparable(before: VerificationFigures, after: VerificationFigures, pushed
     if not (before.finite and after.finite):
         return "a figure is no number"
     if pushed_crc is not None and after.tables != {pushed_crc}:
-        seen = (
-            ", ".join(sorted("one that nobody named" if crc is None else f"{crc:08X}" for crc in after.tables)) or "one that nobody named"
-        )
-        return f"it was measured with table {seen}, brought into force was {pushed_crc:08X}"
+        used = ", ".join(sorted("unrecorded" if crc is None else f"{crc:08X}" for crc in after.tables)) or "unrecorded"
+        return f"it was measured with table {used}, brought into force was {pushed_crc:08X}"
     if before.air_c is None or after.air_c is None:
         return "how warm the air was is not known"
     low, high = min(before.air_c[0], after.air_c[0]), max(before.air_c[1], after.air_c[1])

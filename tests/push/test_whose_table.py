@@ -148,7 +148,7 @@ async def test_a_report_gives_no_verdict_on_an_unverified_table(store: Store) ->
     assert (sign, word) == ("bad", "Unverified table")
     assert "push 1 of machine 'a'" in text
     strange = table_remarks(store, "a", [{"table": {"crc": 5, "acting": True}}, {"table": {"crc": 6, "acting": False}}])
-    assert strange.remarks == ("measured with a table that this database did not push (CRC 00000005): nobody has accepted it",)
+    assert strange.remarks == ("measured with a table that this database did not push (CRC 00000005): not accepted",)
     assert strange.verdict(("ok", "Within limits", "By the limits.")) == ("ok", "Within limits", "By the limits.")
 
 
@@ -157,7 +157,7 @@ async def test_a_report_names_a_table_that_was_verified_on_another_machine(store
     used = [{"table": {"crc": crc32(ACTING), "acting": True}}]
     assert table_remarks(store, "a", used).remarks == ()
     remark = f"measured with a table (CRC {crc32(ACTING):08X}) that was verified on machine 'a' (push 1), not on this one"
-    assert table_remarks(store, "b", used).remarks == (f"{remark}: nobody has accepted it",)
+    assert table_remarks(store, "b", used).remarks == (f"{remark}: not accepted",)
 
 
 async def test_a_verdict_of_the_control_that_had_the_name_before_is_not_this_one_s(store: Store) -> None:
@@ -374,7 +374,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             used = [{"table": {"crc": int(crc, 16), "acting": True}}]
             assert "accepted by eve at " in table_remarks(store, site.name, used).remarks[0]
             assert table_remarks(store, "lathe", used).remarks == (
-                f"measured with a table (CRC {crc}) that was accepted on machine 'sim', not on this one: nobody has accepted it",
+                f"measured with a table (CRC {crc}) that was accepted on machine 'sim', not on this one: not accepted",
             )
             assert (await StoreBook.new(store, "sim", SystemClock(), site.control))._push == 1  # a word is no push
 

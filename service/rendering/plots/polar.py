@@ -20,13 +20,13 @@ def polar_plot(traces: Sequence[PolarTrace], *, key: str = "polar", heading: str
 
     ``unit``: display unit of the deviation.
     """
-    seen = [[float(v) / unit.size for v in t.deviation_um] for t in traces]
-    low, high = data_range((v for values in seen for v in values), zero=True)
-    summary = "; ".join(f"{t.label}: {_extremes(values, unit)}" for t, values in zip(traces, seen, strict=True)) or "no data"
+    displayed = [[float(v) / unit.size for v in t.deviation_um] for t in traces]
+    low, high = data_range((v for values in displayed for v in values), zero=True)
+    summary = "; ".join(f"{t.label}: {_extremes(values, unit)}" for t, values in zip(traces, displayed, strict=True)) or "no data"
     svg = Svg(SIZE, SIZE + 30.0, key, heading, f"Polar plot of the radial deviation. {summary}.")
     svg.text((CENTRE[0], 18.0), heading, "t-head", anchor="middle")
     _draw_rings(svg, low, high, unit)
-    for trace, values, style in zip(traces, seen, STYLES, strict=False):
+    for trace, values, style in zip(traces, displayed, STYLES, strict=False):
         svg.polyline([_at(float(a), _radius(d, low, high)) for a, d in zip(trace.angle_deg, values, strict=False)], style)
     entries = [(style, trace.label[:40]) for trace, style in zip(traces, STYLES, strict=False)]
     svg.legend((20.0, SIZE + 20.0), entries)

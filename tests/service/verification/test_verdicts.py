@@ -46,8 +46,8 @@ def figures(
         (figures(40), figures(10, air=(20.8, 20.9)), True, "40.0 → 10.0"),
         (figures(40), figures(10, air=None), False, "how warm the air was is not known"),
         (figures(40), figures(10, crc=(7, 8)), False, "measured with table 00000007, 00000008, brought into force was 00000007"),
-        (figures(40), figures(10, crc=(None,)), False, "one that nobody named"),
-        (figures(40), figures(10, crc=()), False, "one that nobody named"),
+        (figures(40), figures(10, crc=(None,)), False, "unrecorded"),
+        (figures(40), figures(10, crc=()), False, "unrecorded"),
     ],
 )
 def test_keep_only_what_is_better_and_nowhere_worse(before, after, keep, why):
