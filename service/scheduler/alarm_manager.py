@@ -28,7 +28,7 @@ from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
-from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, last_seq, look
+from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, evaluate_alarm, last_seq
 
 log = structlog.get_logger("abbe.alarm")
 
@@ -112,7 +112,7 @@ class AlarmManager(RetryingStore):
         """Compare a kept verification with those before it; raise, hold or clear the alarm of its recipe. Return that as a sentence."""
         recipe, warn_days = doc["recipe"], self.duties.warn_days
         records = await self._read(self._store.verifications.of_machine, self._machine, READ_CHECKS)
-        looked = await self._read(look, self._store, self._machine, recipe, records, warn_days)
+        looked = await self._read(evaluate_alarm, self._store, self._machine, recipe, records, warn_days)
         if looked.kind is None:
             return ""
         line = check_line(looked, recipe, doc["schedule"], number)

@@ -75,6 +75,6 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
 async def _look_or_strange(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool]) -> InForceNow:
     """Check as the gate does. A table whose bytes do not match the stated CRC is strange."""
     try:
-        return await table_gate.look(controller, known, chain, corrects)
+        return await table_gate.identify_table(controller, known, chain, corrects)
     except TableMismatch:
         return InForceNow(await controller.comp_status(), None, True, None)

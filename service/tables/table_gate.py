@@ -18,9 +18,9 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from abbe.service.tables.unverified import Endorsement, KnownTables, PushedTable, known_tables
 
-LOOK = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
+LOOK_REMEDY = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
 STRANGE = "a table that this database did not push"
-ACCEPT = (
+ACCEPT_REMEDY = (
     "find out who wrote it; if it is right: `abbe accept-table MACHINE.toml --yes`, or --accept-table with the command that is to go on; "
     "nothing has moved"
 )
@@ -45,7 +45,9 @@ class InForceNow:
         return self.status.bank_crc[self.status.active_bank]
 
 
-async def look(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool] | None = None) -> InForceNow:
+async def identify_table(
+    controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool] | None = None
+) -> InForceNow:
     """Identify the active table by the journals. Its content is read only if ``chain``, the journal of this control, does not endorse it.
 
     ``corrects`` caches by CRC whether a table corrects anything.
@@ -86,16 +88,16 @@ async def check_in_force(controller: TableController, store: Store, site: Site) 
     TableMismatch
         The message names the origin of the table and the remedy.
     """
-    now = await look(controller, *await asyncio.to_thread(_journals, store, site))
+    now = await identify_table(controller, *await asyncio.to_thread(_journals, store, site))
     if now.unverified is not None:
         whose = await asyncio.to_thread(_whose, store, site, now.unverified)
         raise TableMismatch(
             f"the table in force (CRC {now.crc:08X}) is that of {whose}, which was never verified", _remedy(site, now.unverified)
         )
     if now.strange:
-        raise TableMismatch(f"{STRANGE} (CRC {now.crc:08X}) is in force", ACCEPT)
+        raise TableMismatch(f"{STRANGE} (CRC {now.crc:08X}) is in force", ACCEPT_REMEDY)
     if now.elsewhere is not None:
-        raise TableMismatch(f"the table in force (CRC {now.crc:08X}) was {now.elsewhere.not_here}", ACCEPT)
+        raise TableMismatch(f"the table in force (CRC {now.crc:08X}) was {now.elsewhere.not_here}", ACCEPT_REMEDY)
 
 
 def _journals(store: Store, site: Site) -> tuple[KnownTables, str]:
@@ -111,8 +113,8 @@ def _whose(store: Store, site: Site, push: PushedTable) -> str:
 
 def _remedy(site: Site, push: PushedTable) -> str:
     if push.may_be_active and push.state != PushState.OPERATOR and push.machine != site.name:
-        return f"start any command with the machine file of {push.machine!r}, which takes it back; or {LOOK}"
-    return LOOK
+        return f"start any command with the machine file of {push.machine!r}, which takes it back; or {LOOK_REMEDY}"
+    return LOOK_REMEDY
 
 
 async def accept_strange(controller: TableController, store: Store, site: Site, by: str) -> str | None:
@@ -120,7 +122,7 @@ async def accept_strange(controller: TableController, store: Store, site: Site, 
 
     An unverified table of a push of this database is not accepted here: that takes `abbe accept-table`.
     """
-    now = await look(controller, *await asyncio.to_thread(_journals, store, site))
+    now = await identify_table(controller, *await asyncio.to_thread(_journals, store, site))
     if not now.strange and now.elsewhere is None:
         return None
     await vouch(store, site, now.status, by)

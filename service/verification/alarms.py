@@ -161,7 +161,7 @@ def series_begins(store: Store, machine: str) -> datetime | None:
     return datetime.fromisoformat(changed[-1].utc) if changed else None
 
 
-def look(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> AlarmCheck:
+def evaluate_alarm(store: Store, machine: str, recipe: str, records: Sequence[VerificationRecord], warn_days: float) -> AlarmCheck:
     """Compare the latest check of a recipe with earlier ones and with the active alarm. Nothing is written."""
     begins, now = series_begins(store, machine), active_alarm(store, machine, recipe)
     compare = None

@@ -90,7 +90,7 @@ class FigureRow:
     sure: bool | None
 
 
-def against(first: LoadedRun, other: LoadedRun) -> str:
+def incomparable_reason(first: LoadedRun, other: LoadedRun) -> str:
     """Reason why two runs are not comparable, in one line; empty if they are."""
     if first.machine != other.machine:
         names = f"{other.label} was measured on machine {other.machine}, {first.label} on {first.machine}"

@@ -22,10 +22,10 @@ from abbe.service.verification.compare_runs import (
     FigureRow,
     LoadedRun,
     RunDifference,
-    against,
     curve,
     difference,
     figure_rows,
+    incomparable_reason,
     remarks,
 )
 from abbe.service.web.frame import current
@@ -78,7 +78,7 @@ def compare_screen(store: Store, numbers: Sequence[int], say: Say, rules: Rules)
         return CompareScreen(choices, runs)
     try:
         loaded = [_load(store, record, rules) for record in there]
-        why = next((text for one in loaded[1:] if (text := against(loaded[0], one))), "")
+        why = next((text for one in loaded[1:] if (text := incomparable_reason(loaded[0], one))), "")
         curves = [] if why else [curve(one) for one in loaded]
     except AbbeError as error:
         return CompareScreen(choices, runs, trouble=error.detail)

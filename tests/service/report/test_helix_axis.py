@@ -18,7 +18,7 @@ from abbe.service.report.report_measured import Measured, run_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.helix_axis import helix_axis
 from abbe.service.runs.observations import run_data
-from abbe.service.verification.compare_runs import LoadedRun, against, curve
+from abbe.service.verification.compare_runs import LoadedRun, curve, incomparable_reason
 from tests.scenarios.campaign_files import measured
 
 CENTRE = np.array([300.0, 250.0, 200.0])
@@ -88,8 +88,8 @@ def test_what_neither_set_up_nor_path_tells_is_not_drawn(monkeypatch: pytest.Mon
 
 def test_a_stated_and_an_inferred_axis_are_one_axis() -> None:
     first, second = compared(helix_about("X", "a", axis="X")), compared(helix_about("X", "b"))
-    assert against(first, second) == ""
-    assert "axis of june/b is Y" in against(first, compared(helix_about("Y", "b")))
+    assert incomparable_reason(first, second) == ""
+    assert "axis of june/b is Y" in incomparable_reason(first, compared(helix_about("Y", "b")))
 
 
 @pytest.mark.parametrize("law", ["angle", "area"])

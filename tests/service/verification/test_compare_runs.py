@@ -9,7 +9,7 @@ import pytest
 
 from abbe.service.rendering.document import ReportFigure
 from abbe.service.runs.observations import run_data
-from abbe.service.verification.compare_runs import LoadedRun, against, curve, difference, figure_rows, remarks
+from abbe.service.verification.compare_runs import LoadedRun, curve, difference, figure_rows, incomparable_reason, remarks
 
 RADIUS = 100.0
 
@@ -46,12 +46,12 @@ def test_noise_alone_is_no_difference() -> None:
 
 def test_what_cannot_be_compared_says_why() -> None:
     one = circle(1)
-    assert against(one, circle(2)) == ""
+    assert incomparable_reason(one, circle(2)) == ""
     other_plane = one.run | {"setup": one.run["setup"] | {"plane": "YZ"}}
-    assert "plane of june/c2 is YZ" in against(one, LoadedRun("june/c2", "mill-7", other_plane, one.data, ()))
-    assert "measured on machine lathe" in against(one, LoadedRun("june/c2", "lathe", one.run, one.data, ()))
+    assert "plane of june/c2 is YZ" in incomparable_reason(one, LoadedRun("june/c2", "mill-7", other_plane, one.data, ()))
+    assert "measured on machine lathe" in incomparable_reason(one, LoadedRun("june/c2", "lathe", one.run, one.data, ()))
     helix = one.run | {"test": "ballbar_helix"}
-    assert "only runs of one test" in against(one, LoadedRun("june/c2", "mill-7", helix, one.data, ()))
+    assert "only runs of one test" in incomparable_reason(one, LoadedRun("june/c2", "mill-7", helix, one.data, ()))
     moved = circle(2, centre_mm=[5.0, 0.0, 0.0])
     assert remarks([one, moved]) == ["june/c2 was measured elsewhere than june/c1 (centre_mm): the difference holds that too"]
     assert remarks([one, circle(5)]) == []

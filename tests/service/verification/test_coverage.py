@@ -14,7 +14,7 @@ from abbe.service.errors import MeasurementFault
 from abbe.service.report.report_measured import Measured, campaign_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.coverage import COMPLETE, LEAST, covered_share, not_judged, with_state
-from abbe.service.verification.compare_runs import against
+from abbe.service.verification.compare_runs import incomparable_reason
 from abbe.service.verification.iso_report import evaluate
 from abbe.service.verification.verify import figures
 from tests.scenarios.campaign_files import measured
@@ -159,5 +159,5 @@ def test_the_report_of_a_campaign_leaves_out_a_file_that_ends_early() -> None:
 def test_a_part_of_a_path_is_compared_with_nothing() -> None:
     whole = helix_about("Z", axis="Z")
     part = with_state(cut(whole, 0.5), record(whole, "stopped", path_of(whole)))
-    assert "stopped: 45.1 % of the path" in against(compared(whole), compared(part))
-    assert "not judged" in against(compared(part), compared(whole))
+    assert "stopped: 45.1 % of the path" in incomparable_reason(compared(whole), compared(part))
+    assert "not judged" in incomparable_reason(compared(part), compared(whole))
