@@ -64,7 +64,7 @@ def test_status_cannot_be_typed_in():
         PaperRow("yang", "Table 0", "q", "µm", Printed("1"))
     with pytest.raises(ValueError, match="has no origin"):
         PaperRow("yang", "Table 0", "q", "µm", Printed("1"), Computed(1.0))
-    with pytest.raises(ValueError, match="computed all the same"):
+    with pytest.raises(ValueError, match="must not be computed"):
         row("1", 1.0, given=True)
 
 

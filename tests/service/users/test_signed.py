@@ -75,7 +75,7 @@ def test_another_machine_base_limit_format_day_or_signer_is_refused(key: Ed25519
         check(seal, FILES, expected(Ed25519PrivateKey.generate()), NOW)
     stranger = json.loads(sealed(Ed25519PrivateKey.generate()))
     forged = json.dumps({**stranger, "key": public_of(key)}, sort_keys=True, separators=(",", ":")).encode() + b"\n"
-    with pytest.raises(SignatureRefused, match="does not belong"):  # a trusted name over a stranger's signature
+    with pytest.raises(SignatureRefused, match="does not match the claims"):  # a trusted name over a stranger's signature
         check(forged, FILES, expected(key), NOW)
     for files in ({"a.ini": FILES["a.ini"]}, {**FILES, "c.ini": b""}, {"b.ini": FILES["a.ini"], "a.ini": FILES["b.ini"]}):
         with pytest.raises(SignatureRefused, match="not the file that was signed"):
