@@ -58,7 +58,7 @@ CANNOT_BE_KEPT = [
     ("temperature_c = [18, 24]", "feed_mm_min = 1000", "schedule 'weekly': test check-helix: would move at 6000 mm/min"),
     ('laser = "modbus+tcp://127.0.0.1:9"', "", "schedule 'weekly': this needs a laser for test check-ppp, and the machine file names none"),
     ('cnc = "modbus+tcp://127.0.0.1:9"', "", "schedule 'weekly': this needs a controller for all motion"),
-    ("fixture+tcp://127.0.0.1:9", "fixture+console:", "schedule 'weekly': the fixture is the console, where nobody answers"),
+    ("fixture+tcp://127.0.0.1:9", "fixture+console:", "schedule 'weekly': the fixture is the console, which is unattended"),
     ("[[schedule]]", '[alarm]\ncampaign = "none.toml"\n[[schedule]]\non_alarm = "propose"', "none.toml does not exist"),
     ("[[schedule]]", '[alarm]\ncampaign = "bad.toml"\n[[schedule]]\non_alarm = "propose"', "bad.toml"),
     ("[[schedule]]", '[alarm]\ncampaign = "far.toml"\n[[schedule]]\non_alarm = "propose"', "schedule 'weekly': test far: X would go to"),
