@@ -1,1 +1,1 @@
-"""The narrow way between the two processes of the service: messages with types, and how they travel."""
+"""The channel between the core process and the web process: typed messages and their transport."""

@@ -1,8 +1,8 @@
-"""What core and web say to each other: everything there is. Frozen, checked at both ends, bounded in length.
+"""All messages between core and web process: frozen, validated at both ends, bounded in length.
 
-The core says what is so (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`), the web process asks for what a person wants
-(`StartJob`, `SteerJob`, `DoneByHand`, `RollBack`, `PushNow`). Nothing that it can say names a device, a register or a file, or holds a
-table: the one in force is named by its push and CRC, and which one comes instead says the push journal.
+The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`); the web process forwards what a person
+requests (`StartJob`, `SteerJob`, `DoneByHand`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
+table: a request names the table in force by its push and CRC, and the push journal determines which table replaces it.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from abbe.service.errors import ChannelBroken
 T = TypeVar("T")
 
 PROTOCOL = 1
-"""Both processes are of one installation; a web process that was left behind by an upgrade must not talk to a new core."""
+"""Version of the channel. A web process that survived an upgrade must not talk to the new core."""
 
 LARGEST_B = 256 * 1024
 """The longest message, bytes."""
 MOST_JOBS = 50
 PAGE_MEMORY_MB = 1024
-"""What the page's process gets, by default, MiB."""
+"""Default memory limit of the web process, MiB."""
 
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-How = Literal["stop", "abort", "pause", "resume"]
+Steering = Literal["stop", "abort", "pause", "resume"]
 Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]
 
 
 @dataclass(frozen=True, slots=True)
 class RulesSummary:
-    """What the machine file adds to reports: limits, certificates, allowed temperature."""
+    """Limits, certificates and allowed temperature from the machine file, as reports use them."""
 
     limits_um: dict[str, float]
     calibrated_until: dict[str, date] | None
@@ -49,7 +49,7 @@ class RulesSummary:
 
 @dataclass(frozen=True, slots=True)
 class MachineSummary:
-    """The machine's nominal geometry (run-format.md 1) and its largest feed: what a dry run is calculated from."""
+    """Nominal geometry of the machine (run-format.md 1) and its largest feed: the input of a dry run."""
 
     chain: Word
     stroke_mm: dict[str, tuple[float, float]]
@@ -60,7 +60,7 @@ class MachineSummary:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """First message of the core: all that the web process has to know. Other users could read arguments and environment."""
+    """First message of the core: the configuration of the web process. Other users could read arguments or environment variables."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["begin"]
@@ -85,7 +85,7 @@ class Begin:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """How things stand; at least once a second."""
+    """State of the core, sent at least once a second."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["moment"]
@@ -102,7 +102,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Jobs:
-    """The latest jobs, newest first; whenever one begins, changes its state or ends."""
+    """The latest jobs, newest first; sent whenever a job begins, changes its state or ends."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["jobs"]
@@ -111,7 +111,7 @@ class Jobs:
 
 @dataclass(frozen=True, slots=True)
 class LivePath:
-    """A path is being recorded; number 0: none is any more."""
+    """The path that is being recorded; number 0: none."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["path"]
@@ -120,9 +120,9 @@ class LivePath:
 
 @dataclass(frozen=True, slots=True)
 class LiveSamples:
-    """What a path has read since the last of these, for display only: left out where the reader is slow.
+    """New samples of the path since the last message, for display only; the core drops them while the reader is slow.
 
-    ``first``: number of the first sample, counted from the path's beginning; ``arrived_ms``: when the last one came in, UTC milliseconds;
+    ``first``: number of the first sample, counted from the start of the path; ``arrived_ms``: arrival of the last sample, UTC milliseconds;
     ``values``: deviations in µm as little-endian float32, in base64.
     """
 
@@ -136,7 +136,7 @@ class LiveSamples:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of a request. ``job``: the one that was started or steered."""
+    """Outcome of a request. ``job``: the job that the request started or steered."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["answer"]
@@ -148,7 +148,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Up:
-    """The web process serves."""
+    """The web process accepts connections."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["up"]
@@ -157,7 +157,7 @@ class Up:
 
 @dataclass(frozen=True, slots=True)
 class Alive:
-    """The web process's loop goes round."""
+    """Heartbeat: the event loop of the web process runs."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["alive"]
@@ -165,7 +165,7 @@ class Alive:
 
 @dataclass(frozen=True, slots=True)
 class StartJob:
-    """Somebody wants a declared recipe to be measured now. ``key``: said twice, it starts one job; empty: each request is a new one."""
+    """Start a declared recipe now. ``key``: a repeated key starts no second job; empty: every request starts a new job."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["start"]
@@ -177,19 +177,19 @@ class StartJob:
 
 @dataclass(frozen=True, slots=True)
 class SteerJob:
-    """Somebody wants a running job to stop, pause or go on."""
+    """Stop, abort, pause or resume a running job."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["steer"]
     request: Number
     job: Word
-    how: How
+    how: Steering
     who: Word
 
 
 @dataclass(frozen=True, slots=True)
 class DoneByHand:
-    """Somebody says that what a job asks for is done: prompt number ``prompt``, and no other."""
+    """Confirm that prompt number ``prompt`` of a job, and no other prompt, is done."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["hand"]
@@ -204,10 +204,7 @@ FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | Answer
 
 @dataclass(frozen=True, slots=True)
 class RollBack:
-    """Somebody orders that the table in force, which push ``push`` brought and which has ``crc``, gives way to the one before.
-
-    ``key``: said twice, it is one order.
-    """
+    """Replace the table in force, identified by its push and CRC, by the table before it. ``key``: a repeated key is the same order."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["rollback"]
@@ -221,7 +218,7 @@ class RollBack:
 
 @dataclass(frozen=True, slots=True)
 class PushNow:
-    """Somebody orders that a proposal whose approval holds is pushed now. ``key``: said twice, it is one order."""
+    """Push a proposal with a valid approval now. ``key``: a repeated key is the same order."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["push"]
@@ -231,9 +228,9 @@ class PushNow:
     who: Word
 
 
-Asked = StartJob | SteerJob | DoneByHand | RollBack | PushNow
-"""What is answered with an `Answer`."""
-FromWeb = Up | Alive | Asked
+CoreRequest = StartJob | SteerJob | DoneByHand | RollBack | PushNow
+"""Requests that the core answers with an `Answer`."""
+FromWeb = Up | Alive | CoreRequest
 
 FROM_CORE: TypeAdapter[FromCore] = TypeAdapter(Annotated[FromCore, Field(discriminator="kind")])
 FROM_WEB: TypeAdapter[FromWeb] = TypeAdapter(Annotated[FromWeb, Field(discriminator="kind")])
@@ -245,10 +242,10 @@ def encode(message: FromCore | FromWeb) -> bytes:
     Raises
     ------
     ChannelBroken
-        It is not what its type says, or too long: a defect of the sender.
+        The message does not match its type, or is too long: a defect of the sender.
     """
     if isinstance(message, FromCore):
-        body = FROM_CORE.dump_json(message, warnings=False)  # whatever is wrong with it, the next line says
+        body = FROM_CORE.dump_json(message, warnings=False)  # the next line raises for a wrong message
         from_core(body)
     else:
         body = FROM_WEB.dump_json(message, warnings=False)
@@ -257,24 +254,12 @@ def encode(message: FromCore | FromWeb) -> bytes:
 
 
 def from_core(body: bytes) -> FromCore:
-    """What the core says.
-
-    Raises
-    ------
-    ChannelBroken
-        Not one of its messages.
-    """
+    """Parse a message of the core. Raises ChannelBroken."""
     return _checked(FROM_CORE, body)
 
 
 def from_web(body: bytes) -> FromWeb:
-    """What the web process says.
-
-    Raises
-    ------
-    ChannelBroken
-        Not one of its messages.
-    """
+    """Parse a message of the web process. Raises ChannelBroken."""
     return _checked(FROM_WEB, body)
 
 
@@ -285,5 +270,5 @@ def _checked(adapter: TypeAdapter[T], body: bytes) -> T:
         return adapter.validate_json(body)
     except ValidationError as wrong:
         first = wrong.errors(include_input=False, include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ChannelBroken(f"a message on the channel of the service is not one of ours: {where}: {first['msg']}") from None
+        location = ".".join(str(part) for part in first["loc"])
+        raise ChannelBroken(f"invalid message on the channel of the service: {location}: {first['msg']}") from None

@@ -1,6 +1,6 @@
-"""One end of the channel: four bytes of length, then JSON, over a pair of sockets that was made by the parent and has no address.
+"""One end of the channel: four bytes of length, then JSON, over a socket pair without an address that the parent created.
 
-Nobody but the two processes can ever be at either end: there is no file, no port and no name to connect to.
+No other process can connect to it: there is no file, no port and no name.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from abbe.service.errors import ChannelBroken
 
 _LENGTH = struct.Struct(">I")
 FULL_B = 2 * LARGEST_B
-"""So much may wait for a reader; news that would come on top of it is left out, since newer news follow."""
+"""Bytes that may wait for the reader. Beyond them the sender skips updates, since newer ones follow."""
 
 
 class Wire:
-    """Sends and receives whole messages. Make it with `Wire.over`."""
+    """Sends and receives whole messages; created by `Wire.over`."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer
 
     @classmethod
     async def over(cls, end: socket.socket) -> Self:
-        """One end of a pair of sockets, from now on ours."""
+        """Take over one end of a socket pair."""
         end.setblocking(False)
         return cls(*await asyncio.open_connection(sock=end, limit=LARGEST_B + _LENGTH.size))
 
     @property
     def is_full(self) -> bool:
-        """Whether the other side has not read for so long that news are better left out."""
+        """Whether so much waits for the reader that updates should be skipped."""
         return self._writer.transport.get_write_buffer_size() > FULL_B
 
     def send(self, message: FromCore | FromWeb) -> None:
-        """Send without waiting. What cannot be sent any more is lost: the end of the channel is noticed where it is read.
+        """Send without waiting; a message to a closed channel is lost, and the reading side notices the end.
 
         Raises
         ------
         ChannelBroken
-            The message is not what its type says.
+            The message does not match its type.
         """
         body = encode(message)
         if not self._writer.is_closing():
@@ -53,7 +53,7 @@ class Wire:
         Raises
         ------
         ChannelBroken
-            It announces one that is too long.
+            The announced length is too large.
         """
         try:
             (size,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
@@ -64,5 +64,5 @@ class Wire:
             return None
 
     def close(self) -> None:
-        """End it; the other side reads its end."""
+        """Close this end; the other side reads the end of the stream."""
         self._writer.close()

@@ -21,8 +21,8 @@ from abbe.service.channel.messages import (
     PROTOCOL,
     Alive,
     Answer,
-    Asked,
     Begin,
+    CoreRequest,
     DoneByHand,
     Jobs,
     LivePath,
@@ -284,7 +284,7 @@ class WebProcess:
                 case Alive():
                     pass
 
-    async def _answered(self, message: Asked) -> Answer:
+    async def _answered(self, message: CoreRequest) -> Answer:
         try:
             match message:
                 case StartJob():

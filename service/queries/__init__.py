@@ -1,1 +1,1 @@
-"""The read model: every list and every detail once. Page, HTTP, command line, OPC UA and MTConnect only format what it returns."""
+"""The read model: one query for every list and every detail. Pages, HTTP, command line, OPC UA and MTConnect only format the results."""

@@ -14,16 +14,16 @@ from abbe.service.verification.trend_table import trends as figure_trends
 from abbe.service.verification.verified_by import VerifiedBy, verified_by
 
 CHECKS = 20_000
-"""So many of the latest checks make a trend: more than ten years of four a day."""
-BLANK: Doc = {
+"""Number of latest checks in a trend: more than ten years at four a day."""
+UNSCHEDULED: Doc = {
     "schedule": "", "recipe": "", "duration_s": 0.0, "values": {}, "uncertainties": {}, "limits": {}, "runs": [], "text": "",
 }  # fmt: skip
-"""What a check lacks that no schedule ordered."""
+"""Defaults for a check that no schedule ordered."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trends:
-    """Trends of a machine's figures over its checks with the table in force; ``verified``: which measurement stands behind that table."""
+    """Trends of a machine's figures over its checks with the table in force; ``verified``: the measurement that verified that table."""
 
     machine: str
     figures: Sequence[FigureTrend] = ()
@@ -33,7 +33,7 @@ class Trends:
 def checks(
     reader: Reader, machine: str | None, verdict: str | None, cursor: int | None, limit: int
 ) -> tuple[list[Verification], int | None]:
-    """Checks of all machines, newest first; one that was stored in another form is left out."""
+    """Checks of all machines, newest first, without those stored in another form."""
     rows, after = reader.page("verifications", {"machine": machine, "verdict": verdict}, cursor, limit)
     return [one for row in rows if (one := _check(row)) is not None], after
 
@@ -54,18 +54,13 @@ def latest_checks(reader: Reader, limit: int) -> list[Verification]:
 
 def _check(row: Doc) -> Verification | None:
     known = {"id": row["id"], "verdict": row["verdict"], "machine": row["machine"]}
-    return read_as(Verification, BLANK | {"slot_utc": row["utc"], "started_utc": row["utc"]} | finite(row["doc"]) | known)
+    return read_as(Verification, UNSCHEDULED | {"slot_utc": row["utc"], "started_utc": row["utc"]} | finite(row["doc"]) | known)
 
 
 def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limit: int = CHECKS) -> Trends:
     """Whether the figures of a machine's checks drift, since when, and when they reach their limits.
 
-    Parameters
-    ----------
-    after_utc : datetime, optional
-        Only later checks; None: since the table in force came.
-    limit : int
-        So many of the latest checks are looked at.
+    Uses at most ``limit`` of the checks later than ``after_utc``; None: since the table came into force.
     """
     if not storable(machine):
         return Trends(machine=machine)

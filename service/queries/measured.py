@@ -1,4 +1,4 @@
-"""Machines, campaigns and runs: what was measured."""
+"""Machines, campaigns and runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_RUNNING = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineDescription:
-    """A machine as it was described at some time; another description is another number. None: it was stored in another form."""
+    """One description of a machine; a changed description has a number of its own. ``description`` None: stored in another form."""
 
     number: int
     name: str
@@ -29,7 +29,7 @@ class MachineDescription:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignSummary:
-    """Runs that belong together."""
+    """A campaign: runs that belong together."""
 
     number: int
     name: str
@@ -39,7 +39,7 @@ class CampaignSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSummary(RunFacts):
-    """One measured sequence. ``status`` is as people see it: a run whose process died is incomplete."""
+    """One measured sequence. ``status`` is the visible one: a run whose process died is incomplete."""
 
     number: int
     machine: str
@@ -48,7 +48,7 @@ class RunSummary(RunFacts):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignDetail(CampaignSummary):
-    """A campaign with its runs, in the order of measuring, and the numbers of its solutions and discoveries."""
+    """A campaign with its runs in the order of measurement, and the numbers of its solutions and discoveries."""
 
     runs: list[RunSummary]
     solutions: list[int]
@@ -57,7 +57,7 @@ class CampaignDetail(CampaignSummary):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDetail(RunSummary):
-    """A run with its channels. ``gaps``: stretches of samples that are known to be missing."""
+    """A run with its channels. ``gaps``: number of stretches of missing samples."""
 
     channels: list[ChannelRecord]
     gaps: int
@@ -70,7 +70,7 @@ def machines(reader: Reader, name: str | None, cursor: int | None, limit: int) -
 
 
 def machine(reader: Reader, number: int) -> MachineDescription:
-    """One description. Raises NotStored."""
+    """One description of a machine. Raises NotStored."""
     return _machine(reader.row("machines", number, "machine"))
 
 
@@ -87,41 +87,37 @@ def campaigns(reader: Reader, machine: str | None, cursor: int | None, limit: in
 def campaign(reader: Reader, number: int) -> CampaignDetail:
     """A campaign with its runs. Raises NotStored."""
     row = reader.row("campaigns", number, "campaign")
-    given = {"campaign": row["name"]}
-    runs = [_run(one) for one in reversed(reader.store.pages.page("runs", given, None, MOST_RUNS))]
+    filters = {"campaign": row["name"]}
+    runs = [_run(one) for one in reversed(reader.store.pages.page("runs", filters, None, MOST_RUNS))]
     solutions, discoveries = (
-        [one["id"] for one in reader.store.pages.page(kind, given, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
+        [one["id"] for one in reader.store.pages.page(kind, filters, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
     )
     return of_row(CampaignDetail, row, runs=runs, solutions=solutions, discoveries=discoveries)
 
 
-def runs(reader: Reader, given: Mapping[str, str | None], cursor: int | None, limit: int) -> tuple[list[RunSummary], int | None]:
-    """Runs, newest first, also those that were broken off.
+def runs(reader: Reader, filters: Mapping[str, str | None], cursor: int | None, limit: int) -> tuple[list[RunSummary], int | None]:
+    """Runs, newest first, including those that were broken off.
 
-    Parameters
-    ----------
-    given : mapping
-        ``campaign``, ``machine``, ``test``, ``role``, ``status`` (as written: a run whose process died is ``running`` here); None: any.
-    cursor, limit
-        From where on, and at most how many.
+    ``filters`` has ``campaign``, ``machine``, ``test``, ``role`` and ``status`` (as stored: a run whose process died is ``running``
+    here); None: any.
     """
-    rows, after = reader.page("runs", given, cursor, limit)
+    rows, after = reader.page("runs", filters, cursor, limit)
     return [_run(row) for row in rows], after
 
 
 def runs_by_state(reader: Reader, campaign: str, test: str, state: str, limit: int) -> tuple[list[RunSummary], bool]:
-    """The newest runs whose visible state fits (empty: any), and whether there are more."""
-    given = {"campaign": campaign or None, "test": test or None, "status": state or None}
+    """The newest runs with a visible state (empty: any), and whether there are more."""
+    filters = {"campaign": campaign or None, "test": test or None, "status": state or None}
     if state not in (INCOMPLETE, RUNNING):
-        found, after = runs(reader, given, None, limit)
+        found, after = runs(reader, filters, None, limit)
         return found, after is not None
-    # Both are written as running; which one it is depends on whether its process still lives.
-    fitting = [run for run in runs(reader, given | {"status": RUNNING}, None, MOST_RUNNING)[0] if run.status == state]
+    # The store has both as running; they differ in whether their process still lives.
+    fitting = [run for run in runs(reader, filters | {"status": RUNNING}, None, MOST_RUNNING)[0] if run.status == state]
     return fitting[:limit], len(fitting) > limit
 
 
 def run(reader: Reader, number: int) -> RunDetail:
-    """One run, and which channels it holds. Raises NotStored."""
+    """One run with its channels. Raises NotStored."""
     row = reader.row("runs", number, "run")
     end = reader.store.runs.find(number).end_doc or {}
     state = visible_status(row)
@@ -130,7 +126,7 @@ def run(reader: Reader, number: int) -> RunDetail:
 
 
 def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
-    """Runs (of one campaign), oldest first; a complete run with gaps says how many samples it lacks. Raises NotStored."""
+    """Runs (of one campaign), oldest first; ``reason`` of a complete run with gaps counts the missing samples. Raises NotStored."""
     owners = [store.campaigns.find(campaign)] if campaign is not None else store.campaigns.all()
     names = {one.id: store.machines.get(one.machine_id).name for one in owners}
     found = store.runs.all(owners[0].id if campaign is not None else None)
@@ -138,7 +134,7 @@ def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
 
 
 def run_summary(record: RunRecord, machine: str) -> RunSummary:
-    """A run that was read whole."""
+    """Summary of a complete record."""
     row = {one.name: getattr(record, one.name) for one in fields(record)}
     state = record.visible_status
     return of_row(RunSummary, row, machine=machine, run_id=record.label, status=state, reason=_reason(state, record.reason, record.end_doc))
@@ -150,7 +146,7 @@ def _run(row: Doc) -> RunSummary:
 
 
 def _reason(state: str, reason: str, end: Doc | None) -> str:
-    """Why a run is not complete, or what it lacks although it is."""
+    """Why a run is not complete, or which samples a complete run lacks."""
     if state == INCOMPLETE:
         return "its process ended before the run was closed; the next command that connects to the machine takes over what was saved"
     gaps = (end or {}).get("gaps") or []

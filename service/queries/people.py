@@ -1,4 +1,4 @@
-"""Users, without anything secret, and the audit."""
+"""Users without their secrets, and the audit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from abbe.service.storage.store import Store
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UserSummary:
-    """A user, without anything secret."""
+    """A user without secrets."""
 
     name: str
     role: str

@@ -1,4 +1,4 @@
-"""Proposed tables and where each stands: the same for page, HTTP and command line."""
+"""Proposed tables and the state of each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedRms:
-    """What the model promises, µm: rms over the volume before and after, and the standard uncertainty of the improvement."""
+    """Predicted rms over the volume before and after, and standard uncertainty of the improvement, µm."""
 
     before: float
     after: float
@@ -30,7 +30,7 @@ class PredictedRms:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalSummary(StoredResult):
-    """Proposed tables. ``state`` changed: the row is not what was stored, so nothing else can be said of it. ``by``: account."""
+    """Proposed tables. ``state`` changed: somebody altered the stored row, so its content is unknown. ``by``: account of the proposer."""
 
     solution: int
     state: ProposalState
@@ -41,7 +41,7 @@ class ProposalSummary(StoredResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalDetail(ProposalSummary):
-    """A proposal with everything that is needed to judge it, but for the numbers of the tables (`difference`)."""
+    """A proposal with everything that a decision needs, except the numbers of the tables (`difference`)."""
 
     valid_until: str
     base_crc: str
@@ -56,19 +56,19 @@ class ProposalDetail(ProposalSummary):
 
     @property
     def waits(self) -> bool:
-        """Whether it can still be approved."""
+        """Whether the proposal can still be approved."""
         return self.state in OPEN
 
 
-class _Standings:
-    """Where proposals of one store stand; journals are read once for all of them."""
+class _StatusLookup:
+    """Determines the state of proposals; reads the journal of each machine once."""
 
     def __init__(self, reader: Reader) -> None:
         self._reader = reader
         self._journals: dict[str, JournalView] = {}
 
     def of(self, number: int, proposed: Proposed) -> ProposalStatus:
-        """Where one stands."""
+        """State of one proposal."""
         store, machine = self._reader.store, proposed.candidate.machine
         if machine not in self._journals:
             self._journals[machine] = JournalView.read(store, machine, self._reader.control_of(machine))
@@ -76,48 +76,48 @@ class _Standings:
 
 
 def proposals(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[ProposalSummary], int | None]:
-    """Proposals, newest first. One whose row was changed says so, and does not hide the others."""
+    """Proposals, newest first; one with an altered row has the state ``changed`` and does not hide the others."""
     rows, after = reader.page("proposals", {"machine": machine}, cursor, limit)
-    standings = _Standings(reader) if rows else None
-    return [_summary(reader, row, standings) for row in rows if standings is not None], after
+    statuses = _StatusLookup(reader) if rows else None
+    return [_summary(reader, row, statuses) for row in rows if statuses is not None], after
 
 
-def _summary(reader: Reader, row: Doc, standings: _Standings) -> ProposalSummary:
+def _summary(reader: Reader, row: Doc, statuses: _StatusLookup) -> ProposalSummary:
     try:
         with as_stored():
             proposed = load(reader.store, row["id"])
-            now = standings.of(row["id"], proposed)
+            status = statuses.of(row["id"], proposed)
     except (Unusable, NotStored) as error:
         return of_row(ProposalSummary, row, campaign="", solution=row["solution_id"], state="changed", why=error.detail)
-    return of_row(ProposalSummary, row, **_known(row, proposed, now))
+    return of_row(ProposalSummary, row, **_known(row, proposed, status))
 
 
-def _known(row: Doc, proposed: Proposed, now: ProposalStatus) -> Doc:
+def _known(row: Doc, proposed: Proposed, status: ProposalStatus) -> Doc:
     p = proposed.predicted
     predicted = PredictedRms(before=p.before_mm * 1e3, after=p.after_mm * 1e3, u_model=p.u_model_mm * 1e3)
     known = {"solution": row["solution_id"], "campaign": proposed.campaign, "by": proposed.by, "predicted_rms_um": predicted}
-    return known | {"state": now.word, "why": now.text}
+    return known | {"state": status.word, "why": status.text}
 
 
 def proposal(reader: Reader, number: int) -> ProposalDetail:
-    """One proposal: what it promises with its uncertainty, where it stands, the reasons against it.
+    """One proposal: predicted improvement with uncertainty, state, and the reasons against it.
 
     Raises
     ------
     NotStored
-        There is none.
+        There is no such proposal.
     Unusable
-        Its row was changed after it was stored.
+        The stored row was altered.
     """
     row, store = reader.row("proposals", number, "proposal"), reader.store
     with as_stored():
         proposed = load(store, number)
-        now = _Standings(reader).of(number, proposed)
+        status = _StatusLookup(reader).of(number, proposed)
     c = proposed.candidate
     return of_row(
         ProposalDetail,
         row,
-        **_known(row, proposed, now),
+        **_known(row, proposed, status),
         valid_until=utc_text(datetime.fromtimestamp(proposed.valid_until_s, UTC)),
         base_crc=f"{c.base_crc:08X}",
         generation=proposed.base.gen,
@@ -148,7 +148,7 @@ class CurveDifference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalDifference:
-    """What a proposal changes, in numbers; ``new``, ``old``: what is compared."""
+    """Changes of a proposal in numbers; ``new``, ``old``: names of the compared tables."""
 
     new: str
     old: str
@@ -156,13 +156,7 @@ class ProposalDifference:
 
 
 def difference(reader: Reader, number: int, other: int | None = None) -> ProposalDifference:
-    """What a proposal changes: nine tables in numbers, with uncertainty; ``other``: another proposal, None: the table in force.
-
-    Raises
-    ------
-    NotStored
-        There is no such proposal.
-    """
+    """Changes of a proposal against another one, or against the table in force: nine tables with uncertainty. Raises NotStored."""
     for one in (number, other or number):
         reader.row("proposals", one, "proposal")
     with as_stored():
@@ -170,7 +164,7 @@ def difference(reader: Reader, number: int, other: int | None = None) -> Proposa
 
 
 def difference_of(found: TableDifference) -> ProposalDifference:
-    """Tables that were compared, as numbers for programs."""
+    """A comparison of tables as numbers for programs."""
     tables = [
         CurveDifference(
             table=f"{c.corrected} over {c.moved}",

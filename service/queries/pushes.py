@@ -1,4 +1,4 @@
-"""The journal of pushes, and with it which table is in force and how it came there."""
+"""The push journal, and the table in force with its history."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from abbe.service.tables.push_journal import JournalView, TableHistory
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushEntry(PushTransition):
-    """One transition of one push in the journal of a machine, chained to the one before it."""
+    """One transition of a push in the journal of a machine, chained to the entry before it."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushEntryDetail(PushEntry):
-    """An entry with everything that became known with it; tables are hexadecimal images."""
+    """An entry with the facts that it recorded; tables are hexadecimal images."""
 
     known: dict[str, Any]
 
@@ -27,18 +27,18 @@ class PushEntryDetail(PushEntry):
 def push_entries(
     reader: Reader, machine: str | None, push: int | None, state: str | None, cursor: int | None, limit: int
 ) -> tuple[list[PushEntry], int | None]:
-    """The journal of pushes, newest entry first; of a machine that was renamed under the name that its journal was begun with."""
+    """The push journal, newest entry first; a renamed machine keeps its journal under the first name."""
     journal = machine and reader.store.pushes.chain(machine, reader.control_of(machine))
     rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
     return [of_row(PushEntry, row) for row in rows], after
 
 
 def push_entry(reader: Reader, number: int) -> PushEntryDetail:
-    """One entry of the journal, with everything that became known with it. Raises NotStored."""
+    """One entry of the journal with the facts that it recorded. Raises NotStored."""
     row = reader.row("pushes", number, "entry of a push")
     return of_row(PushEntryDetail, row, known=row["doc"])
 
 
 def tables(reader: Reader) -> TableHistory:
-    """The table in force on this service's machine, its pushes, and what can be ordered back. Raises JournalChanged."""
+    """The table in force on this service's machine, its pushes, and the possible rollback. Raises JournalChanged."""
     return JournalView.read(reader.store, reader.machine, reader.control).history()

@@ -1,4 +1,4 @@
-"""What every query reads from, how it pages, and how documents from the store become records."""
+"""The source of every query: paging, and conversion of stored documents into records."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ log = structlog.get_logger("abbe.queries")
 T = TypeVar("T")
 Doc = dict[str, Any]
 MOST = 200
-"""Rows of a page, unless a query says otherwise."""
+"""Default number of rows in a page."""
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A store, and whose service reads it.
+    """Reads a store for one service.
 
     Parameters
     ----------
     store : Store
-        Everything that is kept; it may know other machines.
+        The database; it may contain other machines.
     machine : str
         The machine of this service; empty for a command that only has a database.
     clock : Clock
-        Now.
+        Clock of the service.
     control : str
         Identity of the machine's control (`control_of`); empty: not known.
     """
@@ -53,24 +53,18 @@ class Reader:
         return self.clock.utc().timestamp()
 
     def control_of(self, machine: str) -> str:
-        """Identity of a machine's control, where it is the one of this service; else empty."""
+        """Identity of a machine's control; empty for machines of other services."""
         return self.control if machine == self.machine else ""
 
-    def page(self, kind: str, given: Mapping[str, object], cursor: int | None = None, limit: int = MOST) -> tuple[list[Doc], int | None]:
-        """Rows of a page, newest first, and the cursor of the next one; None: there is none."""
-        if any(isinstance(value, str) and not storable(value) for value in given.values()):
+    def page(self, kind: str, filters: Mapping[str, object], cursor: int | None = None, limit: int = MOST) -> tuple[list[Doc], int | None]:
+        """Rows of a page, newest first, and the cursor of the next page; None: this is the last page."""
+        if any(isinstance(value, str) and not storable(value) for value in filters.values()):
             return [], None
-        rows = self.store.pages.page(kind, given, cursor, limit + 1)
+        rows = self.store.pages.page(kind, filters, cursor, limit + 1)
         return rows[:limit], rows[limit - 1]["id"] if len(rows) > limit else None
 
     def row(self, kind: str, number: int, what: str) -> Doc:
-        """One row with its document.
-
-        Raises
-        ------
-        NotStored
-            There is none.
-        """
+        """One row with its document; ``what`` names the thing in the error. Raises NotStored."""
         found = self.store.pages.row(kind, number)
         if found is None:
             raise NotStored(f"there is no {what} {number}")
@@ -79,7 +73,7 @@ class Reader:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredResult:
-    """What every result of a campaign has in its list. ``number``: by which it is asked for."""
+    """Fields that every list of results has. ``number``: identifies the result in requests."""
 
     number: int
     campaign: str
@@ -88,20 +82,20 @@ class StoredResult:
 
 
 def of_row(kind: type[T], row: Mapping[str, Any], **known: Any) -> T:
-    """A row of the store as a record: every field has the name of its column, ``number`` that of ``id``; ``known`` comes first."""
+    """A row of the store as a record: fields have the names of columns, ``number`` is ``id``; ``known`` overrides the row."""
     values = {"number": row["id"], **row, **known}
     return kind(**{one.name: values[one.name] for one in fields(kind) if one.name in values})  # type: ignore[arg-type]
 
 
 def json_value(value: object) -> Any:
-    """A record as a JSON value: what HTTP and ``--json`` write."""
+    """A record as the JSON value that HTTP and ``--json`` write."""
     return _ADAPTERS(type(value)).dump_python(value, mode="json")
 
 
 def read_as(kind: type[T], doc: object) -> T | None:
-    """A stored document as a record; None: it is of another form."""
+    """A stored document as a record; None: it has another form."""
     try:
-        found: T = _ADAPTERS(kind).validate_json(json.dumps(finite(doc)))  # by way of JSON: there strict models take lists for tuples
+        found: T = _ADAPTERS(kind).validate_json(json.dumps(finite(doc)))  # via JSON, where strict models accept lists for tuples
     except ValidationError:
         return None
     return found
@@ -111,7 +105,7 @@ _ADAPTERS: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
 
 
 def storable(text: str) -> bool:
-    """Whether a database can hold a text at all: NUL and halves of characters cannot be stored, so nothing has such a name."""
+    """Whether a database can store a text: it cannot store NUL or lone surrogates."""
     return "\0" not in text and not any("\ud800" <= c <= "\udfff" for c in text)
 
 
@@ -122,7 +116,7 @@ def as_stored() -> Iterator[None]:
     Raises
     ------
     NotStored
-        Something that is asked for, or that the data name, is not there.
+        The store lacks a requested or referenced object.
     Unusable
         The data cannot be used.
     """
@@ -135,15 +129,15 @@ def as_stored() -> Iterator[None]:
             raise
         raise Unusable(error.detail, error.remedy) from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        # Documents are whatever somebody has imported or an older version has written. A defect of ours would look the same: it is logged.
+        # Documents may be imported or written by an older version. A defect of this program would look the same, hence the log.
         at = traceback.extract_tb(error.__traceback__)[-1]
         log.warning("stored data cannot be used", error=repr(error)[:200], where=f"{at.filename}:{at.lineno}")
         what = f"{type(error).__name__}: {error}"[:200]
-        raise Unusable(f"what is stored lacks or garbles something ({what})", "the service's log says where") from error
+        raise Unusable(f"stored data are incomplete or malformed ({what})", "see the service's log") from error
 
 
 def finite(value: Any) -> Any:
-    """JSON knows no NaN: what is no number becomes null."""
+    """A value for JSON, which has no NaN: non-finite numbers become null."""
     if isinstance(value, dict):
         return {key: finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):

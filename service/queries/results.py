@@ -1,4 +1,4 @@
-"""Solutions, discoveries, and the map of a solution's volume: what was found from runs."""
+"""Solutions, discoveries, and the volume map of a solution."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from abbe.service.queries.reader import Reader, StoredResult, as_stored, of_row,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolutionSummary(StoredResult):
-    """What a solver found from some runs."""
+    """A solution and the runs that it was computed from."""
 
     kind: str
     runs: list[int]
@@ -26,14 +26,14 @@ class SolutionSummary(StoredResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolutionDetail(SolutionSummary):
-    """A solution with every parameter, its standard uncertainty, and what was not observable from the runs (``not_observable``)."""
+    """A solution with every parameter, its standard uncertainty, and what the runs could not show (``not_observable``)."""
 
     document: SolutionFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoverySummary(StoredResult):
-    """One search for what a campaign's model lacks. ``state``, ``why``: the last state that it reached; empty: none yet."""
+    """A search for effects that a campaign's model lacks. ``state``, ``why``: the latest state; empty: none yet."""
 
     state: str
     why: str
@@ -41,7 +41,7 @@ class DiscoverySummary(StoredResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoveryState:
-    """One state that a search reached."""
+    """A state that a search reached."""
 
     state: str
     utc: str
@@ -50,7 +50,7 @@ class DiscoveryState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoveryDetail(DiscoverySummary):
-    """A search with its states and, once it has one, its answer; ``changed`` where an earlier solution could be compared."""
+    """A search with its states and its answer, if any; ``changed``: comparison with an earlier solution, if there was one."""
 
     states: list[DiscoveryState]
     answer: DiscoveryFile | None
@@ -59,7 +59,7 @@ class DiscoveryDetail(DiscoverySummary):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HiddenMotion:
-    """A motion that the runs do not show by itself, and why."""
+    """A motion that the runs cannot show separately, and the reason."""
 
     motion: str
     reason: str
@@ -69,9 +69,9 @@ class HiddenMotion:
 class VolumeMap:
     """Deviation (actual minus nominal, best-fit rigid motion removed) at the nodes of an even grid over the strokes, X slowest.
 
-    Nodes lie at every crossing of ``x_mm``, ``y_mm``, ``z_mm``. ``motions``: what the map is made of. ``deviation_um``: dX, dY, dZ;
-    ``expanded_um``: their U and that of the length, k = 2. ``told``: whether the 95 % ellipsoid about the deviation leaves out zero; where
-    it does not, neither error nor direction is known. ``hidden``: motions that have no map of their own.
+    Nodes lie at every combination of ``x_mm``, ``y_mm``, ``z_mm``. ``motions``: the motions that make up the map. ``deviation_um``: dX, dY,
+    dZ; ``expanded_um``: their U and that of the length, k = 2. ``told``: whether the 95 % ellipsoid around the deviation excludes zero;
+    otherwise neither error nor direction is known. ``hidden``: motions without a map of their own.
     """
 
     solution: int
@@ -96,12 +96,12 @@ def solutions(
 
 
 def solution(reader: Reader, number: int) -> SolutionDetail:
-    """A solution: parameters with uncertainties, what was not observable, residuals, budget.
+    """A solution: parameters with uncertainties, unobservable quantities, residuals, budget.
 
     Raises
     ------
     NotStored
-        There is none.
+        There is no such solution.
     Unusable
         It was stored in another form.
     """
@@ -113,16 +113,9 @@ def solution(reader: Reader, number: int) -> SolutionDetail:
 
 
 def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) -> VolumeMap:
-    """The map of the volume; a thousandth of a micrometre is far below every U.
+    """The volume map of a solution, rounded to 0.001 µm, which is far below every U.
 
-    Parameters
-    ----------
-    number : int
-        Of the solution.
-    motions : sequence of str
-        Only what these make together; none: all of them.
-    nodes : int
-        So many per axis.
+    ``motions``: the map shows their joint effect, none: that of all; ``nodes``: per axis.
     """
     reader.row("solutions", number, "solution")
     with as_stored():
@@ -153,7 +146,7 @@ def discoveries(
 
 
 def discovery(reader: Reader, number: int) -> DiscoveryDetail:
-    """A search: its states, and what it found. Raises NotStored."""
+    """A search with its states and its answer. Raises NotStored."""
     row = reader.row("discoveries", number, "discovery")
     states = _states(reader.store.discoveries.steps(number))
     found = next((step.finding for step in stored_steps(reader.store, number) if step.finding is not None), None)

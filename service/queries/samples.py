@@ -1,4 +1,4 @@
-"""Stretches of a run's samples and evaluated columns: only the chunks that are asked for are read and unpacked."""
+"""Stretches of a run's samples and evaluated columns; a query reads only the chunks that it needs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SampleStretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Samples(SampleStretch):
-    """A stretch of one channel as it arrived: ball-bar samples in columns, or records of another device."""
+    """A stretch of one channel as it arrived: ball-bar samples by column, or records of another device."""
 
     channel: str
     bar: BarSamples | None = None
@@ -47,7 +47,7 @@ class Samples(SampleStretch):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunColumns(SampleStretch):
-    """A stretch of the evaluated columns of a run (``abbe-run/1``): every reading with its place. null: the column is sealed."""
+    """A stretch of the evaluated columns of a run (``abbe-run/1``): every reading with its position. null: the column is sealed."""
 
     columns: dict[str, list[float | None] | None]
 
@@ -58,7 +58,7 @@ def samples(reader: Reader, run: int, channel: str, first: int, limit: int) -> S
     Raises
     ------
     NotStored
-        There is no such run, or it has no such channel; what was imported has only columns.
+        There is no such run or channel; imported runs have only columns.
     """
     reader.row("runs", run, "run")
     with as_stored():
@@ -68,13 +68,13 @@ def samples(reader: Reader, run: int, channel: str, first: int, limit: int) -> S
             taken = [sample for chunk in found for sample in decode_bar(chunk.payload)][at]
             return Samples(run=run, channel=channel, first=first, count=len(taken), total=total, bar=_columns(taken))
         if not codecs <= {JSON_CODEC}:
-            raise StoreError(f"run {run}, channel {channel!r}: packed in another way ({', '.join(sorted(codecs))})", "use a newer Abbe")
+            raise StoreError(f"run {run}, channel {channel!r}: unknown codec ({', '.join(sorted(codecs))})", "use a newer Abbe")
         records = [finite(one) for chunk in found for one in decode_json(chunk.payload)][at]
     return Samples(run=run, channel=channel, first=first, count=len(records), total=total, records=records)
 
 
 def packed_samples(reader: Reader, run: int, first: int, limit: int) -> tuple[bytes, int]:
-    """The same of the ball-bar, packed (18 bytes a sample), and how many samples there are in all."""
+    """A stretch of ball-bar samples, packed (18 bytes a sample), and the total number of samples."""
     reader.row("runs", run, "run")
     with as_stored():
         found, at, total = _chunks(reader.store, run, "bar", first, limit)
@@ -90,7 +90,7 @@ def columns(reader: Reader, run: int, first: int, limit: int) -> RunColumns:
     NotStored
         There is no such run.
     Unusable, MeasurementFault
-        The run is not complete enough to be evaluated.
+        The run is not complete enough for an evaluation.
     """
     reader.row("runs", run, "run")
     with as_stored():
@@ -110,7 +110,7 @@ def _columns(taken: list[BarSample]) -> BarSamples:
 
 
 def _chunks(store: Store, run: int, channel: str, first: int, limit: int) -> tuple[list[ChunkRecord], slice, int]:
-    """Chunks that hold a stretch, where the stretch lies in them, and how many samples the channel has."""
+    """Chunks that contain a stretch, its slice of their samples, and the number of samples in the channel."""
     sizes = store.chunks.sizes(run, channel) if storable(channel) and channel != IMPORTED_CHANNEL else []
     if not sizes:
         raise NotStored(

@@ -1,4 +1,4 @@
-"""How things stand at this moment: what the core says, what is due, and what the store has of it."""
+"""The current status: state of the core, due slots, and the latest stored results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LATEST = 10
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BrokerStatus:
-    """The way to the broker. ``waiting``, ``dropped``: messages."""
+    """Connection to the MQTT broker. ``waiting``, ``dropped``: numbers of messages."""
 
     configured: bool
     broker: str = ""
@@ -37,7 +37,7 @@ class BrokerStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenAlarm:
-    """An alarm that is active, or not acknowledged. ``signals``: figures behind it; ``outcome``: what was done so far."""
+    """An alarm that is active or not acknowledged. ``signals``: figures that raised it; ``outcome``: actions so far."""
 
     alarm: int
     state: Literal["raised", "acknowledged", "cleared"]
@@ -54,7 +54,7 @@ class OpenAlarm:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Activity:
-    """What the core says: the check that runs, the devices, and what needs a person now."""
+    """State of the core: the running check, the devices, and what needs a person now."""
 
     job: RunningCheck | None
     devices: list[DeviceStatus]
@@ -63,7 +63,7 @@ class Activity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveEvent(Activity):
-    """One event of ``/api/v1/live``. ``revision`` grows when more than the progress of a check has changed."""
+    """One event of ``/api/v1/live``. ``revision`` grows when anything but the progress of a check changes."""
 
     event: Literal["moment"] = "moment"
     revision: int
@@ -72,8 +72,8 @@ class LiveEvent(Activity):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status(Activity):
-    """Everything the home page shows. ``revision`` changes when more than the progress of a running check has changed; ``last``: checks,
-    newest first; ``verified``: which measurement stands behind the table in force."""
+    """Content of the home page. ``revision`` changes when anything but the progress of a check changes; ``last``: checks, newest first;
+    ``verified``: the measurement that verified the table in force."""
 
     machine: str
     version: str
@@ -90,31 +90,31 @@ _ALARM = TypeAdapter(OpenAlarm)
 
 
 class CoreState(Protocol):
-    """What the core knows now. Every property raises CoreSilent while the core does not answer."""
+    """Current state of the core. Every property raises CoreSilent while the core does not answer."""
 
     @property
     def devices(self) -> list[DeviceStatus]:
-        """The devices, and when they were last heard of."""
+        """The devices and the time of their last answer."""
         ...
 
     @property
     def job(self) -> RunningCheck | None:
-        """The check that runs."""
+        """The running check."""
         ...
 
     @property
     def changes(self) -> int:
-        """Grows when more than the progress of a check has changed."""
+        """Counter that grows when anything but the progress of a check changes."""
         ...
 
     @property
     def mqtt_connected(self) -> bool:
-        """Whether the broker is there."""
+        """Whether the broker is connected."""
         ...
 
     @property
     def mqtt_dropped(self) -> int:
-        """Alarms that were dropped because too many waited for the broker."""
+        """Number of alarms that were dropped because too many waited for the broker."""
         ...
 
     @property
@@ -124,36 +124,25 @@ class CoreState(Protocol):
 
 
 class StatusSource(Protocol):
-    """Where the pages get the status from."""
+    """Source of the status for the pages."""
 
     async def status(self) -> Status:
-        """Return everything the home page shows."""
+        """Content of the home page."""
         ...
 
     async def verifications(self, limit: int) -> list[Verification]:
-        """Return the latest checks, newest first."""
+        """The latest checks, newest first."""
         ...
 
     async def ready(self) -> None:
-        """Return if a check could be kept and shown now; raise what is wrong."""
+        """Return if the service can store and show a check now; otherwise raise the reason."""
         ...
 
 
 class StatusReader:
-    """Puts the status together; never writes.
+    """Assembles the status; never writes.
 
-    Parameters
-    ----------
-    reader : Reader
-        The store, the machine and the clock.
-    version : str
-        Version of this program.
-    core : CoreState
-        What the core says.
-    upcoming : callable
-        What comes next of each schedule, soonest first.
-    broker : str
-        Address of the broker as shown to people; empty if there is none in the machine file.
+    ``upcoming`` returns the next slot of each schedule, soonest first; ``broker``: address for people, empty without a broker.
     """
 
     def __init__(
@@ -162,31 +151,31 @@ class StatusReader:
         self.reader, self._version, self._core, self._upcoming, self._broker = reader, version, core, upcoming, broker
 
     async def verifications(self, limit: int) -> list[Verification]:
-        """Return the latest checks, newest first."""
+        """The latest checks, newest first."""
         return await asyncio.to_thread(latest_checks, self.reader, limit)
 
     async def ready(self) -> None:
-        """Return if the store can be read and the core has said lately how things stand; else raise what is wrong."""
+        """Return if the store is readable and the core has answered recently; otherwise raise the reason."""
         await self.verifications(1)
         _ = self._core.changes
 
     async def status(self) -> Status:
-        """Return everything the home page shows."""
+        """Content of the home page."""
         reader, core, upcoming = self.reader, self._core, self._upcoming()
         now, machine = reader.clock.utc(), reader.machine
         job, attention = core.job, core.attention
         entries = await asyncio.to_thread(reader.store.alarms.entries, machine)
-        # A slot that was skipped leaves no check and may leave no alarm: without it an open page would go on as if it had not been due.
+        # A skipped slot leaves no check and perhaps no alarm: the revision has to contain the slot, or an open page would not notice it.
         slot = await asyncio.to_thread(reader.store.slots.newest, [f"{machine}/{schedule.name}" for schedule, _ in upcoming])
         strange = strange_table(attention)
         known = await asyncio.to_thread(verified_by, reader.store, machine, control=reader.control, strange=strange)
         last = await self.verifications(LATEST)
-        asked = 0 if job is None else job.prompt
+        prompt = 0 if job is None else job.prompt
         return Status(
             machine=machine,
             version=self._version,
             now_utc=now,
-            revision=f"{last[0].id if last else 0}.{core.changes}.{len(entries)}.{asked}.{known.why}{known.number}.{slot}",
+            revision=f"{last[0].id if last else 0}.{core.changes}.{len(entries)}.{prompt}.{known.why}{known.number}.{slot}",
             job=job,
             devices=core.devices,
             attention=attention,

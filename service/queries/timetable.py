@@ -1,4 +1,4 @@
-"""The timetable: what is due next, in words, and what became of past slots."""
+"""The timetable: next due slots as text, and the outcome of past slots."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LATEST = 10
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NextDue:
-    """What comes next of one schedule; ``cron_words`` and ``words``: its rule and when that is, in English."""
+    """Next slot of a schedule; ``cron_words``, ``words``: its rule and the due time in English."""
 
     schedule: str
     recipe: str
@@ -28,7 +28,7 @@ class NextDue:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduleState(Schedule):
-    """One line of the timetable. ``next_due_utc`` None: its expression never matches again; ``latest``: slots, newest first."""
+    """One line of the timetable. ``next_due_utc`` None: the expression never matches again; ``latest``: slots, newest first."""
 
     in_words: str
     next_due_utc: datetime | None
@@ -36,7 +36,7 @@ class ScheduleState(Schedule):
 
 
 def next_due(schedule: Schedule, slot_utc: datetime, now: datetime) -> NextDue:
-    """A slot that comes, as people read it."""
+    """A future slot with its texts for people."""
     return NextDue(
         schedule=schedule.name,
         recipe=schedule.recipe,
@@ -48,7 +48,7 @@ def next_due(schedule: Schedule, slot_utc: datetime, now: datetime) -> NextDue:
 
 
 def schedule_state(reader: Reader, schedule: Schedule) -> ScheduleState:
-    """A schedule with what is due next, and what became of its latest slots."""
+    """A schedule with its next slot and the outcome of its latest slots."""
     return ScheduleState(
         **{name: getattr(schedule, name) for name in Schedule.__dataclass_fields__},
         in_words=cron_in_words(schedule),
@@ -62,17 +62,17 @@ def past_slots(reader: Reader, schedule: str, limit: int) -> list[SlotRecord]:
     return reader.store.slots.latest(f"{reader.machine}/{schedule}", limit)
 
 
-def due_in_words(moment: datetime, now: datetime, zone: tzinfo) -> str:
-    """When something is due: ``Monday 23 November 06:00, in 2 days``."""
-    left_s = (moment - now).total_seconds()
-    local = moment.astimezone(zone)
+def due_in_words(due: datetime, now: datetime, zone: tzinfo) -> str:
+    """A due time as text: ``Monday 23 November 06:00, in 2 days``."""
+    left_s = (due - now).total_seconds()
+    local = due.astimezone(zone)
     clock = f"{local:%H:%M}" if local.second == 0 else f"{local:%H:%M:%S}"
     day = "today" if local.date() == now.astimezone(zone).date() else f"{local:%A} {local.day} {local:%B}"
     return f"{day} {clock}, in {span(left_s)}" if left_s > 0 else f"{day} {clock}, now"
 
 
 def span(seconds: float) -> str:
-    """A length of time in the largest sensible unit: ``40 s``, ``5 min``, ``3 h``, ``2 days``."""
+    """A duration in the largest sensible unit: ``40 s``, ``5 min``, ``3 h``, ``2 days``."""
     seconds = abs(seconds)
     if seconds < 90:
         return f"{seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""The web application: one page, its JSON, two questions for supervisors, and the way in. It shows; what changes something is guarded."""
+"""The web application: pages, HTTP interface, health checks and login behind the middleware."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from abbe.service.web.api.table_orders import add_table_orders
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.core_link.core_unavailable import add_core_unavailable
 from abbe.service.web.document import SecurityHeaders, complete
-from abbe.service.web.frame import Framed
+from abbe.service.web.frame import FrameMiddleware
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
 from abbe.service.web.login.access import PUBLIC, needs
@@ -51,24 +51,10 @@ PAGE_ROWS = 60
 
 @dataclass(frozen=True)
 class Parts:
-    """What there is besides a page where there is a core: jobs, live events, metrics.
+    """Sources of the routes that need a core: jobs, live events, metrics.
 
-    Parameters
-    ----------
-    core : CoreLine
-        The core.
-    store : Store
-        What is counted.
-    machine : str
-        Name of the machine.
-    recipes : tuple of str
-        What can be started.
-    plans : Rehearsals
-        What can be run dry before.
-    campaigns : tuple of str
-        Those of the recipes that end with a proposal.
-    control : str
-        Identity of the machine's control; empty: not known.
+    ``recipes`` can be started, ``plans`` run dry; ``campaigns``: recipes that end with a proposal; ``control``: identity of the machine's
+    control, empty if unknown.
     """
 
     core: CoreLine
@@ -81,7 +67,7 @@ class Parts:
 
 
 def as_in_host_header(host: str) -> str:
-    """A name or address as browsers write it behind ``Host:``: IPv6 in brackets, in its shortest form."""
+    """A name or address as in the header ``Host``: IPv6 in brackets, in its shortest form."""
     try:
         address = ipaddress.ip_address(host.removeprefix("[").removesuffix("]"))
     except ValueError:
@@ -90,16 +76,16 @@ def as_in_host_header(host: str) -> str:
 
 
 class Application(FastAPI):
-    """FastAPI with our headers outside of everything: also the answer to a defect has them."""
+    """FastAPI with the security headers outermost, so that every response has them, even after a defect."""
 
     behind_tls = False
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Return what answers."""
+        """The middleware stack inside the security headers."""
         return SecurityHeaders(super().build_middleware_stack(), behind_tls=self.behind_tls)
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document, with what stands in front of all routes."""
+        """The OpenAPI document with the answers of the middleware."""
         return complete(super().openapi(), self.routes)
 
 
@@ -113,26 +99,26 @@ def create_app(
     parts: Parts | None = None,
     api: Sources | None = None,
 ) -> FastAPI:
-    """Return the application.
+    """Build the application.
 
     Parameters
     ----------
     source : StatusSource
-        Where the answers come from.
+        Source of the status.
     version : str
-        Of this program, for the OpenAPI document.
+        Version of this program, for the OpenAPI document.
     hosts : sequence of str
-        Names under which the page may be asked for: a foreign page must not reach it through a name of its own (DNS rebinding).
+        Allowed host names: a foreign page must not reach the service through a name of its own (DNS rebinding).
     auth : Authenticator, optional
         Users and audit; without it every visitor may look and none may change anything.
     plant : FactsSource, optional
-        What MTConnect documents tell; without it what the status says.
+        Facts for MTConnect; default: the status.
     parts : Parts, optional
-        The core, for jobs, live events and metrics.
+        Sources of jobs, live events and metrics.
     api : Sources, optional
-        What the interface `/api/v1` reads; without it there is only what the page needs.
+        Sources of the interface `/api/v1`; without it only the routes of the home page exist.
     """
-    # FastAPI's own /docs loads its scripts from a CDN; plants have none.
+    # FastAPI's /docs loads scripts from a CDN, which plants cannot reach.
     app = Application(title="Abbe", version=version, docs_url=None, redoc_url=None, openapi_url=None)
     app.behind_tls = auth is not None and auth.behind_tls
     problems.install(app)
@@ -143,7 +129,7 @@ def create_app(
         add_api(app, api)
     if auth is not None:
         add_login(app, environment(), auth)
-        context = _desk(source, auth, api)
+        context = _page_context(source, auth, api)
         add_pages(app, context)
         add_live_page(app, context, parts.core.jobs if parts is not None else tuple)
         add_new_page(app, context, parts.plans if parts is not None else Rehearsals())
@@ -156,13 +142,13 @@ def create_app(
         add_live(app, parts.core)
         add_metrics(app, parts.store, parts.core, parts.machine, parts.control)
     app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
-    app.add_middleware(Framed, routes=app.router.routes, behind_tls=app.behind_tls)  # inside of the guard: it knows who asks
+    app.add_middleware(FrameMiddleware, routes=app.router.routes, behind_tls=app.behind_tls)  # inside AuthMiddleware
     app.add_middleware(AuthMiddleware, routes=app.router.routes, auth=auth)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[as_in_host_header(host) for host in hosts])
     return app
 
 
-def _desk(source: StatusSource, auth: Authenticator, api: Sources | None) -> PageContext:
+def _page_context(source: StatusSource, auth: Authenticator, api: Sources | None) -> PageContext:
     if api is None:
         return PageContext(environment(), auth, source, Reader(auth.store, "", SystemClock()))
     return PageContext(environment(), auth, source, api.reader, api.rules)
@@ -170,7 +156,7 @@ def _desk(source: StatusSource, auth: Authenticator, api: Sources | None) -> Pag
 
 def _add_routes(app: FastAPI, source: StatusSource) -> None:
     env = environment()
-    trouble: dict[int | str, dict[str, object]] = {503: {"model": Problem, "description": "The store or the core does not answer"}}
+    unavailable: dict[int | str, dict[str, object]] = {503: {"model": Problem, "description": "The store or the core does not answer"}}
 
     @app.get("/", response_class=HTMLResponse, include_in_schema=False)
     @needs(Permission.READ)
@@ -187,13 +173,13 @@ def _add_routes(app: FastAPI, source: StatusSource) -> None:
     async def icon() -> Response:
         return Response(ICON, media_type="image/svg+xml")
 
-    @app.get("/api/v1/status", responses=trouble)
+    @app.get("/api/v1/status", responses=unavailable)
     @needs(Permission.READ)
     async def status() -> Status:
         """Devices, running check, next due, broker, last results."""
         return await source.status()
 
-    @app.get("/api/v1/verifications", responses=trouble)
+    @app.get("/api/v1/verifications", responses=unavailable)
     @needs(Permission.READ)
     async def verifications(limit: Annotated[int, Query(ge=1, le=1000)] = 100) -> LatestChecks:
         """Checks of this machine, newest first."""
@@ -202,12 +188,12 @@ def _add_routes(app: FastAPI, source: StatusSource) -> None:
     @app.get("/healthz")
     @needs(PUBLIC)
     async def healthz() -> Health:
-        """Answer if the process works at all."""
+        """The process runs."""
         return Health()
 
-    @app.get("/readyz", responses=trouble)
+    @app.get("/readyz", responses=unavailable)
     @needs(PUBLIC)
     async def readyz() -> Health:
-        """Answer if the store can be read, without which no check can be kept, and the core answers."""
+        """The store is readable and the core answers."""
         await source.ready()
         return Health()

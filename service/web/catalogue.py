@@ -1,4 +1,4 @@
-"""Every code that an error can have, from one place: the classes that carry them, and the answers of the network that have no class.
+"""The catalogue of error codes: those of the error classes, and those of HTTP statuses without a class.
 
 ``python -m abbe.service.web.catalogue`` prints the page docs/reference/error-codes.md; a test compares the two.
 """
@@ -16,24 +16,24 @@ from abbe.service.errors import AbbeError
 
 DEFECT = "ABB-001"
 HTTP: dict[int, tuple[str, str]] = {
-    400: ("WEB-400", "The request cannot be read: no JSON, a header that is missing or foreign, a Host that is not ours."),
-    401: ("WEB-401", "Nobody is logged in, or the token does not hold any more."),
-    403: ("WEB-403", "The role does not allow it, or the request comes from a page that is not ours."),
-    404: ("WEB-404", "There is no such path, or nothing can have this number."),
-    405: ("WEB-405", "The path is there, by another method; the header Allow says which."),
-    409: ("WEB-409", "It contradicts what is stored."),
-    413: ("WEB-413", "The request is longer than anything that is expected there."),
-    422: ("WEB-422", "A parameter or a field is not what the OpenAPI document demands; the detail names it."),
-    429: ("WEB-429", "Too many requests from this address. The header Retry-After says when to try again."),
+    400: ("WEB-400", "The request is unreadable: no JSON, a missing or wrong header, or a foreign Host."),
+    401: ("WEB-401", "Nobody is logged in, or the token is no longer valid."),
+    403: ("WEB-403", "The role does not allow it, or the request comes from a foreign page."),
+    404: ("WEB-404", "There is no such path, or the number is impossible."),
+    405: ("WEB-405", "The path has other methods; the header Allow lists them."),
+    409: ("WEB-409", "The request contradicts the stored data."),
+    413: ("WEB-413", "The request is too long for this path."),
+    422: ("WEB-422", "A parameter or a field does not match the OpenAPI document; the detail names it."),
+    429: ("WEB-429", "Too many requests from this address. Try again after the time in the header Retry-After."),
     500: (DEFECT, "A defect of this program. The service's log has the details."),
-    503: ("WEB-503", "The service is overloaded or ends. Try again."),
+    503: ("WEB-503", "The service is overloaded or shutting down. Try again."),
 }
-"""Status, code and meaning of answers that no class of error stands for."""
+"""Code and meaning of the statuses without an error class."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorEntry:
-    """One code: what it is called inside, what it means, and the HTTP status that it is answered with, where it is answered."""
+    """An error code: name of its class, meaning, and HTTP status, None if HTTP never answers it."""
 
     code: str
     name: str
@@ -59,11 +59,11 @@ STATUS: dict[type[AbbeError], int] = {
     errors.EffectUnknown: 409,
     errors.ConfigError: 409,
 }
-"""The one table from errors to HTTP. A class that is not here is answered as the nearest one above it; none: 500."""
+"""HTTP statuses of errors. A class that is missing here has the status of its nearest base class, else 500."""
 
 
 def status_of(kind: type[AbbeError]) -> int:
-    """The HTTP status that an error is answered with."""
+    """HTTP status of an error class."""
     return next((STATUS[one] for one in kind.__mro__ if one in STATUS), 500)
 
 
@@ -80,17 +80,17 @@ def page() -> str:
     """The catalogue as a Markdown page."""
     rows = [f"| {one.code} | {one.name} | {one.status or ''} | {one.meaning} |" for one in entries()]
     head = (
-        "# Codes of errors\n\n"
-        "Every error has a code that does not change. The command line prints cause and remedy and ends with exit code 2; the HTTP\n"
+        "# Error codes\n\n"
+        "Every error has a permanent code. The command line prints cause and remedy and ends with exit code 2; the HTTP\n"
         "interface answers `application/problem+json` (RFC 9457) with the code in `code`, and in `type` as `urn:abbe:error:CODE`.\n"
-        "This page is made by `python -m abbe.service.web.catalogue` from the classes themselves; `GET /api/v1/errors` gives the same.\n\n"
+        "`python -m abbe.service.web.catalogue` makes this page from the error classes; `GET /api/v1/errors` returns the same.\n\n"
         "| code | name | HTTP | meaning |\n|---|---|---|---|\n"
     )
     return head + "\n".join(rows) + "\n"
 
 
 def _tree(kind: type[AbbeError] | type[DriverError]) -> Iterator[type[AbbeError] | type[DriverError]]:
-    """A class and all below it that are the product's own."""
+    """A class and its subclasses that belong to the product."""
     yield kind
     for below in kind.__subclasses__():
         if below.__module__ in {"abbe.service.errors", "abbe.drivers.errors"}:

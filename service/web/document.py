@@ -1,4 +1,4 @@
-"""The OpenAPI document, made complete: who may ask, and every status that can be answered, for every route alike."""
+"""Security headers, and the OpenAPI document completed with permissions and with all statuses of every route."""
 
 from __future__ import annotations
 
@@ -10,45 +10,37 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from abbe.service.web.catalogue import HTTP
-from abbe.service.web.login.access import MUTATING, PUBLIC, Need, cells
+from abbe.service.web.login.access import MUTATING, PUBLIC, Need, route_permissions
 from abbe.service.web.login.authentication import COOKIE
 from abbe.service.web.problems import MEDIA_TYPE
 from abbe.service.web.schemas import Problem
 
-# Security headers on every response, errors included. Pure ASGI: a middleware that wraps requests in tasks breaks cancellation.
-
-
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; object-src 'none'",
     "X-Content-Type-Options": "nosniff",
-    # Not "no-referrer": with it browsers send "Origin: null" along with our own login form, and nobody can log in.
+    # Not "no-referrer": browsers would send "Origin: null" with our own login form, and every login would fail.
     "Referrer-Policy": "same-origin",
     "X-Frame-Options": "DENY",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 KEPT = ("/static/", "/icon.svg")
-"""What is the same for everybody: browsers may keep it, and ask whether it is still the same. Nothing else is kept anywhere."""
+"""Content that is the same for all visitors: browsers may cache and revalidate it. They cache nothing else."""
 HSTS = "max-age=31536000"
-"""A year; only ever sent over TLS, and of no effect for a page that is asked for by address instead of by name."""
+"""A year; sent only over TLS, and without effect for a page requested by address instead of by name."""
 
 
 class SecurityHeaders:
-    """Adds `HEADERS` to whatever the application answers, how long it may be kept, and that TLS is here to stay.
+    """Adds `HEADERS`, Cache-Control and, over TLS, HSTS to every response, errors included.
 
-    Parameters
-    ----------
-    app : ASGI application
-        What answers.
-    behind_tls : bool
-        A reverse proxy takes the TLS off.
+    Pure ASGI: a middleware that wraps requests in tasks breaks cancellation. ``behind_tls``: a reverse proxy terminates TLS.
     """
 
     def __init__(self, app: ASGIApp, *, behind_tls: bool = False) -> None:
         self._app, self._behind_tls = app, behind_tls
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, and put the headers on the answer."""
+        """Pass the request on and add the headers to the response."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -69,23 +61,15 @@ class SecurityHeaders:
 Doc = dict[str, Any]
 REF = {"$ref": "#/components/schemas/Problem"}
 UNUSED = ("HTTPValidationError", "ValidationError")
-"""What FastAPI declares for 422; no route answers it."""
+"""Schemas that FastAPI declares for 422; no route uses them."""
 
 
 def complete(document: Doc, routes: Sequence[BaseRoute]) -> Doc:
-    """Add to an OpenAPI document, in place, what stands in front of all routes; may be done again.
-
-    Parameters
-    ----------
-    document : dict
-        As FastAPI makes it from the routes.
-    routes : sequence of routes
-        Of the application.
-    """
-    wanted = {(path, method.lower()): need for method, path, need in cells(routes)}
+    """Add the permissions and answers of the middleware to FastAPI's OpenAPI document, in place; idempotent."""
+    needs = {(path, method.lower()): need for method, path, need in route_permissions(routes)}
     for path, methods in document.get("paths", {}).items():
         for method, operation in methods.items():
-            need = wanted.get((path, method))
+            need = needs.get((path, method))
             _who(operation, need)
             _answers(operation, need, changes=method.upper() in MUTATING)
     schemas = document.setdefault("components", {}).setdefault("schemas", {})
@@ -124,8 +108,8 @@ def _answers(operation: Doc, need: Need | None, *, changes: bool) -> None:
         if name >= "400":
             answer["description"] = HTTP[422][1] if name == "422" else answer["description"]
             answer["content"] = {MEDIA_TYPE: {"schema": REF}}
-    # In front of the application, and answered in words: a Host that is not ours, too much at once.
+    # The server answers a foreign Host and overload in plain text, before the application.
     for name in ("400", "503"):
         answers[name]["content"]["text/plain"] = {"schema": {"type": "string"}}
     if need is not PUBLIC and not changes:
-        answers.setdefault("303", {"description": "Nobody is logged in, and a browser asks for text/html: to the login page"})
+        answers.setdefault("303", {"description": "Without a login, a browser that asks for text/html is redirected to the login page"})

@@ -1,4 +1,4 @@
-"""What surrounds every screen: in which language, for whom, and where one can go. Known for the time of one request."""
+"""The frame of every screen: language, visitor and navigation. It exists for the time of one request."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CHOICES: Mapping[str, tuple[str, Collection[str]]] = {
     "theme": ("abbe_theme", THEMES),
     "units": ("abbe_units", units.SYSTEMS),
 }
-"""What a reader chooses by the query of any screen: the cookie that keeps it, and what there is. Display only."""
+"""Display options that a reader sets in the query of any screen: cookie and allowed values."""
 Screen = tuple[str, str, Permission, tuple[str, ...]]
 SCREENS: tuple[Screen, ...] = (
     ("/", "nav.home", Permission.READ, ("/",)),
@@ -46,12 +46,12 @@ MORE: tuple[Screen, ...] = (
     ("/settings", "nav.settings", Permission.READ, ("/settings", "/diagnostics")),
     ("/audit", "nav.audit", Permission.AUDIT, ("/audit",)),
 )
-"""In the bar, and behind its last entry. Address, word, what it needs, and the addresses under which it is the present one."""
+"""Screens in the navigation bar, and behind its last entry: address, key of the text, permission, and addresses that select the entry."""
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """One entry of the navigation bar; ``here``: the present screen."""
+    """One entry of the navigation bar; ``here``: it is the current screen."""
 
     href: str
     text: str
@@ -60,22 +60,10 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The surroundings of one answer.
+    """Language, visitor and display options of one response.
 
-    Parameters
-    ----------
-    lang : str
-        Language of the words.
-    path : str
-        Address of the screen.
-    query : tuple of pairs of str
-        Its query, without the language.
-    visit : Visit, optional
-        Who asks.
-    theme, units : str
-        As the reader chose them.
-    there : frozenset of str, optional
-        Addresses that are answered; a screen that is not among them is not in the bar. None: not known, all of them.
+    ``path``, ``query``: address of the screen, without the language; ``paths``: addresses of the application, which limit the navigation
+    bar, None: all.
     """
 
     lang: str = DEFAULT
@@ -84,7 +72,7 @@ class Frame:
     visit: Visit | None = None
     theme: str = THEMES[0]
     units: str = units.METRIC
-    there: frozenset[str] | None = None
+    paths: frozenset[str] | None = None
 
     @property
     def who(self) -> str:
@@ -93,28 +81,28 @@ class Frame:
 
     @property
     def csrf(self) -> str:
-        """What a form of this page sends back; empty without a session."""
+        """CSRF token for the forms of this page; empty without a session."""
         return csrf_token(self.visit.secret) if self.visit is not None and self.visit.secret else ""
 
     def may(self, need: Permission) -> bool:
-        """Whether the visitor has a right."""
+        """Whether the visitor has a permission."""
         return self.visit is not None and need in self.visit.principal.permissions
 
     def links(self, screens: Sequence[Screen] = SCREENS) -> list[Link]:
         """The existing screens that the visitor may see."""
-        shown = [one for one in screens if self.may(one[2]) and (self.there is None or one[0] in self.there)]
-        return [Link(href, self.say(word), self.path in own) for href, word, _, own in shown]
+        shown = [one for one in screens if self.may(one[2]) and (self.paths is None or one[0] in self.paths)]
+        return [Link(href, self.translate(key), self.path in own) for href, key, _, own in shown]
 
     def more(self) -> list[Link]:
-        """The same behind the last entry of the bar."""
+        """The screens behind the last entry of the bar."""
         return self.links(MORE)
 
     def length(self, value: float | str | None, unit: str = "µm", decimals: int | None = None) -> str:
-        """A number in the reader's unit; ``decimals`` as in `units.shown`."""
+        """A number in the reader's unit; arguments as in `units.shown`."""
         return units.shown(value, unit, self.units, decimals)
 
     def unit(self, unit: str = "µm") -> str:
-        """The reader's unit for one of ours."""
+        """Sign of the reader's unit."""
         return units.unit_in(unit, self.units)
 
     def with_u(self, value: float | None, u: float | None, unit: str = "µm") -> tuple[str, str]:
@@ -126,16 +114,16 @@ class Frame:
         return units.drawn_in(unit, self.units)
 
     def languages(self) -> list[tuple[str, str, str]]:
-        """Code, name and address of this very screen in each language."""
+        """Code, name and address of this screen in each language."""
         return [(code, name, f"{self.path}?{urlencode([*self.query, ('lang', code)])}") for code, name in NAMES.items()]
 
-    def say(self, key: str, **values: object) -> str:
+    def translate(self, key: str, **values: object) -> str:
         """A text in the reader's language."""
-        return language.say(self.lang, key, **values)
+        return language.translate(self.lang, key, **values)
 
-    def state(self, group: str, word: str) -> str:
-        """A stored state in the reader's language; as it is where it has no translation."""
-        return language.known(self.lang, f"{group}.{word}", word)
+    def state(self, group: str, state: str) -> str:
+        """A stored state in the reader's language, unchanged without a translation."""
+        return language.translate_or(self.lang, f"{group}.{state}", state)
 
 
 _NOW: ContextVar[Frame] = ContextVar("frame")
@@ -143,59 +131,59 @@ _NONE = Frame()
 
 
 def current() -> Frame:
-    """The frame of the request that is being answered."""
+    """The frame of the current request."""
     return _NOW.get(_NONE)
 
 
-def template_words() -> dict[str, Callable[..., Any]]:
-    """What every template may call: ``t`` for a text, ``state`` for a stored state, ``frame`` for the surroundings."""
+def template_functions() -> dict[str, Callable[..., Any]]:
+    """Functions for every template: ``t`` translates a text, ``state`` a stored state, ``frame`` is `current`."""
     return {
-        "t": lambda key, **values: current().say(key, **values),
-        "state": lambda group, word: current().state(group, word),
+        "t": lambda key, **values: current().translate(key, **values),
+        "state": lambda group, state: current().state(group, state),
         "frame": current,
         "unit": lambda unit="µm": current().unit(unit),
         "span_words": lambda: {key: language.catalogue(current().lang)[key] for key in language.SPAN_KEYS},
     }
 
 
-class Framed:
-    """Finds out the language of every request and remembers the one that was asked for. Pure ASGI, inside of the guard."""
+class FrameMiddleware:
+    """Sets the frame of every request and stores chosen display options in cookies. Pure ASGI, inside the auth middleware."""
 
     def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute] = (), *, behind_tls: bool = False) -> None:
         self._app, self._routes, self._behind_tls = app, routes, behind_tls
-        self._there: frozenset[str] | None = None
+        self._paths: frozenset[str] | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on."""
+        """Pass the request on within its frame."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         request = HTTPConnection(scope)
-        if self._there is None and self._routes:
-            self._there = frozenset(str(getattr(route, "path", "")) for route in self._routes)
-        asked = {name: value for name in CHOICES if (value := request.query_params.get(name, "")) in CHOICES[name][1]}
-        kept = {name: value for name, (cookie, there) in CHOICES.items() if (value := request.cookies.get(cookie, "")) in there}
-        chosen = {"lang": language.wanted(request.headers.get("accept-language", "")), "theme": THEMES[0], "units": units.METRIC}
-        chosen |= kept | asked
+        if self._paths is None and self._routes:
+            self._paths = frozenset(str(getattr(route, "path", "")) for route in self._routes)
+        chosen_now = {name: value for name in CHOICES if (value := request.query_params.get(name, "")) in CHOICES[name][1]}
+        stored = {name: value for name, (cookie, allowed) in CHOICES.items() if (value := request.cookies.get(cookie, "")) in allowed}
+        chosen = {"lang": language.preferred(request.headers.get("accept-language", "")), "theme": THEMES[0], "units": units.METRIC}
+        chosen |= stored | chosen_now
         query = tuple((k, v) for k, v in request.query_params.multi_items() if k != "lang")
         visit = scope.get("state", {}).get("visit")
-        token = _NOW.set(Frame(chosen["lang"], scope["path"], query, visit, chosen["theme"], chosen["units"], self._there))
+        token = _NOW.set(Frame(chosen["lang"], scope["path"], query, visit, chosen["theme"], chosen["units"], self._paths))
         try:
-            keep = asked if scope["method"] == "GET" else {}
+            keep = chosen_now if scope["method"] == "GET" else {}
             secure = is_tls(request, behind_tls=self._behind_tls)
             await self._app(scope, receive, _remembering(send, keep, secure=secure) if keep else send)
         finally:
             _NOW.reset(token)
 
 
-def _remembering(send: Send, asked: Mapping[str, str], *, secure: bool) -> Send:
-    """Keep what was asked for, if the answer is a screen: a probe or a program that asks for a document gets no cookie."""
+def _remembering(send: Send, chosen: Mapping[str, str], *, secure: bool) -> Send:
+    """Set the cookies if the response is a screen; health checks and programs get no cookie."""
     more = "; Secure" if secure else ""
 
     async def with_cookie(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
-            for name, value in asked.items() if headers.get("content-type", "").startswith("text/html") else ():
+            for name, value in chosen.items() if headers.get("content-type", "").startswith("text/html") else ():
                 headers.append("set-cookie", f"{CHOICES[name][0]}={value}; Path=/; Max-Age={YEAR_S}; SameSite=Lax; HttpOnly{more}")
         await send(message)
 

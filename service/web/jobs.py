@@ -1,6 +1,4 @@
-"""Jobs over HTTP: start a declared recipe now, see how a job stands, stop, pause and go on, say what is done by hand. The core does it, and
-decides whether.
-"""
+"""Jobs over HTTP: start a declared recipe, show, stop, pause and resume jobs, confirm prompts. The core decides and executes."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ from fastapi import FastAPI, Header, HTTPException, Path, Request
 from fastapi.responses import JSONResponse, Response
 
 from abbe.service.campaigns.builtin_recipes import named, split_recipe_name
-from abbe.service.channel.messages import Answer, How
+from abbe.service.channel.messages import Answer, Steering
 from abbe.service.domain.job_state import JobState
 from abbe.service.queries.reader import json_value
 from abbe.service.users.roles import Permission
@@ -22,7 +20,7 @@ from abbe.service.web.schemas import JobList, NewJob, Problem
 
 STATUS = {"unknown": 404, "busy": 409, "forbidden": 403, "conflict": 409}
 NUMBER = Path(pattern="^[0-9a-f]{12}$", description="Number of the job")
-PROMPT = Path(ge=1, le=10**6, description="Number of what is asked for, as the job says it")
+PROMPT = Path(ge=1, le=10**6, description="Number of the prompt, from the state of the job")
 REFUSALS: dict[int | str, dict[str, object]] = {
     401: {"model": Problem, "description": "Nobody is logged in"},
     403: {"model": Problem, "description": "The role does not allow it"},
@@ -36,12 +34,12 @@ ACCEPTED: dict[int | str, dict[str, object]] = {202: {"model": JobState, "descri
 
 
 def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: tuple[str, ...] = ()) -> None:
-    """Add the routes of jobs to the application. ``campaigns``: those of the recipes that end with a proposal."""
+    """Add the routes of jobs to the application. ``campaigns``: recipes that end with a proposal."""
 
     @app.get("/api/v1/jobs", responses=REFUSALS)
     @needs(Permission.READ)
     async def jobs() -> JobList:
-        """List the jobs since the service began, newest first (`kind` says what each is), and the recipes that can be started."""
+        """Jobs since the start of the service, newest first, and the recipes that can be started."""
         return JobList(recipes=recipes, jobs=core.jobs())
 
     @app.post("/api/v1/jobs", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
@@ -49,13 +47,13 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     async def start(
         request: Request,
         wanted: NewJob,
-        key: Annotated[str, Header(alias="Idempotency-Key", max_length=100, description="Said twice, it starts one job")] = "",
+        key: Annotated[str, Header(alias="Idempotency-Key", max_length=100, description="A repeated key starts no second job")] = "",
     ) -> Response:
-        """Measure a recipe now; ``identification`` is the full campaign, at whose end a proposal waits: it needs ``propose``, too."""
+        """Measure a recipe now; ``identification``, the full campaign, ends with a proposal and also needs ``propose``."""
         visit: Visit = request.state.visit
         recipe = named(wanted.recipe, wanted.rate_hz)
         visit.target = f"recipe {recipe}"
-        # The core knows the role, not the scopes of a token.
+        # The core knows the role of the user, but not the scopes of a token.
         if split_recipe_name(recipe)[0] in campaigns and Permission.PROPOSE not in visit.principal.permissions:
             return problem(
                 403, f"{recipe} ends with a proposal: it needs {Permission.PROPOSE.value!r} as well as {Permission.MEASURE.value!r}"
@@ -69,7 +67,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     @app.get("/api/v1/jobs/{job}", responses=REFUSALS)
     @needs(Permission.READ)
     async def one(job: Annotated[str, NUMBER]) -> JobState:
-        """Say how a job stands."""
+        """State of a job."""
         found = _find(core, job)
         if found is None:
             raise HTTPException(404, f"there is no job {job} since the service began")
@@ -78,18 +76,18 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     @app.post("/api/v1/jobs/{job}/prompts/{prompt}/done", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
     @needs(Permission.MEASURE)
     async def done(request: Request, job: Annotated[str, NUMBER], prompt: Annotated[int, PROMPT]) -> Response:
-        """Say that what the job asks for is done; the machine moves then. Refused (409) if another prompt stands."""
+        """Confirm that a prompt of the job is done; then the machine moves. Refused (409) if another prompt is open."""
         visit: Visit = request.state.visit
         visit.target = f"job {job}, prompt {prompt}"
         return answered(core, await core.done_by_hand(job, prompt, visit.principal.name))
 
-    def add_steering(how: How, words: str) -> None:
+    def add_steering(how: Steering, summary: str) -> None:
         @app.post(
             f"/api/v1/jobs/{{job}}/{how}",
             status_code=202,
             response_model=JobState,
             responses=ACCEPTED | REFUSALS,
-            summary=words,
+            summary=summary,
             operation_id=f"{how}_job",
         )
         @needs(Permission.MEASURE)
@@ -104,12 +102,12 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
 
 
 def answered(core: CoreLine, answer: Answer) -> Response:
-    """What the core said to a request, as a response; with a job its state and where it is."""
+    """The core's answer as an HTTP response: the state of the job and its address, or a problem."""
     if answer.outcome != "done":
         return problem(STATUS[answer.outcome], answer.text)
     found = _find(core, answer.job)
     if found is None:  # the core keeps the latest jobs only
-        return problem(404, f"job {answer.job} is not known any more")
+        return problem(404, f"job {answer.job} is no longer known")
     return JSONResponse(json_value(found), 202, headers={"Location": f"/api/v1/jobs/{answer.job}"})
 
 

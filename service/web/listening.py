@@ -1,4 +1,4 @@
-"""Where the page is reached: socket and certificate, and whether it may be reached from there. Checked by the core at its start."""
+"""The listening socket, its certificate, and whether other computers may reach it. The core checks them at its start."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from abbe.service.errors import ConfigError
 
 
 def check_certificate(certificate: str, key: str) -> None:
-    """Refuse a certificate that cannot be used; nothing happens without one.
+    """Check that a certificate is usable; an empty path passes.
 
     Raises
     ------
     ConfigError
-        Certificate or key cannot be read, or do not belong together.
+        Certificate or key is unreadable, or they do not match.
     """
     if not certificate:
         return
@@ -28,25 +28,25 @@ def check_certificate(certificate: str, key: str) -> None:
 
 
 def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Sequence[str] = (), behind_tls: bool = False) -> None:
-    """Refuse to be reached from other computers without somebody who manages the users, and without encryption.
+    """Refuse access from other computers without an admin or without encryption.
 
     Parameters
     ----------
     host : str
         Address to listen on.
     admins : callable
-        How many admins with a password may log in; asked only if it matters. A user who is not one could shut nobody out.
+        Number of admins with a password who may log in; called only if needed. Other users could not lock anybody out.
     tls : bool
         Whether a certificate is configured.
     names : sequence of str
-        Under which other computers ask for the page: by a reverse proxy, if the address is this computer's own.
+        Host names that other computers use, by a reverse proxy if the address is this computer's own.
     behind_tls : bool
-        Whether that proxy takes off the TLS.
+        Whether that proxy terminates TLS.
 
     Raises
     ------
     ConfigError
-        What is missing.
+        An admin or encryption is missing.
     """
     wide, proxied = not is_loopback(host), [name for name in names if not is_loopback(name.removeprefix("[").removesuffix("]"))]
     if not wide and not proxied:
@@ -65,17 +65,17 @@ def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Se
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket. Whether it may listen there is `check_exposure`'s to say, before.
+    """A listening socket; call `check_exposure` first.
 
     Raises
     ------
     ConfigError
-        Somebody else has the port, or the address is not this computer's.
+        The port is in use, or the address is not this computer's.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         listening = socket.create_server((host, port), family=family, backlog=64)
-        # Connections inherit it. Without, head and body of an answer wait 40 ms for each other: asyncio sets it on no socket of protocol 0.
+        # Connections inherit the option, which asyncio sets on no socket of protocol 0: head and body would wait 40 ms for each other.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as trouble:
@@ -85,12 +85,12 @@ def bind(host: str, port: int) -> socket.socket:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether an address can be reached from this computer only."""
+    """Whether only this computer can reach an address."""
     return host == "localhost" or is_local(host)
 
 
 def is_local(address: str) -> bool:
-    """Tell whether an address is this computer's own."""
+    """Whether an address is this computer's own."""
     try:
         return ipaddress.ip_address(address).is_loopback
     except ValueError:

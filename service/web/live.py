@@ -18,7 +18,7 @@ from abbe.service.web.login.auth_middleware import Visit
 
 _EVENT = TypeAdapter(LiveEvent)
 LONGEST_S = 600.0
-"""Then it is closed: who listens on comes again, and is looked at again - a session that has ended in between hears no more."""
+"""Longest life of a connection. The client reconnects and is checked again, so an ended session gets no more events."""
 TRY_AGAIN, GOING_AWAY, POLICY = 1013, 1001, 1008
 
 
@@ -28,19 +28,19 @@ def add_live(app: FastAPI, core: CoreLine) -> None:
     @app.websocket("/api/v1/live")
     @needs(Permission.READ)
     async def live(socket: WebSocket) -> None:
-        with core.listener(_who(socket)) as moments:
-            if moments is None:
+        with core.listener(_who(socket)) as snapshots:
+            if snapshots is None:
                 await socket.close(TRY_AGAIN)
                 return
             await socket.accept()
 
-            async def tell() -> None:
-                async for moment in moments():
-                    text = _event(core, moment.changes)
+            async def send_events() -> None:
+                async for snapshot in snapshots():
+                    text = _event(core, snapshot.changes)
                     if text is not None:
                         await socket.send_text(text)
 
-            await _until_gone(socket, tell())
+            await _until_closed(socket, send_events())
 
     @app.websocket("/api/v1/live/samples")
     @needs(Permission.READ)
@@ -51,11 +51,11 @@ def add_live(app: FastAPI, core: CoreLine) -> None:
                 return
             await socket.accept()
 
-            async def tell() -> None:
+            async def send_parts() -> None:
                 async for part in parts():
                     await (socket.send_text(part) if isinstance(part, str) else socket.send_bytes(part))
 
-            await _until_gone(socket, tell())
+            await _until_closed(socket, send_parts())
 
 
 def _who(socket: WebSocket) -> str:
@@ -63,31 +63,31 @@ def _who(socket: WebSocket) -> str:
     return visit.principal.name
 
 
-async def _until_gone(socket: WebSocket, telling: Awaitable[None]) -> None:
-    """Tell until the client goes, says something, has listened long enough, or there is no more to tell; then close."""
-    told = asyncio.ensure_future(telling)
-    heard = asyncio.create_task(_gone(socket), name="live hear")
+async def _until_closed(socket: WebSocket, work: Awaitable[None]) -> None:
+    """Send until the client leaves or sends something, the work ends, or `LONGEST_S` has passed; then close."""
+    sending = asyncio.ensure_future(work)
+    receiving = asyncio.create_task(_disconnected(socket), name="live receive")
     try:
-        await asyncio.wait({told, heard}, timeout=LONGEST_S, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({sending, receiving}, timeout=LONGEST_S, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        gone = heard.done()
-        for task in (told, heard):
+        received = receiving.done()
+        for task in (sending, receiving):
             task.cancel()
-        await asyncio.gather(told, heard, return_exceptions=True)
-    if gone and heard.result():
+        await asyncio.gather(sending, receiving, return_exceptions=True)
+    if received and receiving.result():
         return
-    with suppress(RuntimeError, WebSocketDisconnect):  # it may have gone meanwhile
-        await socket.close(POLICY if gone else GOING_AWAY)
+    with suppress(RuntimeError, WebSocketDisconnect):  # the client may have left meanwhile
+        await socket.close(POLICY if received else GOING_AWAY)
 
 
-async def _gone(socket: WebSocket) -> bool:
-    """Wait until the client goes; False: it says something instead, which it has no reason to."""
+async def _disconnected(socket: WebSocket) -> bool:
+    """Wait until the client disconnects; False: it sent a message, which the protocol does not allow."""
     message = await socket.receive()
     return bool(message["type"] == "websocket.disconnect")
 
 
 def _event(core: CoreLine, revision: int) -> str | None:
-    """The event of this moment; None while the core is silent."""
+    """The current event as JSON; None while the core is silent."""
     try:
         event = LiveEvent(
             revision=revision, job=core.job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=core.attention

@@ -1,4 +1,4 @@
-"""What Prometheus asks for: ``/metrics``, in its text format. Figures of the store, of the core, and of this process."""
+"""Prometheus metrics of the store, the core and this process at ``/metrics``."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from abbe.service.web.login.access import needs
 VERDICTS = ("pass", "fail", "cannot tell")
 
 
-class _Figures(Collector):
+class _MetricsCollector(Collector):
     def __init__(self, store: Store, core: CoreLine, machine: str, control: str) -> None:
         self._store, self._core, self._machine, self._control = store, core, machine, control
 
     def collect(self) -> Iterable[Metric]:
         yield from self._of_store()
         try:
-            moment = self._core.moment()
+            snapshot = self._core.snapshot()
         except CoreSilent:
             yield GaugeMetricFamily("abbe_core_up", "Whether the core process answers", 0.0)
             return
         yield GaugeMetricFamily("abbe_core_up", "Whether the core process answers", 1.0)
-        yield from _of_core(moment)
+        yield from _of_core(snapshot)
 
     def _of_store(self) -> Iterator[Metric]:
         checks = CounterMetricFamily("abbe_checks", "Checks of the whole history by verdict", labels=["verdict"])
@@ -63,22 +63,22 @@ class _Figures(Collector):
         yield figures
 
 
-def _of_core(moment: Snapshot) -> Iterator[Metric]:
+def _of_core(snapshot: Snapshot) -> Iterator[Metric]:
     devices = GaugeMetricFamily("abbe_device_connected", "1: used or answered last, 0: fault or not used yet", labels=["role"])
-    for device in moment.devices:
+    for device in snapshot.devices:
         devices.add_metric([device.role], float(device.state in {"in use", "answered"}))
     yield devices
-    yield GaugeMetricFamily("abbe_measuring", "Whether a check runs", float(moment.check is not None))
-    yield GaugeMetricFamily("abbe_mqtt_connected", "Whether the broker is there", float(moment.mqtt_connected))
-    yield GaugeMetricFamily("abbe_attention", "How many things need a person", len(moment.attention))
-    yield GaugeMetricFamily("abbe_core_resident_memory_bytes", "Resident memory of the core process", moment.core_rss_bytes)
-    yield CounterMetricFamily("abbe_web_restarts", "How often the web process was started again", moment.web_restarts)
+    yield GaugeMetricFamily("abbe_measuring", "Whether a check runs", float(snapshot.check is not None))
+    yield GaugeMetricFamily("abbe_mqtt_connected", "Whether the broker is there", float(snapshot.mqtt_connected))
+    yield GaugeMetricFamily("abbe_attention", "How many things need a person", len(snapshot.attention))
+    yield GaugeMetricFamily("abbe_core_resident_memory_bytes", "Resident memory of the core process", snapshot.core_rss_bytes)
+    yield CounterMetricFamily("abbe_web_restarts", "How often the web process was started again", snapshot.web_restarts)
 
 
 def add_metrics(app: FastAPI, store: Store, core: CoreLine, machine: str, control: str = "") -> None:
-    """Add the route to the application. Who may look at the page may ask for these; a program with a token of the scope ``read``."""
+    """Add the route to the application. It needs the permission ``read``, like the home page."""
     registry = CollectorRegistry()
-    registry.register(_Figures(store, core, machine, control))
+    registry.register(_MetricsCollector(store, core, machine, control))
     ProcessCollector(namespace="abbe_web", registry=registry)
 
     @app.get("/metrics", include_in_schema=False)

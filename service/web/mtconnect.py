@@ -1,4 +1,4 @@
-"""``/mtconnect/probe``, ``/current`` and ``/sample``, for programs that speak MTConnect; with the right that the page needs."""
+"""MTConnect at ``/mtconnect/probe``, ``/current`` and ``/sample``, with the permission of the home page."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ MEDIA_TYPE = "text/xml"
 
 
 class MtconnectAccess:
-    """The agent, and where its facts come from. It starts with the first question, which gives it its ``instanceId``."""
+    """The agent and its source of facts. The first request starts the agent, and its time becomes the ``instanceId``."""
 
     def __init__(self, source: FactsSource) -> None:
         self._source = source
         self._agent: Agent | None = None
 
     async def answer(self, request: Request, write: Callable[[Agent, PlantFacts, Mapping[str, str]], bytes]) -> Response:
-        """Return a document, or the Error document of what cannot be answered."""
+        """The requested document, or an Error document."""
         facts = await self._source.facts()
         if self._agent is None:
             self._agent = Agent(int(facts.now_utc.timestamp()))
@@ -35,20 +35,20 @@ class MtconnectAccess:
 
 
 def add_mtconnect(app: FastAPI, source: FactsSource) -> None:
-    """Mount the three questions. They are in no OpenAPI document: MTConnect describes them."""
-    auth = MtconnectAccess(source)
+    """Add the three routes. OpenAPI omits them, since MTConnect describes them."""
+    access = MtconnectAccess(source)
 
     @app.get("/mtconnect/probe", include_in_schema=False)
     @needs(Permission.READ)
     async def probe(request: Request) -> Response:
-        return await auth.answer(request, lambda agent, facts, _: agent.probe(facts))
+        return await access.answer(request, lambda agent, facts, _: agent.probe(facts))
 
     @app.get("/mtconnect/current", include_in_schema=False)
     @needs(Permission.READ)
     async def current(request: Request) -> Response:
-        return await auth.answer(request, lambda agent, facts, query: agent.current(facts, query))
+        return await access.answer(request, lambda agent, facts, query: agent.current(facts, query))
 
     @app.get("/mtconnect/sample", include_in_schema=False)
     @needs(Permission.READ)
     async def sample(request: Request) -> Response:
-        return await auth.answer(request, lambda agent, facts, query: agent.sample(facts, query))
+        return await access.answer(request, lambda agent, facts, query: agent.sample(facts, query))

@@ -1,4 +1,4 @@
-"""The page: status and past checks into HTML, on the server. The script only refreshes it."""
+"""The home page: renders status and past checks as HTML on the server. The script only refreshes it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from markupsafe import Markup
 
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.status import Status
-from abbe.service.web import language, words
-from abbe.service.web.frame import current, template_words
+from abbe.service.web import formatting, language
+from abbe.service.web.frame import current, template_functions
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted
 
@@ -28,25 +28,25 @@ ICON = (
 
 
 def environment() -> Environment:
-    """Return the template environment. Everything is escaped: names and fault texts come from devices and files."""
+    """The template environment. It escapes everything, since names and fault texts come from devices and files."""
     env = Environment(
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    env.filters["number"] = words.number
+    env.filters["number"] = formatting.number
     env.filters["length"] = lambda value, unit="µm", decimals=None: current().length(value, unit, decimals)
     env.filters["lengths"] = _lengths
     env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
-    # Pictures come from our own SVG writer, which has escaped every text; escaping again would show the reader the tags.
+    # Pictures come from our own SVG writer, which has escaped every text.
     env.filters["picture"] = Markup
-    env.globals |= template_words()
+    env.globals |= template_functions()
     return env
 
 
 def render(env: Environment, status: Status, past: Sequence[Verification]) -> str:
-    """Return the page."""
+    """The home page as HTML."""
     zone: tzinfo = ZoneInfo(status.next_due[0].timezone) if status.next_due else UTC
     lang, changes = current().lang, status.verified.changes
-    # The verification of a push that was taken back is of a table that is not in force.
+    # The verification of a push that was rolled back belongs to a table that is not in force.
     latest = next((check for check in past if not check.push or check.verdict == "pass"), None)
     return env.get_template("page.html").render(
         status=status,
@@ -62,20 +62,20 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
         machine=status.machine,
         name=lambda key: _named(lang, key),
         measured=lambda value, key: current().length(value, language.figure(lang, key)[1]),
-        stamp=lambda moment: words.stamp(moment, zone),
-        ago=lambda moment: language.ago(lang, moment, status.now_utc),
+        stamp=lambda time: formatting.stamp(time, zone),
+        ago=lambda time: language.ago(lang, time, status.now_utc),
         due_words=lambda one: language.due(lang, one.due_utc, status.now_utc),
     )
 
 
 def figures(past: Sequence[Verification]) -> list[str]:
-    """Return the figures worth a column and a plot: those that are judged, or, if none is, the first few."""
+    """Figures with a column and a plot: those with a limit or, if none has one, the first `SHOWN_FIGURES`."""
     judged = dict.fromkeys(key for check in past for key in check.values if check.limits.get(key) is not None)
     return list(judged or dict.fromkeys(key for check in past for key in check.values))[:SHOWN_FIGURES]
 
 
 def trends(past: Sequence[Verification], zone: tzinfo, changes: Sequence[datetime] = ()) -> list[Markup]:
-    """Return a plot for each figure; ``changes``: when another table came into force."""
+    """A plot for each figure; ``changes``: times at which another table came into force."""
     plots = []
     for key in figures(past):
         name, unit = language.figure(current().lang, key)
@@ -86,7 +86,7 @@ def trends(past: Sequence[Verification], zone: tzinfo, changes: Sequence[datetim
 
 
 def _lengths(rows: Sequence[Sequence[str]], *at: int) -> list[list[str]]:
-    """Rows of a table whose cells at these places are µm, in the reader's unit."""
+    """Rows of a table, with the µm cells in columns ``at`` converted to the reader's unit."""
     return [[current().length(cell) if k in at else cell for k, cell in enumerate(row)] for row in rows]
 
 
@@ -96,7 +96,7 @@ def _named(lang: str, key: str) -> tuple[str, str]:
 
 
 def _point(check: Verification, key: str, unit: str, changes: Sequence[datetime]) -> Point | None:
-    """A figure of a check in the reader's unit; None: it has none."""
+    """A figure of a check in the reader's unit; None: the check lacks it."""
     value, limit, system = check.values.get(key), check.limits.get(key), current().units
     if value is None:
         return None
@@ -107,9 +107,9 @@ def _point(check: Verification, key: str, unit: str, changes: Sequence[datetime]
 
 
 def figure_verdict(check: Verification, key: str) -> str:
-    """Return what one figure says, by the same guard-banded rule as the check's own verdict.
+    """Verdict of one figure, by the same guard-banded rule as that of the check.
 
-    If the check's verdict does not follow from its figures, then its reason (say, the temperature) is one for each of them.
+    If the check's verdict does not follow from its figures, its reason (e.g. the temperature) applies to each of them.
     """
     found = {name: _judged(check, name) for name in check.limits if check.values.get(name) is not None}
     worst = next((verdict for verdict in ("fail", "cannot tell", "pass") if verdict in found.values()), None)

@@ -1,4 +1,4 @@
-"""Errors as application/problem+json, mapped here and nowhere else; codes and statuses are those of the catalogue."""
+"""The only mapping from errors to application/problem+json; codes and statuses come from the catalogue."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from abbe.service.web.schemas import Problem
 
 MEDIA_TYPE = "application/problem+json"
 LONGEST = 1000
-"""Characters of a detail: it may repeat what was sent."""
+"""Largest length of a detail, which may repeat client input, characters."""
 
 
 def problem(status: int, detail: str, code: str = "", headers: dict[str, str] | None = None) -> JSONResponse:
-    """Return an RFC 9457 response; without a code it is the status's own."""
+    """An RFC 9457 response; the default code is that of the status."""
     code = code or HTTP.get(status, (f"WEB-{status}", ""))[0]
-    # Halves of characters can be sent in JSON and cannot be answered in UTF-8.
+    # JSON can contain lone surrogates, which UTF-8 cannot.
     plain = detail[:LONGEST].encode("utf-8", "backslashreplace").decode("utf-8")
     body = Problem(type=f"urn:abbe:error:{code}", title=HTTPStatus(status).phrase, status=status, detail=plain, code=code)
     return JSONResponse(body.model_dump(), status, headers=headers, media_type=MEDIA_TYPE)
 
 
 def problem_of(error: AbbeError) -> JSONResponse:
-    """The response to an error of ours."""
+    """The response to an error of the service."""
     status = status_of(type(error))
     detail = error.detail + (f" - {error.remedy}" if error.remedy and status != 503 else "")
     return problem(status, detail, error.code, {"Retry-After": "5"} if status == 503 else None)
@@ -40,18 +40,18 @@ async def _http(_: Request, error: Exception) -> JSONResponse:
     return problem(error.status_code, str(error.detail), headers=dict(error.headers or {}))
 
 
-async def _gone(_: Request, error: Exception) -> JSONResponse:
-    # Nobody reads it; without it a visitor who goes away, or was too slow, would be a defect of ours in the log.
+async def _disconnected(_: Request, error: Exception) -> JSONResponse:
+    # The client never reads it; without it, the log would show a disconnect as a defect.
     assert isinstance(error, ClientDisconnect)
-    return problem(400, "the request did not come to its end")
+    return problem(400, "the request is incomplete")
 
 
 async def _invalid(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
-    where = ".".join(str(part)[:100] for part in first["loc"])
-    # What cannot be the number of anything is not there, as one that nothing has.
-    return problem(404 if first["loc"][0] == "path" else 422, f"{where}: {first['msg']}")
+    location = ".".join(str(part)[:100] for part in first["loc"])
+    # An impossible number is answered like an unknown number.
+    return problem(404 if first["loc"][0] == "path" else 422, f"{location}: {first['msg']}")
 
 
 async def _abbe(_: Request, error: Exception) -> JSONResponse:
@@ -61,8 +61,8 @@ async def _abbe(_: Request, error: Exception) -> JSONResponse:
 
 async def _defect(request: Request, error: Exception) -> JSONResponse:
     if isinstance(error, MemoryError) and (end := getattr(request.app.state, "end", None)) is not None:
-        end()  # a process that has come to its limit stays there: the core starts a new one
-    # The traceback goes to the log (the server re-raises); a client has no use for our insides.
+        end()  # a process at its memory limit does not recover: the core starts a new one
+    # The traceback goes to the log (the server re-raises), not to the client.
     return problem(500, f"{type(error).__name__}: a defect of this program; see the service's log", DEFECT)
 
 
@@ -70,6 +70,6 @@ def install(app: FastAPI) -> None:
     """Answer every kind of error with a problem document."""
     app.add_exception_handler(HTTPException, _http)
     app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(ClientDisconnect, _gone)
+    app.add_exception_handler(ClientDisconnect, _disconnected)
     app.add_exception_handler(AbbeError, _abbe)
     app.add_exception_handler(Exception, _defect)

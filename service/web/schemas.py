@@ -1,4 +1,4 @@
-"""What HTTP alone has: envelopes of lists, bodies of requests, problems. What is in an envelope is a record of the read model."""
+"""Types that only HTTP has: list envelopes, request bodies, problems. Envelopes contain records of the read model."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from abbe.service.queries.timetable import ScheduleState
 from abbe.service.web.catalogue import ErrorEntry
 
 LONGEST_RECIPE = 180
-"""The channel takes words of 200 characters, and the rate stands behind the name."""
+"""The channel limits names to 200 characters, and the rate follows the name."""
 
 
 class ApiAnswer(BaseModel):
-    """Base of all answers. Times are UTC, ISO 8601; units stand in the names."""
+    """Base of all answers. Times are UTC, ISO 8601; names end with units."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -33,7 +33,7 @@ class ApiAnswer(BaseModel):
 class ListPage(ApiAnswer):
     """A page of a list, newest first."""
 
-    next_cursor: Annotated[int | None, Field(description="Give it as `cursor` for the next page; null: this is the last one.")]
+    next_cursor: Annotated[int | None, Field(description="`cursor` of the next page; null: this is the last page.")]
 
 
 class MachineList(ListPage):
@@ -91,7 +91,7 @@ class LatestChecks(ApiAnswer):
 
 
 class DeviceList(ApiAnswer):
-    """Devices of this service's machine. They are not asked for this answer."""
+    """Devices of this service's machine, as last known: the request does not contact them."""
 
     machine: str
     devices: Sequence[DeviceStatus]
@@ -111,7 +111,7 @@ class RecipeList(ApiAnswer):
 
 
 class ErrorList(ApiAnswer):
-    """All codes of errors, and what they mean."""
+    """All error codes with their meanings."""
 
     errors: Sequence[ErrorEntry]
 
@@ -124,7 +124,7 @@ class Timetable(ApiAnswer):
 
 
 class JobList(ApiAnswer):
-    """The latest jobs, newest first, and what can be started."""
+    """The latest jobs, newest first, and the recipes that can be started."""
 
     recipes: Sequence[str]
     jobs: Sequence[JobState]
@@ -143,7 +143,7 @@ class AuditList(ApiAnswer):
 
 
 class Me(ApiAnswer):
-    """Who asks. ``csrf_token`` is empty for tokens and onlookers."""
+    """The current user. ``csrf_token`` is empty for tokens and onlookers."""
 
     name: str
     role: str
@@ -152,7 +152,7 @@ class Me(ApiAnswer):
 
 
 class Decision(ApiAnswer):
-    """What was decided, by whom. ``expiry``: of an approval."""
+    """A decision on a proposal. ``expiry``: end of an approval."""
 
     proposal: int
     decision: Literal["approved", "rejected"]
@@ -185,26 +185,26 @@ class RequestBody(BaseModel):
 
 
 class NewJob(RequestBody):
-    """What is to be done now."""
+    """A recipe to measure now."""
 
     recipe: Annotated[str, Field(min_length=1, max_length=LONGEST_RECIPE)]
     rate_hz: Annotated[int, Field(ge=1, le=1000, description="Ball-bar samples per second; has to divide 1000")] = USUAL_HZ
 
 
 class ApproveBody(RequestBody):
-    """For how long the approval holds, at most."""
+    """Longest validity of the approval."""
 
     hours: Annotated[float, Field(ge=0.01, le=720.0)] = 24.0
 
 
 class RejectBody(RequestBody):
-    """Why. The proposer reads it."""
+    """Reason of a rejection, for the proposer."""
 
     reason: Annotated[str, Field(min_length=1, max_length=500)]
 
 
 class RollbackBody(RequestBody):
-    """Which table shall go: the push that brought it, its CRC-32 as `/table` shows it, and why. Refused if another one is in force."""
+    """The table to remove: its push, its CRC-32 as `/table` shows it, and the reason. Refused if another table is in force."""
 
     push: Annotated[int, Field(ge=1, le=2**31 - 1)]
     crc: Annotated[str, Field(pattern="^[0-9A-Fa-f]{8}$")]
@@ -212,4 +212,4 @@ class RollbackBody(RequestBody):
 
 
 class PushBody(RequestBody):
-    """Empty: what is pushed is what was approved."""
+    """Empty: the approval determines the pushed tables."""

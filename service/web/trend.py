@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, tzinfo
 from html import escape
 
-from abbe.service.web.words import number
+from abbe.service.web.formatting import number
 
 WIDTH, HEIGHT = 560, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
@@ -16,7 +16,7 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One check's figure. ``verdict`` is of the figure, not of the whole check; ``earlier``: measured before the table in force came."""
+    """A figure of one check. ``verdict`` is that of the figure, not of the check; ``earlier``: measured with an earlier table."""
 
     at: datetime
     value: float
@@ -40,21 +40,13 @@ class _PixelScale:
 
 
 def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo, changes: Sequence[datetime] = ()) -> str:
-    """Return the plot as an SVG element.
+    """The plot as an SVG element.
 
-    Parameters
-    ----------
-    name, unit : str
-        Label of the vertical axis.
-    points : sequence of Point
-        In any order; must not be empty.
-    zone : tzinfo
-        Of the dates on the horizontal axis.
-    changes : sequence of datetime
-        When another table came into force: a line across. Points of an earlier table are drawn in grey.
+    ``name``, ``unit`` label the vertical axis; ``points`` may have any order and must not be empty; ``zone`` applies to the dates. Each of
+    ``changes``, when another table came into force, is a vertical line. Points of an earlier table are grey.
     """
     points = sorted(points, key=lambda point: point.at)
-    changes = [moment for moment in changes if moment >= points[0].at]
+    changes = [time for time in changes if time >= points[0].at]
     x, y = _time_scale(points, changes), _value_scale(points)
     label = f"{name} [{unit}]" if unit else name
     body = [*_grid(y), *_dates(points, x, zone), *_limit(points, x, y), *_changes(changes, x)]
@@ -71,14 +63,14 @@ def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo, chang
 
 
 def _changes(changes: Sequence[datetime], x: _PixelScale) -> list[str]:
-    """A line where another table came into force."""
-    lines = [f"M{x(moment.timestamp()):.1f} {TOP + 4}V{HEIGHT - BOTTOM}" for moment in changes]
+    """Vertical lines where another table came into force."""
+    lines = [f"M{x(time.timestamp()):.1f} {TOP + 4}V{HEIGHT - BOTTOM}" for time in changes]
     return [f'<path class="changed" d="{line}"/>' for line in lines]
 
 
 def _time_scale(points: Sequence[Point], changes: Sequence[datetime]) -> _PixelScale:
     first, last = points[0].at.timestamp(), max([points[-1].at, *changes]).timestamp()
-    # A single check, or several within a minute, still get an axis with a length.
+    # A single check, or several within a minute, still need an axis with a length.
     margin = max((last - first) * 0.04, 30.0)
     return _PixelScale(first - margin, last + margin, LEFT, WIDTH - RIGHT)
 
@@ -93,7 +85,7 @@ def _value_scale(points: Sequence[Point]) -> _PixelScale:
 
 
 def _step(length: float) -> float:
-    """Return a round step of which four to eight make up ``length``."""
+    """A round step that divides ``length`` into four to eight parts."""
     rough = max(length, 1e-9) / 5
     power = 10.0 ** math.floor(math.log10(rough))
     return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough)
@@ -114,9 +106,9 @@ def _dates(points: Sequence[Point], x: _PixelScale, zone: tzinfo) -> list[str]:
     form = "%H:%M:%S" if length < timedelta(minutes=10) else "%H:%M" if length < timedelta(hours=36) else "%d %b"
     texts = []
     for part in (0.125, 0.375, 0.625, 0.875):
-        moment = datetime.fromtimestamp(x.low + part * (x.high - x.low), zone)
+        time = datetime.fromtimestamp(x.low + part * (x.high - x.low), zone)
         texts.append(
-            f'<text class="tick" x="{x(moment.timestamp()):.1f}" y="{HEIGHT - BOTTOM + 17}" text-anchor="middle">{moment:{form}}</text>'
+            f'<text class="tick" x="{x(time.timestamp()):.1f}" y="{HEIGHT - BOTTOM + 17}" text-anchor="middle">{time:{form}}</text>'
         )
     day = points[-1].at.astimezone(zone).strftime("%Y-%m-%d")
     texts.append(
@@ -126,7 +118,7 @@ def _dates(points: Sequence[Point], x: _PixelScale, zone: tzinfo) -> list[str]:
 
 
 def _limit(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]:
-    """Draw the limit as a line with steps: a limit changed in the machine file did not hold before."""
+    """The limit as a step line, since the machine file may have changed it."""
     known = [(x(point.at.timestamp()), y(point.limit)) for point in points if point.limit is not None]
     if not known:
         return []
@@ -134,17 +126,17 @@ def _limit(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]
     last_y = known[-1][1]
     return [
         f'<path class="limit" d="{path}"/>',
-        # Beside the plot, not in it: the newest point is where one looks, and it may lie on the limit.
+        # Beside the plot, not in it: the newest point may lie on the limit.
         f'<text class="limit-text" x="{WIDTH - RIGHT + 5}" y="{last_y + 4:.1f}">limit</text>',
     ]
 
 
 def _mark(point: Point, px: float, y: _PixelScale, unit: str) -> list[str]:
-    """Draw bar and mark. The verdict is a shape as well as a colour."""
+    """Bar and mark of a point. The verdict has a shape as well as a colour."""
     top, bottom, middle = y(point.value + point.uncertainty), y(point.value - point.uncertainty), y(point.value)
     bar = f'<path class="bar" d="M{px:.1f} {top:.1f}V{bottom:.1f}M{px - 4:.1f} {top:.1f}h8M{px - 4:.1f} {bottom:.1f}h8"/>'
-    told = f"{number(point.value)} ± {number(point.uncertainty)} {unit}, {point.verdict}"
-    hover = f"<title>{escape(told + (', earlier table' if point.earlier else ''))}</title>"
+    text = f"{number(point.value)} ± {number(point.uncertainty)} {unit}, {point.verdict}"
+    hover = f"<title>{escape(text + (', earlier table' if point.earlier else ''))}</title>"
     earlier = " earlier" if point.earlier else ""
     if point.verdict == "pass":
         mark = f'<circle class="pass{earlier}" cx="{px:.1f}" cy="{middle:.1f}" r="4">{hover}</circle>'

@@ -1,1 +1,1 @@
-"""The HTTP interface `/api/v1`: what the store knows, and decisions on proposals. It moves nothing."""
+"""The HTTP interface `/api/v1`: stored data, and decisions on proposals. It moves no axis."""

@@ -1,4 +1,4 @@
-"""Puts the interface into the application."""
+"""Adds the interface to the application."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from abbe.service.web.api.tables import add_tables
 
 
 def add_api(app: FastAPI, sources: Sources) -> None:
-    """Add every route of the interface.
-
-    They are added to the application itself and not by a router of their own: the guard asks the application's routes what each needs.
-    """
+    """Add every route of the interface to the application itself: the auth middleware reads permissions from the application's routes."""
     for add in (add_measured, add_results, add_tables, add_plant, add_reports):
         add(app, sources)

@@ -1,4 +1,4 @@
-"""Routes: machines, campaigns, runs and what the runs hold."""
+"""Routes: machines, campaigns, runs and their samples."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from abbe.service.web.schemas import CampaignList, MachineList, RunList
 
 JSON_ROWS = 10_000
 BINARY_ROWS = 100_000
-First = Annotated[int, Query(ge=0, le=LARGEST, description="Number of the first one, from 0.")]
+First = Annotated[int, Query(ge=0, le=LARGEST, description="Number of the first row, from 0.")]
 Rows = Annotated[int, Query(ge=1, le=JSON_ROWS)]
-ChannelName = Annotated[str, Query(description="As the run's `channels` name it.")]
-WrittenState = Annotated[str | None, Query(description="As written: a run whose process died is `running` here.")]
+ChannelName = Annotated[str, Query(description="A name from the run's `channels`.")]
+WrittenState = Annotated[str | None, Query(description="As stored: a run whose process died is `running` here.")]
 OCTETS: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
@@ -39,7 +39,7 @@ def _add_machines(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/machines")
     @needs(Permission.READ)
     def machines(name: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> MachineList:
-        """Machines that the store knows, with their nominal geometry."""
+        """Machines in the store, with their nominal geometry."""
         found, after = measured.machines(sources.reader, name, cursor, limit)
         return MachineList(machines=found, next_cursor=after)
 
@@ -75,15 +75,15 @@ def _add_runs(app: FastAPI, sources: Sources) -> None:
         cursor: Cursor = None,
         limit: Limit = 50,
     ) -> RunList:
-        """Runs, newest first, also those that were broken off."""
-        given = {"campaign": campaign, "machine": machine, "test": test, "role": role, "status": status}
-        found, after = measured.runs(sources.reader, given, cursor, limit)
+        """Runs, newest first, including those that were broken off."""
+        filters = {"campaign": campaign, "machine": machine, "test": test, "role": role, "status": status}
+        found, after = measured.runs(sources.reader, filters, cursor, limit)
         return RunList(runs=found, next_cursor=after)
 
     @app.get("/api/v1/runs/{number}")
     @needs(Permission.READ)
     def run(number: Number) -> measured.RunDetail:
-        """One run, and which channels it holds."""
+        """One run with its channels."""
         return measured.run(sources.reader, number)
 
 

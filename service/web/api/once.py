@@ -1,4 +1,4 @@
-"""A request that changes something is done once for each Idempotency-Key: who repeats it gets the first answer again."""
+"""A changing request is executed once per Idempotency-Key; a repetition gets the first answer again."""
 
 from __future__ import annotations
 
@@ -24,26 +24,28 @@ Key = Annotated[
     Header(
         alias="Idempotency-Key",
         pattern=r"^[A-Za-z0-9._:-]{1,100}$",
-        description="Made up by the client for this request. Sent again with the same request, the first answer comes again; kept 7 days.",
+        description="Chosen by the client for this request. Repeating key and request returns the first answer; kept for 7 days.",
     ),
 ]
 
 
 async def once(store: Store, request: Request, key: str, body: BaseModel, work: Callable[[], BaseModel]) -> Response:
-    """Do ``work`` in a thread, unless it was done for this key; answer what it gives.
+    """Do ``work`` in a thread, unless it was done for this key, and return its answer.
 
     Raises
     ------
-    KeyReused, KeyInUse
-        The key came with another request before; its request is still being worked on.
+    KeyReused
+        The key belongs to another request.
+    KeyInUse
+        The first request with this key is still being processed.
     """
     visit: Visit = request.state.visit
     who = visit.principal.name
     digest = hashlib.sha256(canonical([request.method, request.url.path, body.model_dump(mode="json")])).hexdigest()
     known = await store.write(store.replies.claim, who, key, digest)
     if known is not None:
-        answer = _again(known.digest == digest, known.status, known.body)
-        visit.replayed = True  # for the audit: a decision stands in it once, and that somebody asked again as what it is
+        answer = _replayed(known.digest == digest, known.status, known.body)
+        visit.replayed = True  # the audit records the repetition as such, and the decision once
         return answer
     try:
         status, text = await asyncio.to_thread(_answer, work)
@@ -55,7 +57,7 @@ async def once(store: Store, request: Request, key: str, body: BaseModel, work: 
 
 
 def _answer(work: Callable[[], BaseModel]) -> tuple[int, str]:
-    """Status and body. A refusal is an answer as well; that the store is not there is none."""
+    """Status and body of an answer. A refusal is an answer; an unavailable store is not."""
     try:
         return 200, work().model_dump_json()
     except AbbeError as error:
@@ -65,16 +67,16 @@ def _answer(work: Callable[[], BaseModel]) -> tuple[int, str]:
         return refused.status_code, bytes(refused.body).decode()
 
 
-def _again(same: bool, status: int | None, body: str | None) -> Response:
+def _replayed(same: bool, status: int | None, body: str | None) -> Response:
     if not same:
         raise KeyReused("this Idempotency-Key was sent with another request before", "a new request needs a new key")
     if status is None or body is None:
-        raise KeyInUse("the request of this Idempotency-Key is still being worked on", "ask again after a minute")
+        raise KeyInUse("the request with this Idempotency-Key is still in progress", "try again after a minute")
     answer = _response(status, body)
     answer.headers[REPLAYED] = "true"
     return answer
 
 
 def _response(status: int, text: str) -> Response:
-    json.loads(text)  # what was kept is what is answered, and nothing but JSON
+    json.loads(text)  # stored answers must be JSON
     return Response(text, status, media_type="application/json" if status < 400 else MEDIA_TYPE)

@@ -1,4 +1,4 @@
-"""Routes: devices, recipes, the timetable, and the codes of errors."""
+"""Routes: devices, recipes, the timetable, and error codes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def add_plant(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/errors")
     @needs(Permission.READ)
     def errors() -> ErrorList:
-        """Every code that an error can have, and what it means."""
+        """All error codes with their meanings."""
         return ErrorList(errors=entries())
 
     @app.get("/api/v1/devices")
     @needs(Permission.READ)
     def devices() -> DeviceList:
-        """Devices of this service's machine, and when they were last heard of."""
+        """Devices of this service's machine and the time of their last answer."""
         return DeviceList(machine=machine, devices=sources.devices())
 
     @app.get("/api/v1/recipes")
@@ -38,7 +38,7 @@ def add_plant(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/schedules")
     @needs(Permission.READ)
     def schedules() -> Timetable:
-        """The timetable with what is due next, and what became of the latest slots."""
+        """The timetable with the next slot of each schedule and the outcome of the latest slots."""
         return Timetable(machine=machine, schedules=[schedule_state(sources.reader, one) for one in sources.schedules])
 
 

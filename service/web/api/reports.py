@@ -1,4 +1,4 @@
-"""Route: reports to sign, of anything that is stored. Made in a thread, few at a time; nothing is computed anew."""
+"""Route: reports to sign, from stored data without a new computation. Each runs in a thread, `AT_A_TIME` at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AT_A_TIME = 2
 
 
 class ReportKind(StrEnum):
-    """What a report is about."""
+    """Subject of a report."""
 
     RUN = "run"
     CAMPAIGN = "campaign"
@@ -32,7 +32,7 @@ class ReportKind(StrEnum):
 
 
 class ReportForm(StrEnum):
-    """How it is written."""
+    """File format of a report."""
 
     PDF = "pdf"
     HTML = "html"
@@ -63,10 +63,10 @@ def add_reports(app: FastAPI, sources: Sources) -> None:
     async def report(
         kind: ReportKind,
         number: Number,
-        form: Annotated[ReportForm, Query(description="How it is written.")] = ReportForm.PDF,
-        machine: Annotated[str | None, Query(description="Whose push, where several machines are stored.")] = None,
+        form: Annotated[ReportForm, Query(description="File format.")] = ReportForm.PDF,
+        machine: Annotated[str | None, Query(description="Machine of the push, if the store has several.")] = None,
     ) -> Response:
-        """A report to sign: figures with U by ISO 230, conditions, decision, what was not observable."""
+        """A report to sign: figures with U by ISO 230, conditions, decision, unobservable quantities."""
         async with few:
             name, data = await asyncio.to_thread(_written, sources, kind, number, form, machine)
         return Response(data, media_type=MEDIA[form], headers={"Content-Disposition": f'attachment; filename="{name}"'})

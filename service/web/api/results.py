@@ -17,16 +17,16 @@ from abbe.service.web.login.access import needs
 from abbe.service.web.schemas import CheckList, DiscoveryList, SolutionList
 
 MOST_NODES = 9
-Nodes = Annotated[int, Query(ge=2, le=MOST_NODES, description="So many per axis.")]
+Nodes = Annotated[int, Query(ge=2, le=MOST_NODES, description="Nodes per axis.")]
 Motion = Literal[
     "EXX", "EYX", "EZX", "EAX", "EBX", "ECX", "EXY", "EYY", "EZY", "EAY", "EBY", "ECY",
     "EXZ", "EYZ", "EZZ", "EAZ", "EBZ", "ECZ", "C0Y", "B0Z", "A0Z",
 ]  # fmt: skip
-Motions = Annotated[list[Motion], Query(max_length=21, description="Only what these make together; none: all of them.")]
+Motions = Annotated[list[Motion], Query(max_length=21, description="The map shows the joint effect of these; none: of all.")]
 
 
 def _no_number(value: object) -> object:
-    """Refuse a count of seconds: a person cannot check it."""
+    """Refuse a number of seconds, which people cannot check."""
     try:
         float(str(value))
     except ValueError:
@@ -35,7 +35,7 @@ def _no_number(value: object) -> object:
 
 
 UtcTime = Annotated[datetime, BeforeValidator(_no_number)]
-After = Annotated[UtcTime | None, Query(description="Only later checks (UTC if it does not say); absent: since the table came.")]
+After = Annotated[UtcTime | None, Query(description="Only later checks (UTC without an offset); absent: since the table came into force.")]
 
 
 def add_results(app: FastAPI, sources: Sources) -> None:
@@ -56,13 +56,13 @@ def _add_solutions(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/solutions/{number}")
     @needs(Permission.READ)
     def solution(number: Number) -> results.SolutionDetail:
-        """A solution: parameters with uncertainties, what was not observable, residuals, budget."""
+        """A solution: parameters with uncertainties, unobservable quantities, residuals, budget."""
         return results.solution(sources.reader, number)
 
     @app.get("/api/v1/solutions/{number}/field")
     @needs(Permission.READ)
     def field(number: Number, motion: Motions = [], nodes: Nodes = 6) -> results.VolumeMap:  # noqa: B006 - FastAPI copies it
-        """The map of the volume: deviation and uncertainty at the nodes, from the solution's whole covariance."""
+        """The volume map: deviation and uncertainty at the nodes, from the full covariance of the solution."""
         return results.volume_map(sources.reader, number, motion, nodes)
 
 
@@ -77,7 +77,7 @@ def _add_discoveries(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/discoveries/{number}")
     @needs(Permission.READ)
     def discovery(number: Number) -> results.DiscoveryDetail:
-        """A search: its states, and what it found."""
+        """A search with its states and its answer."""
         return results.discovery(sources.reader, number)
 
 

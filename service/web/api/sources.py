@@ -1,4 +1,4 @@
-"""Where the answers of the interface come from, and the parameters that many routes have."""
+"""Sources of the interface, and parameters that many routes share."""
 
 from __future__ import annotations
 
@@ -15,28 +15,18 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.web.core_link.logtail import LogTail
 
-Number = Annotated[int, Path(ge=1, le=LARGEST, description="Its number.")]
-Limit = Annotated[int, Query(ge=1, le=200, description="At most so many.")]
-Cursor = Annotated[int | None, Query(ge=1, le=LARGEST, description="`next_cursor` of the page before; absent: the newest.")]
-Filter = Annotated[str | None, Query(description="Only those that have exactly this.")]
+Number = Annotated[int, Path(ge=1, le=LARGEST, description="Number of the object.")]
+Limit = Annotated[int, Query(ge=1, le=200, description="Largest number of rows.")]
+Cursor = Annotated[int | None, Query(ge=1, le=LARGEST, description="`next_cursor` of the previous page; absent: the newest.")]
+Filter = Annotated[str | None, Query(description="Exact match.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """What the interface reads.
+    """Sources of the interface.
 
-    Parameters
-    ----------
-    reader : Reader
-        The store, the machine of this service, and now.
-    schedules : sequence of Schedule
-        The timetable.
-    devices : callable
-        Its devices, and when they were last heard of.
-    rules : Rules
-        What the machine file adds to reports.
-    tail : LogTail, optional
-        The latest lines of the log, for the diagnostics.
+    ``devices`` returns the devices with their last state; ``rules``: limits and certificates of the machine file; ``tail``: the latest log
+    lines, for the diagnostics.
     """
 
     reader: Reader

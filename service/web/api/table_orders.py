@@ -1,4 +1,4 @@
-"""Routes: what is ordered of the table in force. The core does it, as a job, and decides whether; here it is only passed on."""
+"""Routes: rollback and push of tables. They pass the order on; the core decides and executes it as a job."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def add_table_orders(app: FastAPI, core: CoreLine) -> None:
     @app.post("/api/v1/tables/rollback", status_code=202, responses=RESPONSES, response_model=JobState, max_body_size=LONGEST_BODY)
     @needs(Permission.APPROVE)
     async def rollback(request: Request, body: RollbackBody, key: Key) -> Response:
-        """Order that the table in force gives way to the one before, as `abbe comp rollback` does; refused (409) says why."""
+        """Replace the table in force by the one before it, as `abbe comp rollback` does; a refusal (409) gives the reason."""
         visit: Visit = request.state.visit
         visit.target = f"table of push {body.push} ({body.crc})"
-        reason = body.reason.replace("\0", "\ufffd")  # the one character that not every database can keep
+        reason = body.reason.replace("\0", "\ufffd")  # not every database can store NUL
         answer = await core.roll_back(body.push, int(body.crc, 16), reason, key, visit.principal.name)
-        return _passed_on(core, visit, answer)
+        return _job_answer(core, visit, answer)
 
     @app.post(
         "/api/v1/proposals/{number}/push",
@@ -42,13 +42,13 @@ def add_table_orders(app: FastAPI, core: CoreLine) -> None:
     )
     @needs(Permission.APPROVE)
     async def push(request: Request, number: Number, body: PushBody, key: Key) -> Response:
-        """Order that an approved proposal is pushed now, where the service does not push by itself; refused (409) says why."""
+        """Push an approved proposal now, unless the service pushes by itself; a refusal (409) gives the reason."""
         visit: Visit = request.state.visit
         visit.target = f"proposal {number}"
-        return _passed_on(core, visit, await core.push(number, key, visit.principal.name))
+        return _job_answer(core, visit, await core.push(number, key, visit.principal.name))
 
 
-def _passed_on(core: CoreLine, visit: Visit, answer: Answer) -> Response:
+def _job_answer(core: CoreLine, visit: Visit, answer: Answer) -> Response:
     if answer.job:
         visit.target += f", job {answer.job}"
     visit.replayed = answer.outcome == "done" and bool(answer.text)

@@ -1,4 +1,4 @@
-"""Routes: proposals of tables, decisions on them, and the journal of pushes."""
+"""Routes: proposed tables, decisions on them, and the push journal."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def _add_proposals(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/proposals")
     @needs(Permission.READ)
     def proposals(machine: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> ProposalList:
-        """Proposed tables, newest first, and where each stands."""
+        """Proposed tables with their states, newest first."""
         found, after = proposed.proposals(sources.reader, machine, cursor, limit)
         return ProposalList(proposals=found, next_cursor=after)
 
     @app.get("/api/v1/proposals/{number}")
     @needs(Permission.READ)
     def proposal(number: Number) -> proposed.ProposalDetail:
-        """One proposal: what it promises with its uncertainty, where it stands, the reasons against it."""
+        """One proposal: predicted improvement with uncertainty, state, and the reasons against it."""
         return proposed.proposal(sources.reader, number)
 
     @app.get("/api/v1/proposals/{number}/diff")
@@ -54,7 +54,7 @@ def _add_proposals(app: FastAPI, sources: Sources) -> None:
             int | None, Query(alias="with", ge=1, le=LARGEST, description="Another proposal; absent: the table in force.")
         ] = None,
     ) -> proposed.ProposalDifference:
-        """What a proposal changes: nine tables in numbers, with uncertainty."""
+        """Changes of a proposal: nine tables in numbers, with uncertainty."""
         return proposed.difference(sources.reader, number, other)
 
 
@@ -64,7 +64,7 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
     @app.post("/api/v1/proposals/{number}/approve", response_model=Decision, max_body_size=LONGEST_BODY)
     @needs(Permission.APPROVE)
     async def approve(request: Request, number: Number, body: ApproveBody, key: Key) -> Response:
-        """Approve exactly this table on exactly this base, by the rules of `abbe comp approve`; refused (409) says why."""
+        """Approve exactly this table on exactly this base, by the rules of `abbe comp approve`; a refusal (409) gives the reason."""
         name, account = _person(request)
 
         def work() -> Decision:
@@ -77,9 +77,9 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
     @app.post("/api/v1/proposals/{number}/reject", response_model=Decision, max_body_size=LONGEST_BODY)
     @needs(Permission.APPROVE)
     async def reject(request: Request, number: Number, body: RejectBody, key: Key) -> Response:
-        """Reject a proposal for good, with a reason: it cannot be approved or pushed any more."""
+        """Reject a proposal for good, with a reason: it can no longer be approved or pushed."""
         name, account = _person(request)
-        reason = body.reason.replace("\0", "\ufffd")  # the one character that not every database can keep
+        reason = body.reason.replace("\0", "\ufffd")  # not every database can store NUL
 
         def work() -> Decision:
             with _stored(sources, number):
@@ -91,14 +91,14 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
 
 @contextmanager
 def _stored(sources: Sources, number: int) -> Iterator[None]:
-    """Decide on a proposal that is there; what is wrong with its row is an answer."""
+    """Decide on an existing proposal; errors of its row become an answer."""
     sources.reader.row("proposals", number, "proposal")
     with as_stored():
         yield
 
 
 def _person(request: Request) -> tuple[str, str]:
-    """Who decides, and by which account: a token counts as its owner, so it never makes one person two."""
+    """Name and account of the person who decides; a token counts as its owner, so one person never counts as two."""
     visit: Visit = request.state.visit
     account = visit.principal.name
     return account.partition(":")[2].partition("/")[0], account
@@ -114,12 +114,12 @@ def _add_pushes(app: FastAPI, sources: Sources) -> None:
         cursor: Cursor = None,
         limit: Limit = 50,
     ) -> PushJournal:
-        """The journal of pushes, newest entry first; of a machine that was renamed under the name that its journal was begun with."""
+        """The push journal, newest entry first; a renamed machine keeps its journal under the first name."""
         found, after = pushes.push_entries(sources.reader, machine, push, state, cursor, limit)
         return PushJournal(entries=found, next_cursor=after)
 
     @app.get("/api/v1/pushes/{number}")
     @needs(Permission.READ)
     def push_entry(number: Number) -> pushes.PushEntryDetail:
-        """One entry of the journal, with everything that became known with it."""
+        """One entry of the journal with the facts that it recorded."""
         return pushes.push_entry(sources.reader, number)

@@ -1,1 +1,1 @@
-"""The line to the core process: what it knows of the moment, and what is said while it is away."""
+"""Connection to the core process: its latest state, and the answer while it is unavailable."""

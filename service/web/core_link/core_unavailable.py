@@ -1,4 +1,4 @@
-"""While the core does not answer, people get a screen that says so, programs a problem document. Old values are never shown as current."""
+"""Answers while the core is silent: a screen for people, a problem document for programs. Old values are never shown as current."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RETRY_S = "5"
 
 
 def add_core_unavailable(app: FastAPI, env: Environment) -> None:
-    """Answer `CoreSilent` on every address, by what was asked for."""
+    """Install the handler of `CoreSilent` for every address."""
 
     async def silent(request: Request, error: Exception) -> Response:
         assert isinstance(error, CoreSilent)
@@ -25,6 +25,6 @@ def add_core_unavailable(app: FastAPI, env: Environment) -> None:
 
 
 def for_people(request: Request) -> bool:
-    """Whether a browser asks for a screen. The home page always is one: its script fetches it again without an Accept header."""
+    """Whether the request is for a screen. The home page always is: its script fetches it without an Accept header."""
     path = request.url.path
     return path == "/" or (not path.startswith("/api/") and "text/html" in request.headers.get("accept", ""))

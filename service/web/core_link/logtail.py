@@ -1,4 +1,4 @@
-"""The latest lines of this process's log, for the diagnostics: kept in memory, so that no reader needs access to the log files."""
+"""The latest log lines of this process in memory, so that the diagnostics need no access to log files."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ LONGEST = 2000
 
 
 class LogTail(logging.Handler):
-    """Keeps the latest `KEPT` lines, on one line each and without passwords of URLs."""
+    """Keeps the latest `KEPT` records, one line each, without passwords in URLs."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
         self._lines: deque[str] = deque(maxlen=KEPT)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a record, as the log itself writes it."""
+        """Keep a record in the format of the log."""
         try:
             self._lines.append(visible(mask_secrets(self.format(record)))[:LONGEST])
-        except (TypeError, ValueError, KeyError, RecursionError):  # what a log cannot write must not stop what logs it
+        except (TypeError, ValueError, KeyError, RecursionError):  # a record that cannot be formatted must not stop the caller
             self.handleError(record)
 
     def lines(self) -> list[str]:
@@ -30,8 +30,8 @@ class LogTail(logging.Handler):
         return list(self._lines)
 
 
-def keep_log() -> LogTail:
-    """Keep what is logged from now on, in the form of the handler that is there already."""
+def capture_log() -> LogTail:
+    """Add a log tail to the root logger, with the format of the existing handler."""
     tail, root = LogTail(), logging.getLogger()
     if root.handlers and root.handlers[0].formatter is not None:
         tail.setFormatter(root.handlers[0].formatter)

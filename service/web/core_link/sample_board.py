@@ -1,7 +1,7 @@
-"""What the running path reads, as the browsers get it: the latest minute, and a bounded queue for each that looks on.
+"""Live samples of the running path for browsers: the latest minute, and a bounded queue for each listener.
 
-A frame is binary, little endian: version (u32, 1), number of the path (u32), number of its first sample (u32), how many follow (u32), when
-the last one arrived at the core (f64, UTC ms), then the deviations (f32, µm; NaN: the box did not read).
+A frame is binary, little endian: version (u32, 1), number of the path (u32), number of its first sample (u32), count of samples (u32),
+arrival of the last sample at the core (f64, UTC ms), then the deviations (f32, µm; NaN: no reading).
 """
 
 from __future__ import annotations
@@ -23,54 +23,48 @@ VERSION = 1
 HEAD = struct.Struct("<IIIId")
 FLOAT_B = 4
 KEPT_FRAMES = 1200
-"""Who comes later gets so many: a minute at 20 Hz."""
+"""Frames that a new listener gets at once: a minute at 20 Hz."""
 QUEUE = 40
-"""So many frames wait for one browser; then the oldest go. The disk has had them all."""
+"""Frames that wait for one browser; then the oldest are dropped. The recording on disk is complete."""
 MOST_LISTENERS, MOST_EACH = 32, 12
-"""Listeners at once, in all and of one account: one account cannot keep the others out."""
+"""Simultaneous listeners, in all and per account: one account cannot shut out the others."""
 _PATH = TypeAdapter(RecordedPath)
 
 
 class SampleBoard:
-    """The path that is recorded now and its latest frames."""
+    """The path that is being recorded and its latest frames."""
 
     def __init__(self) -> None:
         self._path: RecordedPath | None = None
         self._frames: deque[bytes] = deque(maxlen=KEPT_FRAMES)
         self._listeners: dict[asyncio.Queue[bytes | None], str] = {}
         self.dropped = 0
-        """Frames that some browser was too slow for."""
+        """Number of frames that were dropped for slow browsers."""
 
-    def hear_path(self, path: RecordedPath) -> None:
-        """The core begins a path, or (number 0) has none any more."""
+    def set_path(self, path: RecordedPath) -> None:
+        """Set the path that is being recorded; number 0: none."""
         self._path = path if path.number else None
         if path.number:
             self._frames.clear()
-        self._tell(b"")
+        self._publish(b"")
 
-    def hear_samples(self, told: LiveSamples) -> None:
-        """The core has read more.
-
-        Raises
-        ------
-        ChannelBroken
-            What it sends are no samples.
-        """
+    def add_samples(self, samples: LiveSamples) -> None:
+        """Pass new samples on to the listeners. Raises ChannelBroken if they cannot be decoded."""
         try:
-            values = b64decode(told.values, validate=True)
+            values = b64decode(samples.values, validate=True)
         except ValueError:
             raise ChannelBroken("samples on the channel of the service are not base64") from None
         if len(values) % FLOAT_B:
             raise ChannelBroken(f"samples on the channel of the service are {len(values)} bytes long: no float32")
-        frame = HEAD.pack(VERSION, told.path, told.first % 2**32, len(values) // FLOAT_B, told.arrived_ms) + values
+        frame = HEAD.pack(VERSION, samples.path, samples.first % 2**32, len(values) // FLOAT_B, samples.arrived_ms) + values
         self._frames.append(frame)
-        self._tell(frame)
+        self._publish(frame)
 
     def end(self) -> None:
-        """Nobody who looks on waits any longer."""
-        self._tell(None)
+        """Release all listeners."""
+        self._publish(None)
 
-    def _tell(self, frame: bytes | None) -> None:
+    def _publish(self, frame: bytes | None) -> None:
         for queue in self._listeners:
             if queue.full():
                 queue.get_nowait()
@@ -79,8 +73,8 @@ class SampleBoard:
 
     @contextmanager
     def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[str | bytes]] | None]:
-        """A way to get what there is and everything from now on, texts (a path, as JSON) and frames; None: too many look on,
-        or too many of this account.
+        """Subscribe to the kept frames and all later ones: text (a path as JSON) and binary frames; None: too many listeners, in all or of
+        this account.
         """
         if len(self._listeners) >= MOST_LISTENERS or list(self._listeners.values()).count(who) >= MOST_EACH:
             yield None
@@ -89,14 +83,14 @@ class SampleBoard:
         begun, kept = self._path, b"".join(self._frames)
 
         async def parts() -> AsyncIterator[str | bytes]:
-            told = begun
-            yield _text(told)
-            if kept and told is not None:
+            path = begun
+            yield _text(path)
+            if kept and path is not None:
                 yield kept
             while (frame := await queue.get()) is not None:
-                if self._path is not told:
-                    told = self._path
-                    yield _text(told)
+                if self._path is not path:
+                    path = self._path
+                    yield _text(path)
                 if frame:
                     yield frame
 

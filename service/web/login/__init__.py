@@ -1,1 +1,1 @@
-"""Who is asking: password, session, token, and what each role may."""
+"""Login with passwords, sessions and tokens, and the permissions of routes."""

@@ -1,4 +1,4 @@
-"""What each route needs, declared on the route itself. One without a declaration is shut, and a test fails."""
+"""The permission that each route needs, declared on the route. A route without a declaration is closed, and a test fails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MUTATING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 class Open(Enum):
-    """What needs no permission: the way in, pictures and style, and the two questions of supervisors."""
+    """Marks routes without permission: login, pictures and style, and the two health checks."""
 
     PUBLIC = "public"
 
@@ -25,12 +25,12 @@ Need = Permission | Open
 PUBLIC = Open.PUBLIC
 ACTIVE_HEADER = "X-Abbe-Active"
 REFRESHED = frozenset({"/api/v1/status", "/api/v1/live", "/api/v1/live/samples"})
-"""What pages ask again and again by themselves."""
+"""Paths that pages refresh by themselves."""
 MOUNTS: dict[str, Need] = {"/static": PUBLIC}
 
 
 def needs(need: Need) -> Callable[[F], F]:
-    """Declare what a route needs; stands directly above its function."""
+    """Declare the permission of a route; the decorator stands directly above its function."""
 
     def declare(endpoint: F) -> F:
         setattr(endpoint, MARK, need)
@@ -40,24 +40,24 @@ def needs(need: Need) -> Callable[[F], F]:
 
 
 def need_of(route: BaseRoute) -> Need | None:
-    """What a route needs; None: it is not declared."""
+    """Declared permission of a route; None: no declaration."""
     if isinstance(route, Mount):
         return MOUNTS.get(route.path)
     found = getattr(getattr(route, "endpoint", None), MARK, None)
     return found if isinstance(found, Permission | Open) else None
 
 
-def in_use(path: str, said: str | None) -> bool:
-    """Tell whether a request is a use of its session: one that a page makes by itself does not keep the session alive.
+def in_use(path: str, active: str | None) -> bool:
+    """Whether a request extends its session; an automatic refresh does not.
 
-    ``said``: the header ``X-Abbe-Active``, "1" if a person has touched the page since its last request, "0" if not. Without it
-    everything counts but what pages refresh.
+    ``active``: the header ``X-Abbe-Active``, "1" if a person has used the page since its last request, "0" if not. Without the header
+    every path outside `REFRESHED` counts as use.
     """
-    return said == "1" if said is not None else path not in REFRESHED
+    return active == "1" if active is not None else path not in REFRESHED
 
 
-def cells(routes: Sequence[BaseRoute]) -> Iterator[tuple[str, str, Need | None]]:
-    """Every method of every path, with what it needs: what a test of the rights walks through."""
+def route_permissions(routes: Sequence[BaseRoute]) -> Iterator[tuple[str, str, Need | None]]:
+    """Method, path and permission of every route, for tests of the rights and for OpenAPI."""
     for route in routes:
         methods = getattr(route, "methods", None) or {"GET"}
         for method in sorted(methods - {"HEAD"}):
@@ -65,5 +65,5 @@ def cells(routes: Sequence[BaseRoute]) -> Iterator[tuple[str, str, Need | None]]
 
 
 def route_of(routes: Sequence[BaseRoute], scope: Any) -> BaseRoute | None:
-    """The route that will answer; None: no path, or not by this method (the router says which)."""
+    """The route that will answer; None: unknown path or method (the router distinguishes them)."""
     return next((route for route in routes if route.matches(scope)[0] is Match.FULL), None)

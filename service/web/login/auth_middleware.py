@@ -1,6 +1,6 @@
-"""In front of every route: rate, who asks, how long the body is, what the route needs, where the request comes from; behind it: the record.
+"""Middleware that checks rate, identity, body length, permission and origin before every route, and records changing requests.
 
-Pure ASGI. Nothing of a body is read for somebody unknown.
+Pure ASGI. It reads no body of an unknown visitor.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ CSRF_HEADER = "X-CSRF-Token"
 
 @dataclass
 class Visit:
-    """What is known of a request; handlers find it in ``request.state.visit``. ``target``, ``who``: for the record, if they know better.
-    ``replayed``: the answer was given before, and nothing was done again."""
+    """Facts about a request; handlers find them in ``request.state.visit`` and may set ``target`` and ``who`` for the audit.
+
+    ``replayed``: the stored answer was sent again, and nothing was done.
+    """
 
     principal: Principal
     address: str
@@ -40,16 +42,10 @@ class Visit:
 
 
 class AuthMiddleware:
-    """Lets through what is allowed.
+    """Passes allowed requests on to ``app``.
 
-    Parameters
-    ----------
-    app : ASGI application
-        Behind it.
-    routes : sequence of routes
-        Of the application, as they are at the time of a request.
-    auth : Authenticator, optional
-        Without one there are no users: everybody is an onlooker, and nothing can be changed.
+    ``routes`` is read at each request, so later routes count too. Without ``auth`` there are no users: every visitor is an onlooker, and
+    no request may change anything.
     """
 
     def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], auth: Authenticator | None) -> None:
@@ -57,7 +53,7 @@ class AuthMiddleware:
         self._behind_tls = auth is not None and auth.behind_tls
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let pass, or answer."""
+        """Pass the request on, or answer it."""
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
@@ -67,7 +63,7 @@ class AuthMiddleware:
             await _answer(problem(429, "too many requests from this address", headers={"Retry-After": "1"}), scope, receive, send)
             return
         route = route_of(self._routes, scope)
-        if route is None:  # the router says what is not there, and what is there by another method
+        if route is None:  # the router distinguishes unknown paths from unknown methods
             await self._app(scope, receive, send)
             return
         visit = Visit(NOBODY, address)
@@ -86,9 +82,9 @@ class AuthMiddleware:
             await self._app(scope, receive, send)
 
     async def _refusal(self, request: HTTPConnection, need: Need | None, visit: Visit, body: Body | None) -> Response | None:
-        """Why a request is not let through; None: it is. ``body``: of one that changes something."""
+        """Response that refuses the request; None: allowed. ``body``: body of a changing request."""
         if need is None:
-            return problem(403, "nobody has said who may do this")
+            return problem(403, "this route declares no permission")
         changes = body is not None
         bearer = _bearer(request)
         tls = is_tls(request, behind_tls=self._behind_tls)
@@ -108,11 +104,11 @@ class AuthMiddleware:
         return None
 
     def _foreign(self, request: HTTPConnection, visit: Visit, need: Need, *, changes: bool) -> Response | None:
-        """Whether another site's page sends this. A browser always says where from; a program with a token has no cookie to be misused."""
+        """Refusal of a request from another site's page. Browsers always send an origin; a program with a token has no cookie to misuse."""
         origin = request.headers.get("origin")
         by_token = visit.principal.by == "token"
         if not (origin is None and by_token) and not is_ours(request, origin, behind_tls=self._behind_tls):
-            return problem(403, "this came from another page than ours (Origin)")
+            return problem(403, "the request came from a foreign page (Origin)")
         if changes and need is not PUBLIC and not by_token:
             sent = request.headers.get(CSRF_HEADER, "")
             if not hmac.compare_digest(sent.encode(), csrf_token(visit.secret).encode()):
@@ -122,7 +118,7 @@ class AuthMiddleware:
     async def _recorded(
         self, auth: Authenticator, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
     ) -> None:
-        """Answer, with a record of it on disk before the answer leaves. What could not be recorded is not begun."""
+        """Answer once the record is on disk. Work that cannot be recorded does not begin."""
         scope, receive, send = call
         log = _Log(auth, visit, f"{scope['method']} {getattr(route, 'path', '')}", scope["path"], refused=refused is not None)
         if refused is None:
@@ -162,14 +158,14 @@ class _Log:
     unrecorded: bool = False
 
     async def answered(self, status: int) -> None:
-        """Record how it was answered. Refusals of one address are not all recorded; what may have changed something always is."""
-        if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.auth.noise.take(self.visit.address)):
+        """Record the status of the answer. Refusals are rate-limited per address; possible changes are always recorded."""
+        if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.auth.recorded_refusals.take(self.visit.address)):
             return
         kind = "replayed" if self.visit.replayed else "done" if status < 400 else "refused" if status < 500 or self.refused else "failed"
         await self._write(f"{kind} {status}")
 
     async def broken(self, error: BaseException) -> None:
-        """Record that it ended in a defect, or was broken off; the service's log has the details."""
+        """Record that the request failed or was cancelled; the service's log has the details."""
         if self.unrecorded:
             return
         try:
@@ -191,7 +187,7 @@ class _Log:
 
 
 def _unknown(request: HTTPConnection, principal: Principal, *, changes: bool) -> Response | None:
-    # Without users everybody may look; to change something one has to be somebody.
+    # Without users everybody may look; a change needs a known user.
     if principal is NOBODY or (changes and principal.by == "nobody"):
         if "text/html" in request.headers.get("accept", "") and not changes and request.scope["type"] == "http":
             return RedirectResponse("/login", 303)

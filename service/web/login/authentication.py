@@ -1,4 +1,4 @@
-"""What the middleware asks: whose secret this is, whether another try is allowed, and where it is recorded."""
+"""Identity of a request, rate limits and audit, as the middleware uses them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ COOKIE = "abbe"
 
 
 @dataclass(frozen=True, slots=True)
-class Front:
-    """How visitors get to the page.
+class Endpoint:
+    """How visitors reach the service.
 
     Parameters
     ----------
     port : int
-        Where the service listens; in the name of its cookies, since browsers send cookies to every port of a host. 0: not in it.
+        Port of the service, part of the names of its cookies, since browsers send cookies to every port of a host; 0: not part of them.
     behind_tls : bool
-        A reverse proxy on this computer takes the TLS off: every request counts as one over TLS, and the last address in its
+        A reverse proxy on this computer terminates TLS: every request counts as one over TLS, and the last address in its
         ``X-Forwarded-For`` is the visitor's.
     """
 
@@ -35,26 +35,13 @@ class Front:
     behind_tls: bool = False
 
 
-ALONE = Front()
+DEFAULT_ENDPOINT = Endpoint()
 
 
 class Authenticator:
     """Users, lockout, rate limits and audit of one service.
 
-    Parameters
-    ----------
-    store : Store
-        Users and audit are read from and written to it.
-    people : People
-        The users.
-    book : AuditBook
-        The audit.
-    now_s : callable
-        Monotonic seconds.
-    front : Front
-        How visitors get here.
-    rate_hz, burst : float
-        Requests of one address a second, and at once.
+    ``now_s``: monotonic seconds; ``rate_hz``, ``burst``: requests of one address per second, and at once.
     """
 
     def __init__(
@@ -62,31 +49,31 @@ class Authenticator:
         store: Store,
         people: People,
         book: AuditBook,
-        front: Front = ALONE,
+        endpoint: Endpoint = DEFAULT_ENDPOINT,
         *,
         now_s: Callable[[], float] = time.monotonic,
         rate_hz: float = 50.0,
         burst: float = 200.0,
     ) -> None:
         self.store, self.people, self.book = store, people, book
-        self._cookie, self.behind_tls = f"{COOKIE}-{front.port}" if front.port else COOKIE, front.behind_tls
+        self._cookie, self.behind_tls = f"{COOKIE}-{endpoint.port}" if endpoint.port else COOKIE, endpoint.behind_tls
         self.lockout = Lockout(now_s)
         self.requests = Buckets(rate_hz, burst, now_s)
-        self.noise = Buckets(1 / 6, 20.0, now_s)
-        """Refusals of one address that are recorded: who floods the login must not fill the audit."""
+        self.recorded_refusals = Buckets(1 / 6, 20.0, now_s)
+        """Limits recorded refusals per address: a flood of logins must not fill the audit."""
 
     def cookie(self, *, tls: bool) -> str:
-        """Name of the cookie of a session. With TLS only this host can set it."""
+        """Name of the session cookie. With TLS only this host can set it."""
         return f"__Host-{self._cookie}" if tls else self._cookie
 
     def device_cookie(self) -> str:
-        """Name of the cookie of a browser in which somebody has logged in."""
+        """Name of the cookie that marks a browser with an earlier login."""
         return f"{self._cookie}-device"
 
     async def who(self, bearer: str | None, secret: str | None, *, in_use: bool = True) -> Principal:
-        """Who asks: by token if one is given, else by cookie; an onlooker while there are no users at all.
+        """Identify the visitor by token, else by cookie; an onlooker while there are no users.
 
-        ``in_use`` False: a page that refreshes itself asks, which does not keep its session alive.
+        ``in_use`` False: an automatic refresh, which does not extend the session.
         """
         return await asyncio.to_thread(self._who, bearer, secret, in_use)
 
@@ -100,20 +87,14 @@ class Authenticator:
         return NOBODY if self.people.anybody() else ONLOOKER
 
     async def ready(self) -> None:
-        """Make sure that a record can be written, before something is done.
-
-        Raises
-        ------
-        AbbeError
-            It cannot.
-        """
+        """Check before a change that the audit is writable. Raises AbbeError if not."""
         await asyncio.to_thread(self.book.ready)
 
     async def record(self, event: AuditEvent) -> None:
-        """Write a record; on return it is on disk."""
+        """Write a record to disk."""
         await asyncio.to_thread(self.book.write, event)
 
 
 def csrf_token(secret: str) -> str:
-    """What a page of ours sends back with everything that changes something; a foreign page cannot read it."""
+    """Token that our pages send with every change; a foreign page cannot read it."""
     return hmac.new(secret.encode(), b"csrf", hashlib.sha256).hexdigest()

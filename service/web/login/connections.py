@@ -1,7 +1,7 @@
-"""Connections that say nothing, or say it for ever, are let go; a visitor who asks is served while they come.
+"""HTTP connections with time limits: idle or endless requests are dropped, so that other visitors are served.
 
-uvicorn ends a connection that is idle after an answer, and refuses everybody once so many are connected. Here a request has to come to its
-end in time, and when there are too many connections the one that has been silent longest makes room.
+uvicorn only ends connections that are idle after an answer, and refuses everybody above a number of connections. Here every request has a
+deadline, and above `MOST_CONNECTIONS` the connection that has been silent longest is dropped.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from uvicorn.protocols.http.flow_control import service_unavailable
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEADERS_S = 10.0
-"""From the connection, or from the answer before it, to the end of a request's headers."""
+"""From the connection, or from the previous answer, to the end of a request's headers."""
 BODY_S = 20.0
-"""To the end of its body: forms are short."""
+"""From the headers to the end of the body: forms are short."""
 LINGER_S = 2.0
-"""So long the rest of a body that was refused is thrown away as it comes: who is cut off while he sends may never read the answer."""
+"""How long the rest of a refused body is read and discarded: a client that is cut off while sending may never read the answer."""
 READ_S = 30.0
-"""So long an answer may wait for its reader, from when he stops reading."""
+"""How long an answer may wait after the client stops reading."""
 MOST_CONNECTIONS = 200
-MOST_AT_WORK = 100
+MOST_BUSY = 100
 
 
-class PatientProtocol(H11Protocol):
-    """HTTP of one connection, with an end to each wait."""
+class TimeLimitedProtocol(H11Protocol):
+    """HTTP protocol of one connection with a limit for every wait."""
 
-    def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **named)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self._waits_for: Any = None
         self._wait: asyncio.TimerHandle | None = None
         self._reader_wait: asyncio.TimerHandle | None = None
@@ -42,28 +42,28 @@ class PatientProtocol(H11Protocol):
         super().connection_made(transport)
         self._watch()
         if len(self.connections) > MOST_CONNECTIONS:
-            others = [one for one in self.connections if isinstance(one, PatientProtocol) and one is not self and not one.at_work()]
+            others = [one for one in self.connections if isinstance(one, TimeLimitedProtocol) and one is not self and not one.is_busy()]
             if others:
-                min(others, key=lambda one: one.silent_since_s).let_go()
+                min(others, key=lambda one: one.silent_since_s).drop()
             else:
-                self.let_go()
+                self.drop()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait for nothing any more."""
+        """Cancel all timers."""
         super().connection_lost(exc)
         self._stop_waiting()
         self._watch_reader(stopped=False)
 
     def data_received(self, data: bytes) -> None:
-        """Take what came; a piece of a request is no request."""
-        # Refused by number are those who have asked, not those who are there, or are asking slowly.
-        busy = sum(isinstance(one, PatientProtocol) and one.at_work() for one in self.connections)
-        self.app = service_unavailable if busy >= MOST_AT_WORK else self._whole_app
+        """Receive data; only complete requests count as busy."""
+        # The limit counts complete requests, not idle connections or slow senders.
+        busy = sum(isinstance(one, TimeLimitedProtocol) and one.is_busy() for one in self.connections)
+        self.app = service_unavailable if busy >= MOST_BUSY else self._whole_app
         super().data_received(data)
         self._watch()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request; for the rest of one that was answered before it ended, not long."""
+        """Wait for the next request; for the rest of a request that was answered early, only `LINGER_S`."""
         self.silent_since_s = self.loop.time()
         super().on_response_complete()
         self._watch()
@@ -71,35 +71,35 @@ class PatientProtocol(H11Protocol):
             self._wait_for(h11.SEND_BODY, LINGER_S)
 
     def pause_writing(self) -> None:
-        """The reader does not read."""
+        """Start the limit for a client that stopped reading."""
         super().pause_writing()
         self._watch_reader(stopped=True)
 
     def resume_writing(self) -> None:
-        """He reads."""
+        """End the limit: the client reads again."""
         super().resume_writing()
         self._watch_reader(stopped=False)
 
-    def at_work(self) -> bool:
-        """Tell whether a whole request is being answered."""
-        # Before the first request there is no cycle, whatever uvicorn's types say.
+    def is_busy(self) -> bool:
+        """Whether a complete request is being answered."""
+        # Before the first request there is no cycle, contrary to uvicorn's types.
         return self._waits_for is None and getattr(self.cycle, "response_complete", True) is False
 
-    def let_go(self) -> None:
-        """Close at once: a client that does not read gets no closing message either."""
+    def drop(self) -> None:
+        """Close at once, without a closing message."""
         self._stop_waiting()
         self._watch_reader(stopped=False)
         self.connections.discard(self)
         self.transport.abort()
 
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """From here on it is a WebSocket's connection, with waits of its own."""
+        """Hand the connection over to the WebSocket protocol, which has limits of its own."""
         self._upgraded = True
         self._stop_waiting()
         super().handle_websocket_upgrade(event)
 
     def _watch(self) -> None:
-        """Wait for what the visitor has to say next; pieces of it do not make the wait longer."""
+        """Start the limit for the client's next step; partial data does not extend it."""
         if self._upgraded:
             return
         state = self.conn.their_state
@@ -115,7 +115,7 @@ class PatientProtocol(H11Protocol):
     def _wait_for(self, state: Any, wait_s: float) -> None:
         self._stop_waiting()
         self._waits_for = state
-        self._wait = self.loop.call_later(wait_s, self.let_go)
+        self._wait = self.loop.call_later(wait_s, self.drop)
 
     def _stop_waiting(self) -> None:
         self._waits_for = None
@@ -128,4 +128,4 @@ class PatientProtocol(H11Protocol):
             self._reader_wait.cancel()
             self._reader_wait = None
         if stopped:
-            self._reader_wait = self.loop.call_later(READ_S, self.let_go)
+            self._reader_wait = self.loop.call_later(READ_S, self.drop)

@@ -1,4 +1,4 @@
-"""The way in and out, and what an admin and an auditor read."""
+"""Login and logout, and the routes for admins and auditors."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from abbe.service.web.schemas import AuditList, Me, Problem, UserList
 
 LONGEST_FORM = 4096
 DEVICE_S = 90 * 86_400
-"""So long a browser is known again; what that is good for stands in `service/users/lockout.py`."""
+"""How long a browser with an earlier login is recognized; see `service/users/lockout.py`."""
 
 
 def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
-    """Add the routes of users to the application."""
+    """Add login, logout and the user routes to the application."""
 
     def page(status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
         headers = {"Retry-After": str(ceil(wait_s))} if wait_s else None
@@ -48,22 +48,22 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
             return problem(413, "a login is a short form of two fields")
         name, password = fields.get("name", ""), fields.get("password", "")
         visit.target = "unknown user"
-        came = await asyncio.to_thread(_came, auth, request, name)
-        wait_s = auth.lockout.wait_s(name, came)
+        origin = await asyncio.to_thread(_login_origin, auth, request, name)
+        wait_s = auth.lockout.wait_s(name, origin)
         if wait_s > 0:
             return page(429, f"Too many tries. Wait {ceil(wait_s)} s.", wait_s)
-        # Counted before the password is looked at: tries that come together must not all see a free account.
-        wait_s = auth.lockout.failed(name, came)
+        # Counted before the password check: simultaneous tries must not all find the account unlocked.
+        wait_s = auth.lockout.failed(name, origin)
         user = await asyncio.to_thread(auth.people.check, name, password)
         visit.target = name if await asyncio.to_thread(auth.people.known, name) else "unknown user"
         if user is None:
             return page(401, "Name or password is wrong." + (f" Next try in {ceil(wait_s)} s." if wait_s else ""))
-        auth.lockout.succeeded(name, came)
+        auth.lockout.succeeded(name, origin)
         visit.who = f"user:{user.name}"
         secret = await asyncio.to_thread(auth.people.begin, user, visit.secret)
         answer = RedirectResponse("/", 303)
         _set_cookie(auth, request, answer, secret)
-        if not came.device:
+        if not origin.device:
             made, tls = await asyncio.to_thread(auth.people.new_device, user), is_tls(request, behind_tls=auth.behind_tls)
             answer.set_cookie(auth.device_cookie(), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
         return answer
@@ -92,7 +92,7 @@ def _add_reading(app: FastAPI, auth: Authenticator) -> None:
     @app.get("/api/v1/session", responses=refusals)
     @needs(Permission.READ)
     async def session(request: Request) -> Me:
-        """Who asks, what he may do, and the token for the header X-CSRF-Token."""
+        """The current user, their permissions, and the token for the header X-CSRF-Token."""
         visit: Visit = request.state.visit
         who = visit.principal
         token = csrf_token(visit.secret) if visit.secret else ""
@@ -111,14 +111,14 @@ def _add_reading(app: FastAPI, auth: Authenticator) -> None:
         return AuditList(records=await asyncio.to_thread(people.audit, auth.store, limit))
 
 
-def _came(auth: Authenticator, request: Request, name: str) -> Came:
+def _login_origin(auth: Authenticator, request: Request, name: str) -> Came:
     visit: Visit = request.state.visit
     device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(), ""))
     return Came(visit.address, device, here=is_local(visit.address) and not auth.behind_tls)
 
 
 def _set_cookie(auth: Authenticator, request: Request, answer: Response, secret: str) -> None:
-    """The cookie dies with the browser; how long the session lasts is decided here, not there."""
+    """Set a cookie that ends with the browser; the server alone limits the session."""
     tls = is_tls(request, behind_tls=auth.behind_tls)
     age = None if secret else 0
     answer.set_cookie(auth.cookie(tls=tls), secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)

@@ -1,1 +1,1 @@
-"""The operator's screens beside the home page: read from the store, written on the server in the reader's language."""
+"""The operator's screens besides the home page, rendered on the server from the store in the reader's language."""

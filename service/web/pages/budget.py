@@ -1,4 +1,4 @@
-"""The uncertainty budget of a solution for the screen: sources, coverage intervals, and what the trials said of them."""
+"""The uncertainty budget of a solution for the screen: sources, coverage intervals, and Monte Carlo trials."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from abbe.service.rendering.plots.bars import contribution_bars
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 
-Say = Callable[..., str]
+Translate = Callable[..., str]
 NOTHING = Markup("")
 UM = 1e6
 """From mm/mm and rad to µm/m and µrad."""
@@ -25,7 +25,7 @@ UM = 1e6
 
 @dataclass(frozen=True, slots=True)
 class SourceLine:
-    """One source: u and share; type of its evaluation and degrees of freedom, a dash where the solution does not hold them."""
+    """One source: u, share, type of evaluation and degrees of freedom; a dash if the solution lacks them."""
 
     name: str
     words: str
@@ -49,8 +49,8 @@ class IntervalLine:
 
 @dataclass(frozen=True, slots=True)
 class BudgetScreen:
-    """The budget in the reader's units. ``total``: u of all sources together; ``worst``: results at the worst known place; ``old``: without
-    types and freedom.
+    """The budget in the reader's units. ``total``: combined u; ``worst``: results at the worst point; ``old``: without evaluation types and
+    degrees of freedom.
     """
 
     number: int
@@ -67,8 +67,8 @@ class BudgetScreen:
     old: bool = False
 
 
-def budget_screen(store: Store, record: SolutionRecord, say: Say) -> BudgetScreen:
-    """The budget as the store has it; nothing is computed anew but the ends of intervals."""
+def budget_screen(store: Store, record: SolutionRecord, translate: Translate) -> BudgetScreen:
+    """The stored budget; only the ends of intervals are computed."""
     solution = stored_solution(record.doc, record.id)
     campaign = store.campaigns.find(record.campaign_id).name
     lines, worst, trials = solution.uncertainty.budget, solution.uncertainty.worst_point, solution.monte_carlo
@@ -76,8 +76,8 @@ def budget_screen(store: Store, record: SolutionRecord, say: Say) -> BudgetScree
         return BudgetScreen(record.id, campaign)
     bars = [Contribution(_name(b), b.u_um) for b in lines]
     total = float(np.sqrt(sum(b.u_um**2 for b in lines)))
-    # The SVG writer has escaped every text; escaping again would show the reader the tags.
-    picture = Markup(contribution_bars(bars, key="budget", heading=say("budget.bars"), unit=current().drawn()))  # noqa: S704
+    # The SVG writer has already escaped every text.
+    picture = Markup(contribution_bars(bars, key="budget", heading=translate("budget.bars"), unit=current().drawn()))  # noqa: S704
     return BudgetScreen(
         record.id, campaign, [_source(b) for b in lines], _size(total, 2), picture, _worst(worst),
         ", ".join(placed(v, current().drawn("mm")) for v in worst.at_mm), _size(worst.expanded_vector_um, 2),
@@ -87,7 +87,7 @@ def budget_screen(store: Store, record: SolutionRecord, say: Say) -> BudgetScree
 
 
 def _name(b: BudgetLineValue) -> str:
-    """Short name of a source; as it is where it has no translation."""
+    """Short name of a source, unchanged without a translation."""
     return current().state("source", b.source)
 
 
@@ -101,7 +101,7 @@ def _source(b: BudgetLineValue) -> SourceLine:
 
 
 def _worst(worst: WorstPoint) -> list[IntervalLine]:
-    """Components of the deviation with the interval of 95 % as it was stored (k from its degrees of freedom)."""
+    """Components of the deviation with the stored 95 % interval (k from its degrees of freedom)."""
     rows = zip(("dX", "dY", "dZ"), worst.deviation_um, worst.expanded_um, strict=True)
     return [_interval(name, value, expanded, "µm") for name, value, expanded in rows]
 
@@ -115,7 +115,7 @@ def _interval(name: str, value: float, expanded: float, unit: str) -> IntervalLi
     shown, half = frame.with_u(value, expanded / COVERAGE, unit)
     if not (finite(value) and finite(expanded)):
         return IntervalLine(name, shown, half, NOT_AVAILABLE, NOT_AVAILABLE, frame.unit(unit))
-    # The ends are rounded as U is: 470 to tens.
+    # The ends have the resolution of U: with U = 470, tens.
     decimals = 1 - math.floor(math.log10(float(half))) if expanded > 0.0 else 0
     low, high = (fixed(end / frame.drawn(unit).size, decimals) for end in (value - expanded, value + expanded))
     return IntervalLine(name, shown, half, low, high, frame.unit(unit))
@@ -125,4 +125,4 @@ def _trials(trials: MonteCarloCheck | None) -> list[tuple[str, str, str, str]]:
     if trials is None:
         return []
     rows = zip(("dX", "dY", "dZ"), trials.stated_um, trials.found_um, trials.valid, strict=True)
-    return [(name, _size(a, 3), _size(b, 3), current().say("yes" if ok else "compare.no")) for name, a, b, ok in rows]
+    return [(name, _size(a, 3), _size(b, 3), current().translate("yes" if ok else "compare.no")) for name, a, b, ok in rows]

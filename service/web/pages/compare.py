@@ -1,4 +1,4 @@
-"""Up to four runs of one kind for the screen: which can be chosen, one picture on one scale, difference of two, figures side by side."""
+"""Comparison of up to four runs of one kind: choices, a picture on one scale, the difference of two, figures side by side."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from abbe.service.verification.compare_runs import (
     remarks,
 )
 from abbe.service.web.frame import current
-from abbe.service.web.pages.context import found
+from abbe.service.web.pages.context import find_or_none
 from abbe.service.web.pages.runs import run_document
 
 LETTERS = "ABCD"
 LISTED = 40
-UNUSED = (KeyError, TypeError, ValueError, IndexError)
-Say = Callable[..., str]
+MALFORMED = (KeyError, TypeError, ValueError, IndexError)
+Translate = Callable[..., str]
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedLine:
-    """A figure in the reader's unit: value and U of each run, difference of last and first, and what it says: yes, no, cannot tell."""
+    """A figure in the reader's unit: value and U of each run, difference of last and first; ``differs``: yes, no, cannot tell."""
 
     symbol: str
     name: str
     unit: str
     values: Sequence[tuple[str, str]]
-    apart: tuple[str, str]
-    told: str
+    difference: tuple[str, str]
+    differs: str
 
 
 @dataclass(frozen=True, slots=True)
 class CompareScreen:
-    """``choices``: runs that may be chosen; ``runs``: those that were; ``trouble``: why they cannot be compared."""
+    """A comparison. ``choices``: selectable runs; ``runs``: the selected ones; ``trouble``: why they cannot be compared."""
 
     choices: Sequence[RunRecord]
     runs: Sequence[tuple[str, RunRecord]] = ()
@@ -62,40 +62,40 @@ class CompareScreen:
     trouble: str = ""
 
 
-def compare_screen(store: Store, numbers: Sequence[int], say: Say, rules: Rules) -> CompareScreen:
-    """Compare runs of the store; fewer than two: what can be chosen."""
+def compare_screen(store: Store, numbers: Sequence[int], translate: Translate, rules: Rules) -> CompareScreen:
+    """Compare runs of the store; with fewer than two, show the choices."""
     numbers = list(dict.fromkeys(numbers))
-    records = [found(store.runs.find, n) for n in numbers]
-    lost = [str(n) for n, record in zip(numbers, records, strict=True) if record is None]
-    there = [record for record in records if record is not None]
-    choices = _choices(store, there)
-    runs = list(zip(LETTERS, there, strict=False))
-    if lost:
-        return CompareScreen(choices, trouble=say("compare.lost", numbers=", ".join(lost)))
-    if len(there) > MOST:
-        return CompareScreen(choices, trouble=say("compare.too_many", n=MOST))
-    if len(there) < 2:
+    records = [find_or_none(store.runs.find, n) for n in numbers]
+    unknown = [str(n) for n, record in zip(numbers, records, strict=True) if record is None]
+    known = [record for record in records if record is not None]
+    choices = _choices(store, known)
+    runs = list(zip(LETTERS, known, strict=False))
+    if unknown:
+        return CompareScreen(choices, trouble=translate("compare.lost", numbers=", ".join(unknown)))
+    if len(known) > MOST:
+        return CompareScreen(choices, trouble=translate("compare.too_many", n=MOST))
+    if len(known) < 2:
         return CompareScreen(choices, runs)
     try:
-        loaded = [_load(store, record, rules) for record in there]
+        loaded = [_load(store, record, rules) for record in known]
         why = next((text for one in loaded[1:] if (text := incomparable_reason(loaded[0], one))), "")
         curves = [] if why else [curve(one) for one in loaded]
     except AbbeError as error:
         return CompareScreen(choices, runs, trouble=error.detail)
-    except UNUSED as error:  # a document of another version, or changed by hand
+    except MALFORMED as error:  # another version wrote the document, or somebody edited it
         return CompareScreen(choices, runs, trouble=f"{type(error).__name__}: {error}")
     if why:
         return CompareScreen(choices, runs, trouble=why)
-    apart = difference(curves[0], curves[1]) if len(curves) == 2 else None
-    said = [*remarks(loaded, _feed), *([_summary(apart, say)] if apart is not None else [])]
-    return CompareScreen(choices, runs, [_line(r) for r in figure_rows(loaded)], pictures(curves, apart, say), said)
+    change = difference(curves[0], curves[1]) if len(curves) == 2 else None
+    texts = [*remarks(loaded, _feed), *([_summary(change, translate)] if change is not None else [])]
+    return CompareScreen(choices, runs, [_line(r) for r in figure_rows(loaded)], pictures(curves, change, translate), texts)
 
 
-def _choices(store: Store, there: Sequence[RunRecord]) -> list[RunRecord]:
-    """The newest runs that could go with the first, or any; those that were chosen come first."""
-    newest = store.runs.latest(LISTED, test=there[0].test if there else "", status="complete")
-    kept = {record.id for record in there}
-    return [*there, *(run for run in newest if run.id not in kept)]
+def _choices(store: Store, selected: Sequence[RunRecord]) -> list[RunRecord]:
+    """The selected runs, then the newest that can be compared with the first of them."""
+    newest = store.runs.latest(LISTED, test=selected[0].test if selected else "", status="complete")
+    known = {record.id for record in selected}
+    return [*selected, *(run for run in newest if run.id not in known)]
 
 
 def _load(store: Store, record: RunRecord, rules: Rules) -> LoadedRun:
@@ -111,36 +111,36 @@ def _feed(mm_min: float) -> str:
 
 def _line(row: FigureRow) -> ComparedLine:
     frame = current()
-    told = "cannot tell" if row.sure is None else "yes" if row.sure else "no"
+    differs = "cannot tell" if row.sure is None else "yes" if row.sure else "no"
     values = [frame.with_u(v, u, row.unit) for v, u in row.values]
-    return ComparedLine(row.symbol, row.name, frame.unit(row.unit), values, frame.with_u(row.difference, row.u, row.unit), told)
+    return ComparedLine(row.symbol, row.name, frame.unit(row.unit), values, frame.with_u(row.difference, row.u, row.unit), differs)
 
 
-def _summary(apart: RunDifference, say: Say) -> str:
-    at = apart.largest
-    value, expanded = current().with_u(float(apart.difference_um[at]), float(apart.u_um[at]))
-    share = apart.beyond
-    return say("compare.largest", value=value, u=expanded, unit=current().unit(), share=f"{share:.0%}" if finite(share) else "–")
+def _summary(change: RunDifference, translate: Translate) -> str:
+    at = change.largest
+    value, expanded = current().with_u(float(change.difference_um[at]), float(change.u_um[at]))
+    share = change.beyond
+    return translate("compare.largest", value=value, u=expanded, unit=current().unit(), share=f"{share:.0%}" if finite(share) else "–")
 
 
-def pictures(curves: Sequence[ComparedCurve], apart: RunDifference | None, say: Say) -> list[tuple[Markup, str]]:
-    """Pictures in the reader's units, and captions. The SVG writer has escaped every text; escaping again would show the tags."""
+def pictures(curves: Sequence[ComparedCurve], change: RunDifference | None, translate: Translate) -> list[tuple[Markup, str]]:
+    """Pictures in the reader's units with captions. The SVG writer has already escaped every text."""
     error, place = current().drawn(), current().drawn("mm")
-    y = say("compare.deviation", unit=error.sign)
+    y = translate("compare.deviation", unit=error.sign)
     if curves[0].round:
-        x = say("compare.angle")
+        x = translate("compare.angle")
         traces = [PolarTrace(letter, c.x, c.deviation_um) for letter, c in zip(LETTERS, curves, strict=False)]
-        first = polar_plot(traces, key="overlay", heading=say("compare.overlay"), unit=error)
+        first = polar_plot(traces, key="overlay", heading=translate("compare.overlay"), unit=error)
     else:
-        x = say("compare.along", unit=place.sign)
+        x = translate("compare.along", unit=place.sign)
         named = [(letter, c.x / place.size, c.deviation_um) for letter, c in zip(LETTERS, curves, strict=False)]
-        first = overlay_plot(named, key="overlay", heading=say("compare.overlay"), labels=(x, y), unit=error)
-    out = [(Markup(first), say("compare.scale"))]  # noqa: S704
-    if apart is not None:
-        along = apart.x if curves[0].round else apart.x / place.size
+        first = overlay_plot(named, key="overlay", heading=translate("compare.overlay"), labels=(x, y), unit=error)
+    out = [(Markup(first), translate("compare.scale"))]  # noqa: S704
+    if change is not None:
+        along = change.x if curves[0].round else change.x / place.size
         second = difference_plot(
-            along, apart.difference_um, apart.u_um, key="difference", heading=say("compare.difference"), labels=(x, y), unit=error
+            along, change.difference_um, change.u_um, key="difference", heading=translate("compare.difference"), labels=(x, y), unit=error
         )
-        words = say("compare.band", k=plain(COVERAGE, 1))
-        out.append((Markup(second), words))  # noqa: S704
+        caption = translate("compare.band", k=plain(COVERAGE, 1))
+        out.append((Markup(second), caption))  # noqa: S704
     return out

@@ -1,4 +1,4 @@
-"""The devices of the machine for the screen `/devices`: what core and store know of them. Nothing is asked of a device for it."""
+"""The devices of the machine for the screen `/devices`, from core and store; the screen contacts no device."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from abbe.service.sequences.journal import Trouble, troubles
 from abbe.service.storage.store import Store
 
 CAMPAIGNS = 10
-"""So many of the latest campaigns are looked through for incidents."""
+"""Number of latest campaigns that are searched for incidents."""
 INSTRUMENTS = ("ballbar", "laser")
 SOON_DAYS = 30
 CONTROLLER = "cnc"
@@ -23,14 +23,14 @@ PROOFS = 20
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """The certificate of an instrument. ``until``: its last day, None: none is known; ``days``: left, negative: expired."""
+    """The certificate of an instrument. ``until``: last valid day, None: unknown; ``days``: days left, negative: expired."""
 
     until: date | None
     days: int = 0
 
     @property
     def sign(self) -> str:
-        """Good, bad, or open: it ends within `SOON_DAYS`, or none is known."""
+        """``ok``, ``bad`` (expired), or ``open`` (expires within `SOON_DAYS`, or unknown)."""
         if self.until is None:
             return "open"
         return "bad" if self.days < 0 else "open" if self.days < SOON_DAYS else "ok"
@@ -38,7 +38,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True)
 class DeviceLine:
-    """One device. ``url``: without passwords; ``certificate``: None for what is no instrument; ``firmware``: empty: not known."""
+    """One device. ``url``: without passwords; ``certificate``: None unless it is an instrument; ``firmware``: empty if unknown."""
 
     device: DeviceStatus
     url: str
@@ -48,7 +48,7 @@ class DeviceLine:
 
 @dataclass(frozen=True, slots=True)
 class DeviceScreen:
-    """Devices and the troubles of their links."""
+    """Devices and the incidents of their connections, from ``campaigns`` campaigns."""
 
     lines: Sequence[DeviceLine]
     incidents: Sequence[Trouble]
@@ -58,7 +58,7 @@ class DeviceScreen:
 def device_screen(
     store: Store, machine: str, devices: Sequence[DeviceStatus], until: Mapping[str, date] | None, today: date
 ) -> DeviceScreen:
-    """The devices of a machine file, and what its latest campaigns noted of their links."""
+    """The devices of a machine, and the incidents of their connections in its latest campaigns."""
     own = {record.id for record in store.machines.all() if record.name == machine}
     campaigns = latest_of(store, own)
     latest, numbers = campaigns[-CAMPAIGNS:], {c.id for c in campaigns}
@@ -74,7 +74,7 @@ def device_screen(
 
 
 def latest_of(store: Store, machines: Collection[int]) -> list[CampaignRecord]:
-    """Campaigns of these descriptions of a machine, oldest first."""
+    """Campaigns of the given machine descriptions, oldest first."""
     return [c for c in store.campaigns.all() if c.machine_id in machines]
 
 

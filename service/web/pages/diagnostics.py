@@ -1,4 +1,4 @@
-"""What an admin looks at when something is wrong: versions, database, outbox; and the support bundle, in which no secret is."""
+"""Diagnostics for an admin: versions, database, outbox; and the support bundle, which contains no secrets."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from abbe.service.queries.status import Status
 from abbe.service.secrets import mask_secrets
 from abbe.service.web.api.sources import Sources
 
-# What could be a secret, taken out of texts and documents before they leave the house. Rather too much is blanked than too little.
-
+# Possible secrets are removed from texts and documents before they leave the plant: rather too much is blanked than too little.
 
 HIDDEN = "***"
 _NAMED = r"(?:pass(?:word|phrase|wd|code)|pwd|secret|token|api[_-]?key|private[_-]?key|credential|cookie|authori[sz]ation|csrf)"
@@ -30,34 +29,34 @@ _KEY = re.compile(rf"(?i){_NAMED}|^pass$|^abbe[_-]")
 _PEM = re.compile(r"-----BEGIN [^-]*PRIVATE KEY-----.*?(?:-----END [^-]*PRIVATE KEY-----|\Z)", re.DOTALL)
 _URL = re.compile(r"""(?<=://)([^:/@\s]*):[^\s"']+(?=@)""")
 _HEADER = re.compile(r"""(?i)((?:cookie|authori[sz]ation)(?:\\*["']?\s*[:=]|\\*["']\s*,)\s*)[^\r\n]+""")
-"""A header's value has no end but the line's: `Basic dXNlcjpwYXNz`, `one=1; two=2`."""
+"""Only the end of the line ends the value of a header: `Basic dXNlcjpwYXNz`, `one=1; two=2`."""
 _SCHEME = re.compile(r"((?i:\bbearer)\s+|\bBasic\s+(?=[A-Za-z0-9+/_-]{8}))[^\s\"']+")
 _BEFORE = rf"""(?:{_NAMED}|\bpass)[\w-]*(?:\\*["']?\s*[:=]|\\*["']\s*,)\s*|\babbe[_-][\w.-]*="""
 _QUOTED = re.compile(rf"""(?i)({_BEFORE})[bru]{{0,2}}(\\*)(["']).*?(?:(?<!\\)\2\3|(?=[\r\n])|\Z)""")
-"""A value in quotes ends with the quotes that it began with, however often they are escaped, or with the line where that was cut."""
+"""A quoted value ends with its opening quotes, at the same level of escaping, or with a truncated line."""
 _BARE = re.compile(rf"""(?i)({_BEFORE})(?!\*\*\*)\S+""")
 
 
 def blanked(text: str) -> str:
-    """A text without what could be a secret: passwords of URLs, what follows a word for one, headers of logins, private keys."""
+    """A text without possible secrets: passwords in URLs, values after names of secrets, login headers, private keys."""
     text = _URL.sub(rf"\1:{HIDDEN}", mask_secrets(_PEM.sub(HIDDEN, text)))
     text = _SCHEME.sub(rf"\g<1>{HIDDEN}", _HEADER.sub(rf"\g<1>{HIDDEN}", text))
     return _BARE.sub(rf"\g<1>{HIDDEN}", _QUOTED.sub(rf"\g<1>{HIDDEN}", text))
 
 
 def blanked_doc(value: Any) -> Any:
-    """A document without them: every text of its own, before any of them is escaped, and whole what stands under a word for a secret."""
+    """A document without possible secrets: each text is blanked before escaping, and everything under the name of a secret."""
     if isinstance(value, Mapping):
-        return {blanked(str(key)): HIDDEN if _holds(str(key), one) else blanked_doc(one) for key, one in value.items()}
+        return {blanked(str(key)): HIDDEN if _is_secret(str(key), one) else blanked_doc(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        if len(value) == 2 and isinstance(value[0], str) and _holds(value[0], value[1]):  # a header as a pair
+        if len(value) == 2 and isinstance(value[0], str) and _is_secret(value[0], value[1]):  # a header as a pair
             return [value[0], HIDDEN]
         return [blanked_doc(one) for one in value]
     return value if value is None or isinstance(value, bool | int | float) else blanked(str(value))
 
 
 def blanked_line(line: str) -> str:
-    """A line of a log: by its parts if it is JSON, else as text."""
+    """A log line without possible secrets: by its parts if it is JSON, else as text."""
     try:
         parsed = json.loads(line)
     except ValueError:
@@ -65,7 +64,7 @@ def blanked_line(line: str) -> str:
     return json.dumps(blanked_doc(parsed), ensure_ascii=False) if isinstance(parsed, dict | list) else blanked(line)
 
 
-def _holds(key: str, value: object) -> bool:
+def _is_secret(key: str, value: object) -> bool:
     return _KEY.search(key) is not None and value is not None and not isinstance(value, bool) and value != ""
 
 
@@ -76,7 +75,7 @@ FIXED = (2026, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The state of the installation. Sizes in bytes, None where the database is on another computer; ``growth_b``: a day, on average."""
+    """State of the installation. Sizes in bytes; None if the database is on another computer; ``growth_b``: average per day."""
 
     version: str
     python: str
@@ -93,7 +92,7 @@ class Diagnosis:
 
     @property
     def program(self) -> str:
-        """Which program runs where."""
+        """Versions of Abbe, Python and the operating system."""
         return f"Abbe {self.version}, Python {self.python}, {self.system}"
 
     @property
@@ -103,7 +102,7 @@ class Diagnosis:
 
 
 def diagnosis(sources: Sources, version: str) -> Diagnosis:
-    """Look at everything now."""
+    """The current state of the installation."""
     store, now = sources.reader.store, sources.reader.clock.utc()
     found: StoreHealth = store.health()
     since = None if found.since_utc is None else datetime.fromisoformat(found.since_utc)
@@ -117,12 +116,12 @@ def diagnosis(sources: Sources, version: str) -> Diagnosis:
 
 
 def megabytes(size_b: float) -> str:
-    """A size as people write it."""
+    """A size in MB as text."""
     return f"{size_b / MEGA:.1f} MB"
 
 
 def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
-    """What this process knows of the machine file. Keys and passwords were never in it, but for those in URLs."""
+    """The parts of the machine file that this process knows; they have no keys or passwords, except in URLs."""
     return {
         "machine": sources.reader.machine,
         "database": sources.reader.store.url,
@@ -136,7 +135,7 @@ def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
 
 
 def bundle(diagnosis: Diagnosis, config: Mapping[str, Any], status: Status, log: Sequence[str]) -> bytes:
-    """The support bundle as a zip file; no part of it without `abbe.service.web.pages.diagnostics`."""
+    """The support bundle as a zip file; every member is blanked."""
     members = {
         "config.json": _json(config),
         "diagnosis.json": _json(asdict(diagnosis)),

@@ -1,6 +1,6 @@
-"""All machines of the database for the screen `/fleet`: where each stands, its worst figure and its alarms, worst first.
+"""All machines of the database for the screen `/fleet`: state, worst figure and alarms of each, worst first.
 
-The screen shows no trend, so none is computed: those of ten machines of a month are most of the time of ``abbe fleet``.
+The screen computes no trends: for ten machines over a month they take most of the time of ``abbe fleet``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 @dataclass(frozen=True, slots=True)
 class FleetLine:
-    """One machine: where it stands, its worst figure, and how many alarms are open."""
+    """One machine: state, worst figure, and number of open alarms."""
 
     machine: MachineStatus
     worst: FleetFigure | None
@@ -34,47 +34,47 @@ class FleetLine:
 
     @property
     def share(self) -> float | None:
-        """The worst figure over its limit; None without one."""
+        """The worst figure divided by its limit; None without one."""
         one = self.worst
         return None if one is None or not one.limit else one.value / one.limit
 
     @property
     def share_u(self) -> float | None:
-        """Expanded uncertainty of `share` (k = 2); None where that of the figure is not known."""
+        """Expanded uncertainty of `share` (k = 2); None if that of the figure is unknown."""
         one = self.worst
         return None if one is None or not one.limit or one.expanded is None else one.expanded / one.limit
 
     @property
     def upper(self) -> float:
-        """What the machines are sorted by: the upper end of the share; without figures nobody knows, which comes first."""
+        """Sort key: the upper end of the share; infinite without figures, so that unknown machines come first."""
         return float("inf") if self.share is None else self.share + (self.share_u or 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class FleetQuery:
-    """What a reader wants to see: part of a name, a verdict, and in which order."""
+    """Filter and order: part of a name, a verdict, and the sort key."""
 
     name: str = ""
     verdict: str = ""
     sort: str = SORTS[0]
 
 
-def fleet_lines(store: Store, now: datetime, asked: FleetQuery) -> list[FleetLine]:
-    """The machines that fit, in the order that was asked for."""
-    lines = [_line(store, one) for one in stands(store, now) if _fits(one, asked)]
-    if asked.sort == "machine":
+def fleet_lines(store: Store, now: datetime, query: FleetQuery) -> list[FleetLine]:
+    """The matching machines in the requested order."""
+    lines = [_line(store, one) for one in stands(store, now) if _fits(one, query)]
+    if query.sort == "machine":
         return sorted(lines, key=lambda one: one.machine.machine)
-    if asked.sort == "due":
-        return sorted(lines, key=lambda one: (_moment(one.machine.next_due_utc), one.machine.machine))
+    if query.sort == "due":
+        return sorted(lines, key=lambda one: (_sortable(one.machine.next_due_utc), one.machine.machine))
     return sorted(lines, key=lambda one: (-one.upper, -one.alarms, one.machine.machine))
 
 
-def _moment(utc: str) -> str:
-    return utc_text(datetime.fromisoformat(utc)) if utc else "~"  # what is not due comes last
+def _sortable(utc: str) -> str:
+    return utc_text(datetime.fromisoformat(utc)) if utc else "~"  # machines without a due time come last
 
 
-def _fits(one: MachineStatus, asked: FleetQuery) -> bool:
-    return asked.name.casefold() in one.machine.casefold() and asked.verdict in {"", one.verdict}
+def _fits(one: MachineStatus, query: FleetQuery) -> bool:
+    return query.name.casefold() in one.machine.casefold() and query.verdict in {"", one.verdict}
 
 
 def _line(store: Store, one: MachineStatus) -> FleetLine:
@@ -84,7 +84,7 @@ def _line(store: Store, one: MachineStatus) -> FleetLine:
 
 
 def fleet_csv(lines: Sequence[FleetLine]) -> str:
-    """The same for a spreadsheet: figures as stored, in the unit at the end of their name; times in UTC."""
+    """The machines as CSV: figures in the unit at the end of their name, times in UTC."""
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
     write.writerow(COLUMNS)
@@ -97,7 +97,7 @@ def fleet_csv(lines: Sequence[FleetLine]) -> str:
 
 
 def _cell(value: object) -> object:
-    """A text that a spreadsheet does not take for a formula."""
+    """A cell that a spreadsheet does not take for a formula."""
     if value is None:
         return ""
     return "'" + value if isinstance(value, str) and value.startswith(_FORMULA) else value

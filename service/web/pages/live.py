@@ -1,4 +1,4 @@
-"""The live run: what is measured now, and the buttons that hold and end it. Everything that moves is drawn by ``static/live.js``."""
+"""The screen of the running measurement with its buttons. ``static/live.js`` draws everything that changes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.context import PageContext
 
-SCRIPT_WORDS = (
+SCRIPT_KEYS = (
     "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",
     "live.of", "live.share_here",
 )  # fmt: skip
-"""What the script fills in; the states of a measurement, and how one ends, come on top."""
+"""Texts for the script, besides the states and outcomes of a measurement."""
 
 
 def add_live_page(app: FastAPI, context: PageContext, jobs: Callable[[], Sequence[JobState]] = tuple) -> None:
-    """Add the screen to the application. ``jobs``: those since the service began, newest first; the screen shows how the last one ended."""
+    """Add the screen to the application. ``jobs``: jobs since the start of the service, newest first, for the outcome of the last one."""
 
     @app.get("/live", include_in_schema=False)
     @needs(Permission.READ)
@@ -30,16 +30,16 @@ def add_live_page(app: FastAPI, context: PageContext, jobs: Callable[[], Sequenc
         status = await context.source.status()
         return await context.show(
             "live.html",
-            moment=status,
+            status=status,
             last=next((job for job in jobs() if job.ended_utc is not None), None),
             may_measure=current().may(Permission.MEASURE) and bool(current().csrf),
-            words=script_words(current().lang),
+            texts=script_texts(current().lang),
             due_words=lambda one: language.due(current().lang, one.due_utc, status.now_utc),
         )
 
 
-def script_words(lang: str) -> dict[str, str]:
-    """The texts that the script needs, by key."""
-    told = language.catalogue(lang)
-    states = {key: text for key, text in told.items() if key.startswith(("measuring.", "slot."))}
-    return {key: told[key] for key in SCRIPT_WORDS} | states
+def script_texts(lang: str) -> dict[str, str]:
+    """The texts for the script, by key."""
+    texts = language.catalogue(lang)
+    states = {key: text for key, text in texts.items() if key.startswith(("measuring.", "slot."))}
+    return {key: texts[key] for key in SCRIPT_KEYS} | states

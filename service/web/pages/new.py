@@ -1,4 +1,4 @@
-"""A new test: choose a recipe, see what it would drive, go through the checklist, start it. Only the start moves anything."""
+"""A new test: choose a recipe, see its dry run, complete the checklist, start it. Only the start moves the machine."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
         dry = await asyncio.to_thread(plans.run, chosen, rate_hz, current().drawn("mm"))
         return await context.show(
             "new.html",
-            moment=status,
+            status=status,
             choices=choices,
             chosen=chosen,
             rates_hz=plans.rates_hz,
             rate_hz=rate_hz,
             usual_hz=USUAL_HZ,
             dry=dry,
-            led=chosen == CAMPAIGN,
-            max_feed=None if plans.told is None else plans.told.max_feed_mm_min,
+            guided=chosen == CAMPAIGN,
+            max_feed=None if plans.machine is None else plans.machine.max_feed_mm_min,
             may_measure=current().may(Permission.MEASURE) and bool(current().csrf),
             may_propose=current().may(Permission.PROPOSE),
             key=secrets.token_hex(16),
-            past_due=expired(plans.rules, status.now_utc.date()),
+            expired=expired_certificates(plans.rules, status.now_utc.date()),
             temperature_c=None if plans.rules is None else plans.rules.temperature_c,
         )
 
 
-def expired(rules: RulesSummary | None, today: date) -> list[tuple[str, date]]:
-    """Instruments whose certificate is over, and since when."""
-    told = {} if rules is None or rules.calibrated_until is None else rules.calibrated_until
-    return [(kind, until) for kind, until in sorted(told.items()) if until < today]
+def expired_certificates(rules: RulesSummary | None, today: date) -> list[tuple[str, date]]:
+    """Instruments with an expired certificate, and its last valid day."""
+    certificates = {} if rules is None or rules.calibrated_until is None else rules.calibrated_until
+    return [(kind, until) for kind, until in sorted(certificates.items()) if until < today]

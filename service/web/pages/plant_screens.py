@@ -1,4 +1,4 @@
-"""The addresses of the plant: all machines, this one's devices, settings and diagnostics."""
+"""Routes of the plant screens: all machines, devices of this machine, settings and diagnostics."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def _add_fleet(app: FastAPI, context: PageContext, sources: Sources) -> None:
     @app.get("/fleet", include_in_schema=False)
     @needs(Permission.READ)
     async def fleet(name: Text = "", verdict: Text = "", sort: Sort = "worst") -> HTMLResponse:
-        asked, now, lang = FleetQuery(name, verdict, sort), sources.reader.clock.utc(), current().lang
-        lines = await context.read(fleet_lines, sources.reader.store, now, asked)
+        query, now, lang = FleetQuery(name, verdict, sort), sources.reader.clock.utc(), current().lang
+        lines = await context.read(fleet_lines, sources.reader.store, now, query)
 
         def named(key: str) -> tuple[str, str]:
-            words, unit = language.figure(lang, key)
-            return words, current().unit(unit)
+            text, unit = language.figure(lang, key)
+            return text, current().unit(unit)
 
         return await context.show(
             "fleet.html",
             lines=lines,
-            asked=asked,
+            query=query,
             sorts=SORTS,
             csv=f"/fleet.csv?{urlencode({'name': name, 'verdict': verdict, 'sort': sort})}",
             ago=lambda utc: language.ago(lang, datetime.fromisoformat(utc), now),
@@ -101,7 +101,7 @@ def _add_settings(app: FastAPI, context: PageContext, sources: Sources) -> None:
         found = await context.read(diagnosis, sources, app.version)
         log = _lines(sources)
         made = await context.read(bundle, found, config_of(sources, status, status.mqtt.broker), status, log)
-        # It takes what is known of the plant out of the house: that stands in the audit, or it does not happen.
+        # The bundle takes data out of the plant: without a record in the audit it is not sent.
         event = AuditEvent(
             who=visit.principal.name,
             action=BUNDLE_ACTION,

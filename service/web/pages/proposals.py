@@ -1,4 +1,4 @@
-"""Proposals for the screens, in the reader's units: records of the read model with the picture of what they change."""
+"""Proposals for the screens, in the reader's units, with a picture of their changes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIGNS = {"kept": "ok", "approved": "ok", "pushed": "ok", "refused": "bad", "roll
 
 @dataclass(frozen=True, slots=True)
 class ProposalScreen:
-    """One proposal with what it changes. ``facts``: key of the catalogue and value; ``rows``: cells of ``headings``."""
+    """One proposal with its changes. ``facts``: key of the catalogue and value; ``rows``: cells under ``headings``."""
 
     found: ProposalDetail
     facts: Sequence[tuple[str, str]]
@@ -31,12 +31,12 @@ class ProposalScreen:
 
 
 def sign(state: str) -> str:
-    """Whether a state is good, bad or open."""
+    """Sign of a state: ``ok``, ``bad`` or ``open``."""
     return SIGNS.get(state, "open")
 
 
 def promise(found: ProposalSummary) -> str:
-    """What the model promises, with U; empty where the proposal cannot be read."""
+    """Predicted rms before and after with U; empty if the proposal is unreadable."""
     p = found.predicted_rms_um
     if p is None:
         return ""
@@ -48,18 +48,18 @@ def promise(found: ProposalSummary) -> str:
 
 
 def proposal_screen(reader: Reader, number: int) -> ProposalScreen:
-    """A proposal with its differences to the table in force when it was made.
+    """A proposal with its differences from the table that was in force when it was made.
 
     Raises
     ------
     NotStored
-        There is none.
+        There is no such proposal.
     Unusable
-        Its row was changed after it was stored.
+        The stored row was altered.
     """
     found = proposal(reader, number)
     difference = compare(reader.store, number, ACTIVE)
-    # The SVG writer has escaped every text; escaping again would show the reader the tags.
+    # The SVG writer has already escaped every text.
     picture = Markup(change_plot(difference.curves))  # noqa: S704
     headings = [_heading(h) for h in HEADINGS]
     return ProposalScreen(found, _facts(found), largest(difference), headings, [_row(r) for r in rows(difference)], picture)
@@ -75,7 +75,7 @@ def _heading(heading: str) -> str:
 
 
 def _row(cells: Sequence[str]) -> list[str]:
-    """Cells of `HEADINGS` in the reader's units."""
+    """Cells under `HEADINGS` in the reader's units."""
     return [current().length(cell, _unit_of(heading)) for heading, cell in zip(HEADINGS, cells, strict=True)]
 
 

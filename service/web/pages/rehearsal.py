@@ -1,4 +1,4 @@
-"""A dry run for the screen: what a recipe would drive on this machine, from the machine file alone. Nothing here can reach a device."""
+"""Dry run of a recipe for the screen, from the machine file alone; this module cannot reach a device."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from abbe.service.sequences.steps import CampaignPlan, MountBar, MountLaser, Tes
 from abbe.service.site import machine_from_doc
 
 CAMPAIGN = IDENTIFICATION
-"""The full campaign: its prompts guide a person through the set-ups."""
+"""The full campaign, whose prompts guide a person through the set-ups."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetUp:
-    """Something that a person mounts. ``what``: "bar" or "laser"; ``at_mm`` where; ``size`` the bar's length in mm, 0 for a laser."""
+    """An instrument that a person mounts. ``what``: "bar" or "laser"; ``radius_mm``: length of the bar, 0 for a laser."""
 
     number: int
     what: str
@@ -32,7 +32,7 @@ class SetUp:
 
 @dataclass(frozen=True, slots=True)
 class Rehearsed:
-    """A recipe that was run dry. ``trouble``: why it cannot be run on this machine; nothing else is there then but the recipe."""
+    """Result of a dry run. ``trouble``: why the recipe cannot run on this machine; then the other fields are empty."""
 
     recipe: str
     startable: bool
@@ -45,56 +45,56 @@ class Rehearsed:
 
     @property
     def duration_s(self) -> float:
-        """Machine time, mounting not counted."""
+        """Machine time without mounting."""
         return sum(run.duration_s for run in self.runs)
 
     @property
     def readings(self) -> int:
-        """Readings of all tests."""
+        """Number of readings in all tests."""
         return sum(run.readings for run in self.runs)
 
     @property
     def fastest_mm_min(self) -> float:
-        """Largest feed."""
+        """Largest feed of all runs."""
         return max((run.fastest_mm_min for run in self.runs), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsals:
-    """What can be run dry here: the machine as its file describes it, and the recipes that a person may start."""
+    """Possible dry runs: the machine as its file describes it, and the recipes that a person may start."""
 
-    told: MachineSummary | None = None
+    machine: MachineSummary | None = None
     recipes: tuple[str, ...] = ()
     rates_hz: tuple[int, ...] = RATES_HZ
     rules: RulesSummary | None = None
 
     def choices(self) -> tuple[str, ...]:
-        """Recipes that can be chosen: those that can be started first, then the full campaign. Rates are chosen apart.
+        """Names without rates: startable recipes first, then the full campaign.
 
-        A campaign of a recipe file can be started by programs only: its dry run is that of the command line.
+        Only programs can start a campaign of a recipe file; the command line has its dry run.
         """
         named = (split_recipe_name(name)[0] for name in self.recipes if not name.endswith(".toml"))
-        return tuple(dict.fromkeys([*named, *((CAMPAIGN,) if self.told is not None else ())]))
+        return tuple(dict.fromkeys([*named, *((CAMPAIGN,) if self.machine is not None else ())]))
 
     def run(self, recipe: str, rate_hz: int, unit: Unit = MM) -> Rehearsed | None:
-        """A recipe, dry, at a rate of the ball-bar, its picture in a unit; None where the machine or the recipe is not known here."""
-        told = self.told
-        if told is None or recipe not in self.choices() or (recipe not in RECIPES and recipe != CAMPAIGN):
+        """Dry run of a recipe at a rate of the ball-bar, with a picture in ``unit``; None for an unknown machine or recipe."""
+        given = self.machine
+        if given is None or recipe not in self.choices() or (recipe not in RECIPES and recipe != CAMPAIGN):
             return None
         startable = recipe in {split_recipe_name(name)[0] for name in self.recipes}
         try:
             machine = machine_from_doc(
-                {"chain": told.chain, "stroke_mm": told.stroke_mm, "pivots_mm": told.pivots_mm, "tool_mm": told.tool_mm}
+                {"chain": given.chain, "stroke_mm": given.stroke_mm, "pivots_mm": given.pivots_mm, "tool_mm": given.tool_mm}
             )
             plan = identification(machine, rate_hz=rate_hz) if recipe == CAMPAIGN else recipe_plan(named(recipe, rate_hz), machine)
-            runs = dry_run_campaign(machine, plan, told.max_feed_mm_min)
+            runs = dry_run_campaign(machine, plan, given.max_feed_mm_min)
         except AbbeError as error:
             return Rehearsed(recipe, False, error.detail, error.remedy)
         return Rehearsed(recipe, startable, "", "", runs, set_ups(plan), _used(machine, runs), picture(machine, plan, unit))
 
 
 def set_ups(plan: CampaignPlan) -> tuple[SetUp, ...]:
-    """What a person mounts, in order."""
+    """The set-ups that a person mounts, in order."""
     found = [one for test in plan.tests if (one := _set_up(test)) is not None]
     return tuple(SetUp(k, *one) for k, one in enumerate(found, start=1))
 
@@ -109,7 +109,7 @@ def _set_up(test: TestPlan) -> tuple[str, str, tuple[float, ...], float] | None:
 
 
 def _used(machine: Machine, runs: tuple[DryRun, ...]) -> tuple[tuple[str, float, float, float, float], ...]:
-    """Of each axis: name, lowest and highest commanded position, and its stroke, mm."""
+    """Name, lowest and highest commanded position, and stroke of each axis, mm."""
     return tuple(
         (
             AXES[a],

@@ -1,4 +1,4 @@
-"""Addresses of the screens that look into results: map of the volume, what-if, budget, runs side by side."""
+"""Routes of the result screens: volume map, what-if, budget, comparison of runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
 from abbe.service.web.pages.compare import compare_screen
-from abbe.service.web.pages.context import PageContext, found
+from abbe.service.web.pages.context import PageContext, find_or_none
 from abbe.service.web.pages.results import solution_lines
 from abbe.service.web.pages.volume import NODES, VolumeQuery, volume_screen
 from abbe.service.web.pages.whatif import whatif_screen
@@ -34,13 +34,13 @@ def add_result_pages(app: FastAPI, context: PageContext) -> None:
 
 
 async def _solution(context: PageContext, number: int | None) -> SolutionRecord | HTMLResponse | None:
-    """The solution that was asked for, or the newest; None: there is none at all; or the answer that it is not there."""
+    """The requested solution or the newest; None: the store has none; a response if the requested one does not exist."""
     if number is None:
         newest = await context.read(solution_lines, context.store, 1)
         if not newest:
             return None
         number = newest[0].id
-    record = await context.read(found, context.store.solutions.get, number)
+    record = await context.read(find_or_none, context.store.solutions.get, number)
     return record if record is not None else await context.missing("solution", number)
 
 
@@ -57,8 +57,8 @@ def _add_volume(app: FastAPI, context: PageContext) -> None:
         record = await _solution(context, id)
         if isinstance(record, HTMLResponse):
             return record
-        asked = VolumeQuery(tuple(motion), plane, at, nodes)
-        screen = None if record is None else await context.read(volume_screen, context.store, record, asked, current().say)
+        query = VolumeQuery(tuple(motion), plane, at, nodes)
+        screen = None if record is None else await context.read(volume_screen, context.store, record, query, current().translate)
         return await context.show("volume.html", screen=screen, counts=NODES)
 
 
@@ -69,7 +69,7 @@ def _add_whatif(app: FastAPI, context: PageContext) -> None:
         record = await _solution(context, id)
         if isinstance(record, HTMLResponse):
             return record
-        screen = None if record is None else await context.read(whatif_screen, context.store, record, take, everything, current().say)
+        screen = None if record is None else await context.read(whatif_screen, context.store, record, take, everything, current().translate)
         return await context.show("whatif.html", 409 if screen is not None and screen.trouble else 200, screen=screen)
 
 
@@ -80,7 +80,7 @@ def _add_budget(app: FastAPI, context: PageContext) -> None:
         record = await _solution(context, id)
         if isinstance(record, HTMLResponse):
             return record
-        screen = None if record is None else await context.read(budget_screen, context.store, record, current().say)
+        screen = None if record is None else await context.read(budget_screen, context.store, record, current().translate)
         return await context.show("budget.html", screen=screen)
 
 
@@ -88,5 +88,5 @@ def _add_compare(app: FastAPI, context: PageContext) -> None:
     @app.get("/compare", include_in_schema=False)
     @needs(Permission.READ)
     async def compare(run: Runs = []) -> HTMLResponse:  # noqa: B006
-        screen = await context.read(compare_screen, context.store, run, current().say, context.rules)
+        screen = await context.read(compare_screen, context.store, run, current().translate, context.rules)
         return await context.show("compare.html", 409 if screen.trouble else 200, screen=screen)

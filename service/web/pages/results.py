@@ -1,4 +1,4 @@
-"""Solutions and discoveries for the screens: lists, and one with its pictures."""
+"""Solutions and discoveries for the screens: lists, and single results with their pictures."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 
-# Which of a machine's error motions contributes how much: from a stored solution, with its whole covariance.
+# Contribution of each error motion of a machine, from a stored solution with its full covariance.
 #
-# The contribution of one motion is the rms length of the deviation that it makes alone, over an even grid of the volume, the best-fit rigid
-# motion removed (that is where the workpiece lies, not an error of the machine): c = sqrt(theta^T G theta), G the mean square of its terms.
-# Its uncertainty follows from the covariance of theta (GUM 5.1.2); near zero, where the direction is itself not known, the worst direction
-# counts, as in `abbe.service.verification.deviations`. The squares of the contributions do not add up to the square of the whole: motions
-# can make up for each other.
+# The contribution of a motion is the rms length of the deviation that it alone causes, over an even grid of the volume, with the best-fit
+# rigid motion removed (the pose of the workpiece is no error of the machine): c = sqrt(theta^T G theta), G the mean square of its terms.
+# Its uncertainty follows from the covariance of theta (GUM 5.1.2); near zero, where the direction is unknown, the worst direction counts,
+# as in `abbe.service.verification.deviations`. The squares of the contributions do not add up to the square of the whole, since motions can
+# compensate each other.
 
 
 NODES = 6
@@ -45,7 +45,7 @@ HIDDEN = "not observable"
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """One error motion: contribution and standard uncertainty in µm, whether the runs show it by itself, and if not, why."""
+    """An error motion: contribution and standard uncertainty in µm, whether the runs show it separately, and if not, why."""
 
     name: str
     value_um: float
@@ -55,7 +55,7 @@ class Ranked:
 
     @property
     def hidden(self) -> bool:
-        """Whether these runs do not show it by itself."""
+        """Whether the runs cannot show the motion separately."""
         return self.status == HIDDEN
 
     @property
@@ -65,19 +65,12 @@ class Ranked:
 
     @property
     def contribution(self) -> Contribution:
-        """For the picture."""
+        """The motion as a bar of the picture."""
         return Contribution(self.name, self.value_um, self.u_um)
 
 
 def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], machine: Machine) -> list[Ranked]:
-    """Every motion of a stored solution, largest contribution first.
-
-    Parameters
-    ----------
-    prediction, motions : of the solution.
-    machine : Machine
-        Nominal geometry of the machine that was measured.
-    """
+    """Every motion of a stored solution, largest contribution first; ``machine``: nominal geometry of the measured machine."""
     terms, coefficients, covariance = stored_prediction(prediction)
     points = volume_grid(machine.stroke_mm, NODES)
     design = field(machine, terms, points, None, volume_frame(machine))
@@ -94,7 +87,7 @@ def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], ma
 
 
 def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, float]:
-    """Root of the mean square of a linear combination, and its standard uncertainty."""
+    """Rms of a linear combination, and its standard uncertainty."""
     values, vectors = np.linalg.eigh(mean_square)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     vector, spread = root @ coefficients, root @ covariance @ root.T
@@ -107,7 +100,7 @@ def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, flo
 
 
 MOST_SOLUTIONS = 20
-"""Each is half a megabyte: more of them would make the list slow."""
+"""Each has half a megabyte: more would make the list slow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +117,7 @@ class SolutionLine:
 
 @dataclass(frozen=True, slots=True)
 class ResultScreen:
-    """One solution. ``ranked``: empty where its document does not hold what it takes; ``picture``: of what the runs show."""
+    """One solution. ``ranked``: empty if its document lacks the covariance; ``picture``: contributions that the runs show."""
 
     line: SolutionLine
     text: str
@@ -138,13 +131,13 @@ class ResultScreen:
 
     @property
     def hidden(self) -> list[Ranked]:
-        """Motions that these runs do not show by themselves."""
+        """Motions that the runs cannot show separately."""
         return [r for r in self.ranked if r.hidden]
 
 
 @dataclass(frozen=True, slots=True)
 class DiscoveryScreen:
-    """One search: its states in order, and its report, None while it has not ended (then ``trouble`` says so)."""
+    """One search with its states and its report; ``document`` None: unfinished or unreadable, ``trouble`` has the reason."""
 
     found: DiscoveryDetail
     document: Document | None
@@ -159,17 +152,17 @@ def solution_lines(store: Store, limit: int = MOST_SOLUTIONS) -> list[SolutionLi
 
 
 def _line(record: SolutionRecord, campaign: str) -> SolutionLine:
-    told = record.doc.get("verdict") or {}
-    word = str(told.get("word", ""))
+    verdict = record.doc.get("verdict") or {}
+    word = str(verdict.get("word", ""))
     return SolutionLine(record.id, campaign, str(record.doc.get("model", "")), SOLUTION_SIGNS.get(word, "open"), word, record.created_utc)
 
 
 def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
-    """A solution with what contributes most to the machine's error."""
+    """A solution with its motions by contribution to the machine's error."""
     solution, campaign = stored_solution(record.doc, record.id), store.campaigns.find(record.campaign_id)
     ranked = _ranked(solution, store.machines.get(campaign.machine_id).doc)
     shown = [r.contribution for r in ranked if not r.hidden]
-    # The SVG writer has escaped every text; escaping again would show the reader the tags.
+    # The SVG writer has already escaped every text.
     picture = Markup(contribution_bars(shown, unit=current().drawn())) if shown else Markup("")  # noqa: S704
     return ResultScreen(
         _line(record, campaign.name),
@@ -186,18 +179,18 @@ def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
 
 def _ranked(solution: SolutionFile, machine: Doc) -> list[Ranked]:
     if solution.prediction is None:
-        return []  # stored by a version that did not keep the covariance
+        return []  # an earlier version stored no covariance
     geometry: Machine = machine_from_doc(machine)
     return ranking(solution.prediction, solution.motions, geometry)
 
 
 def discovery_screen(reader: Reader, number: int, rules: Rules) -> DiscoveryScreen:
-    """A search as it was stored; nothing is searched again. Raises NotStored."""
+    """A search as stored. Raises NotStored."""
     found = discovery(reader, number)
     try:
-        told = discovery_report(reader.store, number, rules)
-        # The states stand above with their times: the report's table of them would only say it again.
-        appendix = [s for s in told.appendix if s.title != DECIDED]
-        return DiscoveryScreen(found, replace(told, appendix=appendix))
+        report = discovery_report(reader.store, number, rules)
+        # The screen shows the states with their times, so it omits the report's table of states.
+        appendix = [s for s in report.appendix if s.title != DECIDED]
+        return DiscoveryScreen(found, replace(report, appendix=appendix))
     except AbbeError as error:
         return DiscoveryScreen(found, None, error.detail)

@@ -1,4 +1,4 @@
-"""The addresses of the operator's screens. Every one says what it needs; the guard lets through who has it."""
+"""Routes of the operator's screens. Each declares its permission, which the auth middleware checks."""
 
 from __future__ import annotations
 
@@ -22,31 +22,28 @@ from abbe.service.web.bodies import form_of
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.pages import times
-from abbe.service.web.pages.context import PageContext, can_be_stored, found
+from abbe.service.web.pages.context import PageContext, can_be_stored, find_or_none
 from abbe.service.web.pages.proposals import MOST, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
 from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, run_list, run_screen
-from abbe.service.web.pages.table import ends
+from abbe.service.web.pages.table import outcome_texts
 from abbe.service.web.problems import problem
-
-# The colours of the reports' pictures on a screen: of the figures, not of the page, and dark where the reader has chosen dark.
-
 
 _DARK = re.compile(r"@media screen and \(prefers-color-scheme:dark\)\{:root\{([^}]*)\}\}")
 
 
 def themed(rules: str) -> str:
-    """The rules of `abbe.service.rendering.palette.style_rules`, for figures of a page whose ``html`` says which scheme was chosen."""
+    """CSS rules of `abbe.service.rendering.palette.style_rules` for figures of a page whose ``html`` has the chosen theme."""
     found = _DARK.search(rules)
     if found is None:
-        raise ValueError("the palette has no dark colours in the form that is expected here")
+        raise ValueError("the palette lacks the expected dark colours")
     light = rules[: found.start()] + rules[found.end() :]
     first = light.replace(":root{color-scheme:light dark;", ":root figure{", 1)
     if first == light:
-        raise ValueError("the palette does not begin as is expected here")
-    asked = f"@media screen and (prefers-color-scheme:dark){{:root:not([data-theme=light]) figure{{{found[1]}}}}}"
-    return f"{first}\n{asked}\n:root[data-theme=dark] figure{{{found[1]}}}\n"
+        raise ValueError("the palette does not begin as expected")
+    automatic = f"@media screen and (prefers-color-scheme:dark){{:root:not([data-theme=light]) figure{{{found[1]}}}}}"
+    return f"{first}\n{automatic}\n:root[data-theme=dark] figure{{{found[1]}}}\n"
 
 
 LONGEST_FORM = 1024
@@ -76,9 +73,9 @@ def _add_runs(app: FastAPI, context: PageContext) -> None:
     @app.get("/runs", include_in_schema=False)
     @needs(Permission.READ)
     async def runs(campaign: Text = "", test: Text = "", state: Text = "") -> HTMLResponse:
-        wanted = RunsQuery(campaign, test, state)
-        listed = await context.read(run_list, context.reader, wanted)
-        return await context.show("runs.html", listed=listed, wanted=wanted, tests=TESTS, states=STATES)
+        query = RunsQuery(campaign, test, state)
+        listed = await context.read(run_list, context.reader, query)
+        return await context.show("runs.html", listed=listed, query=query, tests=TESTS, states=STATES)
 
     @app.get("/run", include_in_schema=False)
     @needs(Permission.READ)
@@ -86,12 +83,12 @@ def _add_runs(app: FastAPI, context: PageContext) -> None:
         if id is None:
             newest, _ = await context.read(measured.runs, context.reader, {}, None, 1)
             id = newest[0].number if newest else None
-        record = None if id is None else await context.read(found, context.store.runs.find, id)
+        record = None if id is None else await context.read(find_or_none, context.store.runs.find, id)
         if record is None and id is not None:
             return await context.missing("run", id)
         screen = None if record is None else await context.read(run_screen, context.store, record, context.rules)
-        told = None if screen is None or screen.document is None else shown(screen.document)
-        return await context.show("run.html", screen=screen, told=told)
+        report = None if screen is None or screen.document is None else shown(screen.document)
+        return await context.show("run.html", screen=screen, report=report)
 
 
 def _add_results(app: FastAPI, context: PageContext) -> None:
@@ -105,7 +102,7 @@ def _add_results(app: FastAPI, context: PageContext) -> None:
     async def result(id: Number = None) -> HTMLResponse:
         newest = await context.read(solution_lines, context.store, 1) if id is None else []
         number = newest[0].id if newest else id
-        record = None if number is None else await context.read(found, context.store.solutions.get, number)
+        record = None if number is None else await context.read(find_or_none, context.store.solutions.get, number)
         if record is None and number is not None:
             return await context.missing("solution", number)
         screen = None if record is None else await context.read(result_screen, context.store, record)
@@ -125,8 +122,8 @@ def _add_results(app: FastAPI, context: PageContext) -> None:
             screen = None if number is None else await context.read(discovery_screen, context.reader, number, context.rules)
         except NotStored:
             return await context.missing("discovery", number or 0)
-        told = None if screen is None or screen.document is None else shown(screen.document)
-        return await context.show("discovery.html", screen=screen, told=told)
+        report = None if screen is None or screen.document is None else shown(screen.document)
+        return await context.show("discovery.html", screen=screen, report=report)
 
 
 def _add_proposals(app: FastAPI, context: PageContext) -> None:
@@ -149,8 +146,8 @@ def _add_proposals(app: FastAPI, context: PageContext) -> None:
             return await context.missing("proposal", number)
         except Unusable as error:
             return await context.show("changed.html", 409, number=number, text=error.detail)
-        key, words = secrets.token_hex(8), ends("table.word")
-        return await context.show("proposal.html", screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, words=words)
+        key, texts = secrets.token_hex(8), outcome_texts("table.word")
+        return await context.show("proposal.html", screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, texts=texts)
 
 
 def _add_approval(app: FastAPI, context: PageContext) -> None:
@@ -158,10 +155,10 @@ def _add_approval(app: FastAPI, context: PageContext) -> None:
     @needs(Permission.APPROVE)
     async def approve(request: Request) -> Response:
         visit: Visit = request.state.visit
-        asked = _approval(await form_of(request) or {})
-        if asked is None:
-            return problem(422, "the form names no proposal, or hours that are not between 0.01 and 720")
-        number, hours = asked
+        decision = _approval(await form_of(request) or {})
+        if decision is None:
+            return problem(422, "the form needs the number of a proposal, and hours between 0.01 and 720")
+        number, hours = decision
         visit.target = f"proposal {number}"
         account = visit.principal.name
         name = account.partition(":")[2].partition("/")[0]
@@ -175,7 +172,7 @@ def _add_approval(app: FastAPI, context: PageContext) -> None:
 
 
 def _approval(fields: dict[str, str]) -> tuple[int, float] | None:
-    """Number and hours of a form."""
+    """Number and hours of the approval form; None if invalid."""
     try:
         number, hours = int(fields.get("number", "")), float(fields.get("hours", ""))
     except ValueError:
@@ -187,15 +184,15 @@ def _add_times(app: FastAPI, context: PageContext) -> None:
     @app.get("/trends", include_in_schema=False)
     @needs(Permission.READ)
     async def trends() -> HTMLResponse:
-        past, moment = await context.source.verifications(times.CHECKS), await context.source.status()
-        screen = await context.read(times.trend_screen, context.reader, past, moment)
-        return await context.show("trends.html", verified=moment.verified, plots=screen.plots, charts=screen.charts, checks=len(past))
+        past, status = await context.source.verifications(times.CHECKS), await context.source.status()
+        screen = await context.read(times.trend_screen, context.reader, past, status)
+        return await context.show("trends.html", verified=status.verified, plots=screen.plots, charts=screen.charts, checks=len(past))
 
     @app.get("/schedule", include_in_schema=False)
     @needs(Permission.READ)
     async def schedule() -> HTMLResponse:
-        moment = await context.source.status()
-        return await context.show("schedule.html", lines=await context.read(times.schedule_lines, context.reader, moment))
+        status = await context.source.status()
+        return await context.show("schedule.html", lines=await context.read(times.schedule_lines, context.reader, status))
 
     @app.get("/audit", include_in_schema=False)
     @needs(Permission.AUDIT)

@@ -1,4 +1,4 @@
-"""Runs for the screens: the newest that fit a filter, and one run with its figures and pictures."""
+"""Runs for the screens: a filtered list, and one run with its figures and pictures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_CAMPAIGNS = 50
 
 @dataclass(frozen=True, slots=True)
 class RunsQuery:
-    """What a list of runs is limited to; empty: not limited."""
+    """Filter of the list of runs; empty fields match all."""
 
     campaign: str = ""
     test: str = ""
@@ -36,7 +36,7 @@ class RunsQuery:
 
 @dataclass(frozen=True, slots=True)
 class RunListing:
-    """The newest runs that fit, whether there are more, and the campaigns to choose from."""
+    """The newest matching runs, whether there are more, and the campaigns to choose from."""
 
     runs: list[RunSummary]
     more: bool
@@ -45,32 +45,32 @@ class RunListing:
 
 @dataclass(frozen=True, slots=True)
 class RunScreen:
-    """One run. ``document``: its report, None where it cannot be read; ``trouble``: why."""
+    """One run. ``document``: its report, None if the run is unreadable; ``trouble``: the reason."""
 
     record: RunRecord
     document: Document | None
     trouble: str = ""
 
 
-def run_list(reader: Reader, wanted: RunsQuery) -> RunListing:
-    """The newest runs that fit."""
+def run_list(reader: Reader, query: RunsQuery) -> RunListing:
+    """The newest matching runs."""
     names = [one.name for one in campaigns(reader, None, None, MOST_CAMPAIGNS)[0]]
-    found, more = runs_by_state(reader, wanted.campaign, wanted.test, wanted.state, MOST)
+    found, more = runs_by_state(reader, query.campaign, query.test, query.state, MOST)
     return RunListing(found, more, names)
 
 
 def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
-    """A run as its report has it, by the limits and certificates of the machine file. Says why where it cannot be read."""
+    """A run with its report, judged by the limits and certificates of the machine file; ``trouble`` if it is unreadable."""
     try:
         return RunScreen(record, run_document(store, record, rules)[1])
     except AbbeError as error:
         return RunScreen(record, None, error.detail)
-    except (KeyError, TypeError, ValueError, IndexError) as error:  # a document of another version, or changed by hand
+    except (KeyError, TypeError, ValueError, IndexError) as error:  # another version wrote the document, or somebody edited it
         return RunScreen(record, None, f"{type(error).__name__}: {error}")
 
 
 def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[dict[str, Any], Document]:
-    """A run as an ``abbe-run/1`` object, and its report; errors of both."""
+    """A run as an ``abbe-run/1`` object, and its report."""
     owner = store.campaigns.find(record.campaign_id)
     machine: dict[str, Any] = store.machines.get(owner.machine_id).doc
     run = set_once([load_run(store, record.id)])[0]

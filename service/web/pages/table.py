@@ -1,4 +1,4 @@
-"""The screen of the table in force: which it is by the push journal, how it came there, what was pushed, and the order back."""
+"""The screen of the table in force by the push journal: its origin, the pushes, and the rollback."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from abbe.service.web.pages.context import PageContext
 
 MOST = 50
 SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}
-ENDS = ("kept", "rolled back", "refused", "failed", "stopped", "open", "interrupted")
-"""How an order of a table ends."""
+OUTCOMES = ("kept", "rolled back", "refused", "failed", "stopped", "open", "interrupted")
+"""Outcomes of a push or rollback."""
 
 
-def ends(group: str) -> dict[str, str]:
-    """The words of these ends for a reader, from a group of the catalogue."""
-    return {word: current().state(group, word) for word in ENDS}
+def outcome_texts(group: str) -> dict[str, str]:
+    """Texts of the outcomes in the reader's language, from a group of the catalogue."""
+    return {outcome: current().state(group, outcome) for outcome in OUTCOMES}
 
 
 def add_table_screen(app: FastAPI, context: PageContext) -> None:
@@ -32,21 +32,21 @@ def add_table_screen(app: FastAPI, context: PageContext) -> None:
     @needs(Permission.READ)
     async def table() -> HTMLResponse:
         try:
-            told = await context.read(tables, context.reader)
+            history = await context.read(tables, context.reader)
         except JournalChanged as error:
-            return await context.show("table.html", 409, broken=error.detail, told=None)
+            return await context.show("table.html", 409, broken=error.detail, history=None)
         status = await context.source.status()
         return await context.show(
             "table.html",
-            told=told,
+            history=history,
             broken="",
-            pushes=told.pushes[:MOST],
+            pushes=history.pushes[:MOST],
             attention=status.attention,
             verified=status.verified,
             job=status.job,
             may_order=current().may(Permission.APPROVE) and bool(current().csrf),
             key=secrets.token_hex(8),
-            words=ends("table.back_word"),
+            texts=outcome_texts("table.back_word"),
             sign=lambda word: SIGNS.get(word, "open"),
             crc=lambda number: f"{number:08X}",
         )

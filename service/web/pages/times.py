@@ -1,4 +1,4 @@
-"""What happened and what comes: trends of the checks, and the timetable with its past slots."""
+"""Trends of the checks, and the timetable with its past slots, for the screens."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ AUDIT_ROWS = 200
 
 @dataclass(frozen=True, slots=True)
 class TrendLine:
-    """One judged figure in the reader's units: what the control chart says is in ``trend``."""
+    """A judged figure in the reader's units; ``trend``: result of the control chart."""
 
     name: str
     latest: str
@@ -36,7 +36,7 @@ class TrendLine:
 
 @dataclass(frozen=True, slots=True)
 class TrendScreen:
-    """Pictures of all checks, and control charts of those with the table in force."""
+    """Plots of all checks, and control charts of the checks with the table in force."""
 
     plots: Sequence[Markup]
     charts: Sequence[TrendLine]
@@ -44,17 +44,17 @@ class TrendScreen:
 
 @dataclass(frozen=True, slots=True)
 class ScheduleLine:
-    """One schedule: what comes, in the reader's words, and what became of its past slots."""
+    """A schedule: its next slot as text in the reader's language, and the outcome of past slots."""
 
     due: NextDue
     in_words: str
     slots: Sequence[SlotRecord]
 
 
-def trend_screen(reader: Reader, past: Sequence[Verification], moment: Status) -> TrendScreen:
-    """Every judged figure of the latest checks, newest first in ``past``: pictures, and what the control chart says."""
-    found = trends(reader, moment.machine, limit=CHECKS)
-    plots = trend_plots(past, zone_of(moment), moment.verified.changes)
+def trend_screen(reader: Reader, past: Sequence[Verification], status: Status) -> TrendScreen:
+    """Plots and control charts of the judged figures; ``past``: checks, newest first."""
+    found = trends(reader, status.machine, limit=CHECKS)
+    plots = trend_plots(past, zone_of(status), status.verified.changes)
     return TrendScreen(plots, [_line(one) for one in found.figures])
 
 
@@ -67,7 +67,7 @@ def _line(one: FigureTrend) -> TrendLine:
     return TrendLine(name, latest, limit, one)
 
 
-def schedule_lines(reader: Reader, moment: Status) -> list[ScheduleLine]:
+def schedule_lines(reader: Reader, status: Status) -> list[ScheduleLine]:
     """All schedules with their latest slots."""
     lang = current().lang
-    return [ScheduleLine(d, language.due(lang, d.due_utc, moment.now_utc), past_slots(reader, d.schedule, SLOTS)) for d in moment.next_due]
+    return [ScheduleLine(d, language.due(lang, d.due_utc, status.now_utc), past_slots(reader, d.schedule, SLOTS)) for d in status.next_due]

@@ -1,4 +1,4 @@
-"""The map of the volume for the screen: nodes with their uncertainty, a slice as a picture, and what is not in it."""
+"""The volume map for the screen: nodes with their uncertainty, a slice as a picture, and the motions without a map."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 
 NODES = (3, 4, 5, 6)
-"""More would make the table of all nodes heavier than a screen may be; the interface gives finer grids."""
+"""Nodes per axis. More would make the table too large for a screen; the HTTP interface gives finer grids."""
 STILL, STILL_UM = "0", 1e-9
-"""A component that the chosen motions cannot move at all has no uncertainty either; what is left of it is rounding."""
-Say = Callable[..., str]
+"""A component that the chosen motions cannot change has no uncertainty: a smaller value is rounding."""
+Translate = Callable[..., str]
 NOTHING = Markup("")
 
 
 @dataclass(frozen=True, slots=True)
 class VolumeQuery:
-    """What a reader wants to see. ``at``: number of the slice from 0, -1: the middle; ``motions``: none means all."""
+    """The requested view. ``at``: index of the slice from 0, -1: the middle; ``motions``: none means all."""
 
     motions: tuple[str, ...] = ()
     plane: str = "XY"
@@ -39,22 +39,22 @@ class VolumeQuery:
 
 @dataclass(frozen=True, slots=True)
 class NodeLine:
-    """A node in the reader's units: place; dX, dY, dZ and length with their U (k = 2), rounded together."""
+    """A node in the reader's units: position; dX, dY, dZ and length with U (k = 2); ``significant``: the deviation exceeds its U."""
 
     place: tuple[str, str, str]
     parts: tuple[tuple[str, str], ...]
-    told: bool
+    significant: bool
 
 
 @dataclass(frozen=True, slots=True)
 class VolumeScreen:
-    """The map in the reader's units. ``lines``: all nodes; ``source``: where a script gets the numbers, in mm and µm; ``top``: upper end of
-    the colours; ``trouble``: why there is none.
+    """The map in the reader's units. ``lines``: all nodes; ``source``: address of the numbers for the script, in mm and µm; ``top``: upper
+    end of the colour scale; ``not_significant``: number of such nodes; ``trouble``: why there is no map.
     """
 
     number: int
     campaign: str
-    asked: VolumeQuery
+    query: VolumeQuery
     motions: Sequence[tuple[str, str, bool, bool]] = ()
     hidden: Sequence[tuple[str, str]] = ()
     lines: Sequence[NodeLine] = ()
@@ -62,7 +62,7 @@ class VolumeScreen:
     source: str = ""
     picture: Markup = NOTHING
     figures: Sequence[tuple[str, str]] = ()
-    untold: int = 0
+    not_significant: int = 0
     steps: Sequence[str] = ()
     top: float = 1.0
     magnified: float = 1.0
@@ -70,62 +70,63 @@ class VolumeScreen:
 
     @property
     def axes(self) -> list[tuple[str, list[tuple[str, str, bool, bool]]]]:
-        """Motions by the carriage that makes them; squareness belongs to none."""
+        """Motions grouped by axis; squareness belongs to none."""
         groups = [(axis, [m for m in self.motions if m[0][1] != "0" and m[0][2] == axis]) for axis in "XYZ"]
         return [*groups, ("", [m for m in self.motions if m[0][1] == "0"])]
 
 
-def volume_screen(store: Store, record: SolutionRecord, asked: VolumeQuery, say: Say) -> VolumeScreen:
-    """The map of a stored solution; what cannot be shown says why."""
+def volume_screen(store: Store, record: SolutionRecord, query: VolumeQuery, translate: Translate) -> VolumeScreen:
+    """The map of a stored solution; ``trouble`` if there is none."""
     campaign = store.campaigns.find(record.campaign_id).name
     try:
         stored = stored_field(store, record)
     except (AbbeError, ValueError, KeyError, TypeError) as error:
-        return VolumeScreen(record.id, campaign, asked, trouble=error.detail if isinstance(error, AbbeError) else repr(error))
-    # A motion that cannot be asked for alone, e.g. in a link of another solution, is left out; it is named below.
-    chosen = tuple(name for name in stored.motions if name in asked.motions and name not in stored.hidden)
-    asked = VolumeQuery(chosen, asked.plane, asked.at, asked.nodes)
-    found = node_map(stored, asked.nodes, chosen)
-    return _screen(stored, campaign, asked, found, say)
+        return VolumeScreen(record.id, campaign, query, trouble=error.detail if isinstance(error, AbbeError) else repr(error))
+    # Motions without a map of their own, e.g. from a link to another solution, are left out; the screen names them.
+    chosen = tuple(name for name in stored.motions if name in query.motions and name not in stored.hidden)
+    query = VolumeQuery(chosen, query.plane, query.at, query.nodes)
+    found = node_map(stored, query.nodes, chosen)
+    return _screen(stored, campaign, query, found, translate)
 
 
-def _screen(stored: StoredField, campaign: str, asked: VolumeQuery, found: NodeMap, say: Say) -> VolumeScreen:
-    n, third = asked.nodes, PLANES[asked.plane][2]
-    at = asked.at if 0 <= asked.at < n else n // 2
+def _screen(stored: StoredField, campaign: str, query: VolumeQuery, found: NodeMap, translate: Translate) -> VolumeScreen:
+    n, third = query.nodes, PLANES[query.plane][2]
+    at = query.at if 0 <= query.at < n else n // 2
     levels = np.unique(found.points_mm[:, third])
     place, error = current().drawn("mm"), current().drawn()
     length, top = found.length_um, colour_top(found.length_um / error.size)
     magnified = magnification(float(stored.known.machine.length_mm.max()), float(length.max()))
     level = placed(float(levels[at]), place)
-    words = SliceTexts(
-        say("volume.slice", plane=asked.plane, axis="XYZ"[third], at=level, unit=place.sign), say("volume.nominal"), say("volume.actual"),
-        say("volume.untold_key"), say("volume.magnified", n=tidy(magnified)), place, error,
+    texts = SliceTexts(
+        translate("volume.slice", plane=query.plane, axis="XYZ"[third], at=level, unit=place.sign),
+        translate("volume.nominal"), translate("volume.actual"), translate("volume.untold_key"),
+        translate("volume.magnified", n=tidy(magnified)), place, error,
     )  # fmt: skip
-    cut = _slice(found, asked.plane, at)
-    part = stored.known.part(asked.motions) if asked.motions else stored.known
+    cut = _slice(found, query.plane, at)
+    part = stored.known.part(query.motions) if query.motions else stored.known
     rms_mm, u_mm = expected_rms(part, n)
-    figures = _figures(found, rms_mm * 1e3, u_mm * 1e3, say)
-    query = [("nodes", asked.nodes), *(("motion", name) for name in asked.motions)]
-    motions = [(m, stored.statuses.get(m, ""), m in stored.hidden, not asked.motions or m in asked.motions) for m in stored.motions]
-    # The SVG writer has escaped every text; escaping again would show the reader the tags.
-    picture = Markup(slice_plot(cut, top, magnified, words))  # noqa: S704
+    figures = _figures(found, rms_mm * 1e3, u_mm * 1e3, translate)
+    parameters = [("nodes", query.nodes), *(("motion", name) for name in query.motions)]
+    motions = [(m, stored.statuses.get(m, ""), m in stored.hidden, not query.motions or m in query.motions) for m in stored.motions]
+    # The SVG writer has already escaped every text.
+    picture = Markup(slice_plot(cut, top, magnified, texts))  # noqa: S704
     return VolumeScreen(
-        stored.number, campaign, VolumeQuery(asked.motions, asked.plane, at, n), motions, list(stored.hidden.items()), node_lines(found),
-        [placed(float(v), place) for v in levels], f"/api/v1/solutions/{stored.number}/field?{urlencode(query)}", picture, figures,
+        stored.number, campaign, VolumeQuery(query.motions, query.plane, at, n), motions, list(stored.hidden.items()), node_lines(found),
+        [placed(float(v), place) for v in levels], f"/api/v1/solutions/{stored.number}/field?{urlencode(parameters)}", picture, figures,
         int((~found.told).sum()), steps(top), top, magnified,
     )  # fmt: skip
 
 
-def _figures(found: NodeMap, rms_um: float, u_um: float, say: Say) -> list[tuple[str, str]]:
-    """Largest error, where it is, and rms."""
+def _figures(found: NodeMap, rms_um: float, u_um: float, translate: Translate) -> list[tuple[str, str]]:
+    """Largest error, its position, and rms."""
     frame = current()
     worst = int(np.argmax(found.length_um))
     largest = frame.with_u(float(found.length_um[worst]), float(found.u_um[worst, 3]))
-    where = ", ".join(placed(float(v), frame.drawn("mm")) for v in found.points_mm[worst])
+    position = ", ".join(placed(float(v), frame.drawn("mm")) for v in found.points_mm[worst])
     return [
-        (say("volume.largest"), "{} ± {} {}".format(*largest, frame.unit())),
-        (say("volume.where"), f"({where}) {frame.unit('mm')}"),
-        (say("volume.rms_map"), "{} ± {} {}".format(*frame.with_u(rms_um, u_um), frame.unit())),
+        (translate("volume.largest"), "{} ± {} {}".format(*largest, frame.unit())),
+        (translate("volume.where"), f"({position}) {frame.unit('mm')}"),
+        (translate("volume.rms_map"), "{} ± {} {}".format(*frame.with_u(rms_um, u_um), frame.unit())),
     ]
 
 
@@ -140,12 +141,12 @@ def _slice(found: NodeMap, plane: str, at: int) -> SlicePlane:
 
 
 def node_lines(found: NodeMap) -> list[NodeLine]:
-    """Every node in words."""
+    """All nodes in the reader's units."""
     frame = current()
     values = np.column_stack([found.deviation_um, found.length_um])
     out = []
-    for place, row, u, told in zip(found.points_mm, values, found.u_um, found.told, strict=True):
+    for place, row, u, significant in zip(found.points_mm, values, found.u_um, found.told, strict=True):
         x, y, z = (placed(float(v), frame.drawn("mm")) for v in place)
         parts = tuple(frame.with_u(float(v), float(s)) if s > STILL_UM else (STILL, STILL) for v, s in zip(row, u, strict=True))
-        out.append(NodeLine((x, y, z), parts, bool(told)))
+        out.append(NodeLine((x, y, z), parts, bool(significant)))
     return out

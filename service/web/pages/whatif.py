@@ -1,4 +1,4 @@
-"""What would be left if some errors were corrected: choices, numbers and bars for the screen."""
+"""What-if for the screen: errors that would remain if some were corrected."""
 
 from __future__ import annotations
 
@@ -19,44 +19,44 @@ from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 
 MEAN = "mean."
-"""Before the name of a scale or squareness that is averaged over the volume."""
+"""Prefix of scales and squarenesses that are averaged over the volume."""
 CHECK_PLACE, CHECK_SHARE = (0.45, 0.55, 0.12), 0.7
-"""Where the shipped checks set up the ball-bar (`abbe.service.sequences.recipes.campaigns.quick_check`)."""
+"""Set-up of the ball-bar in the builtin checks (`abbe.service.sequences.recipes.campaigns.quick_check`)."""
 UM = 1e3
 RESOLUTION_MM = 1e-7
-"""Nobody measures a tenth of a nanometre; an uncertainty below it is rounding of numbers."""
+"""Uncertainties below a tenth of a nanometre are rounding."""
 NOTHING = Markup("")
-Say = Callable[..., str]
+Translate = Callable[..., str]
 
 
 @dataclass(frozen=True, slots=True)
 class EffectChoice:
-    """What can be taken as corrected.
+    """An error that can count as corrected.
 
-    ``text``: its name for people; ``reason``: why it cannot be chosen alone, empty if it can; ``taken``: whether it was.
+    ``text``: name for people; ``reason``: why it cannot be chosen alone, empty if it can; ``selected``: whether it counts as corrected.
     """
 
     name: str
     text: str
     status: str
     reason: str
-    taken: bool
+    selected: bool
 
 
 @dataclass(frozen=True, slots=True)
 class ForecastLine:
-    """A figure in the reader's unit: value and U (k = 2) before and after, the gain, what that says: better, worse, not beyond its U."""
+    """A figure in the reader's unit: value and U (k = 2) before and after, the gain, and its verdict: better, worse, unsure."""
 
     name: str
     before: tuple[str, str]
     after: tuple[str, str]
     gain: tuple[str, str]
-    told: str
+    verdict: str
 
 
 @dataclass(frozen=True, slots=True)
 class WhatIfScreen:
-    """The question and its answer. ``means``: linear errors over the volume; ``trouble``: why there is no answer."""
+    """Selection and forecast. ``means``: linear errors over the volume; ``trouble``: why there is no forecast."""
 
     number: int
     campaign: str
@@ -68,36 +68,36 @@ class WhatIfScreen:
     trouble: str = ""
 
     @property
-    def taken(self) -> bool:
+    def any_selected(self) -> bool:
         """Whether anything counts as corrected."""
-        return self.everything or any(c.taken for c in (*self.means, *self.motions))
+        return self.everything or any(c.selected for c in (*self.means, *self.motions))
 
     @property
-    def shut(self) -> list[EffectChoice]:
-        """What cannot be chosen alone."""
+    def unavailable(self) -> list[EffectChoice]:
+        """Motions that cannot be chosen alone."""
         return [c for c in self.motions if c.reason]
 
 
-def whatif_screen(store: Store, record: SolutionRecord, take: Sequence[str], everything: bool, say: Say) -> WhatIfScreen:
-    """Ask a stored solution; what it cannot answer says why."""
+def whatif_screen(store: Store, record: SolutionRecord, take: Sequence[str], everything: bool, translate: Translate) -> WhatIfScreen:
+    """The forecast of a stored solution; ``trouble`` if there is none."""
     campaign = store.campaigns.find(record.campaign_id).name
     try:
         stored = stored_field(store, record)
     except (AbbeError, ValueError, KeyError, TypeError) as error:
         return WhatIfScreen(record.id, campaign, trouble=error.detail if isinstance(error, AbbeError) else repr(error))
-    means, motions = _means(stored, take, say), _motions(stored, take)
-    why = "" if everything else _refusal([*means, *motions], take, say)
+    means, motions = _means(stored, take, translate), _motions(stored, take)
+    why = "" if everything else _refusal([*means, *motions], take, translate)
     if why:
         return WhatIfScreen(record.id, campaign, means, motions, trouble=why)
     outcomes = forecast(stored, [] if everything else take, everything=everything)
-    screen = WhatIfScreen(record.id, campaign, means, motions, everything, [_line(o, say) for o in outcomes])
-    if not screen.taken:
+    screen = WhatIfScreen(record.id, campaign, means, motions, everything, [_line(o, translate) for o in outcomes])
+    if not screen.any_selected:
         return screen
-    return WhatIfScreen(record.id, campaign, means, motions, everything, screen.lines, _picture(outcomes, say))
+    return WhatIfScreen(record.id, campaign, means, motions, everything, screen.lines, _picture(outcomes, translate))
 
 
 def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = False) -> list[Forecast]:
-    """Figures of the volume and of the shipped check, before and after."""
+    """Figures of the volume and of the builtin check, before and after."""
     known = stored.known
     centre, radius = hemisphere(known.machine, CHECK_PLACE, CHECK_SHARE)
     linear = {name: stored.means[name][0] for name in (t.removeprefix(MEAN) for t in take if t.startswith(MEAN))}
@@ -106,15 +106,15 @@ def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = Fal
     return what_if(known, off, check_figures(known, (np.array(centre), radius)))
 
 
-def _means(stored: StoredField, take: Sequence[str], say: Say) -> list[EffectChoice]:
-    """Linear errors over the volume with their values: a quantity that runs show even where they cannot tell single motions apart.
+def _means(stored: StoredField, take: Sequence[str], translate: Translate) -> list[EffectChoice]:
+    """Linear errors over the volume with their values, which runs show even if they cannot separate the motions.
 
-    µm/m is a ratio: the same number for a reader of inches (µin/in), and not converted.
+    µm/m is a ratio with the same value in µin/in, so it is not converted.
     """
     out = []
     for name, (value, u) in stored.means.items():
         shown = "{} ± {}".format(*with_uncertainty(value * 1e6, u * 1e6)) + (" µm/m" if name[0] == "E" else " µrad")
-        text = say("whatif.slope" if name[0] == "E" else "whatif.square", name=name, value=shown)
+        text = translate("whatif.slope" if name[0] == "E" else "whatif.square", name=name, value=shown)
         out.append(EffectChoice(MEAN + name, text, "", "", MEAN + name in take))
     return out
 
@@ -123,34 +123,34 @@ def _motions(stored: StoredField, take: Sequence[str]) -> list[EffectChoice]:
     return [EffectChoice(m, m, stored.statuses.get(m, ""), stored.hidden.get(m, ""), m in take) for m in stored.motions]
 
 
-def _refusal(choices: Sequence[EffectChoice], take: Sequence[str], say: Say) -> str:
-    """Why the question cannot be answered, in one line; empty if it can."""
-    strange = [name for name in take if name not in {c.name for c in choices}]
-    if strange:
-        return say("whatif.refused", names=", ".join(strange), why=say("whatif.unknown"))
-    lost = [c for c in choices if c.taken and c.reason]
-    if lost:
-        return say("whatif.refused", names=", ".join(c.name for c in lost), why=lost[0].reason)
+def _refusal(choices: Sequence[EffectChoice], take: Sequence[str], translate: Translate) -> str:
+    """Why the selection has no forecast, in one line; empty if it has one."""
+    unknown = [name for name in take if name not in {c.name for c in choices}]
+    if unknown:
+        return translate("whatif.refused", names=", ".join(unknown), why=translate("whatif.unknown"))
+    hidden = [c for c in choices if c.selected and c.reason]
+    if hidden:
+        return translate("whatif.refused", names=", ".join(c.name for c in hidden), why=hidden[0].reason)
     twice = [name for name in take if MEAN + name in take]
-    return say("whatif.twice", names=", ".join(twice)) if twice else ""
+    return translate("whatif.twice", names=", ".join(twice)) if twice else ""
 
 
-def _line(o: Forecast, say: Say) -> ForecastLine:
+def _line(o: Forecast, translate: Translate) -> ForecastLine:
     pairs = [(o.before_mm, o.u_before_mm), (o.after_mm, o.u_after_mm), (o.gain_mm, max(o.u_gain_mm, RESOLUTION_MM))]
     before, after, gain = (current().with_u(v * UM, u * UM) for v, u in pairs)
-    if o.u_gain_mm < RESOLUTION_MM:  # taking a given scale out shifts a range by as much in every draw: what is left is rounding
+    if o.u_gain_mm < RESOLUTION_MM:  # removing a given scale shifts a range equally in every draw: the rest is rounding
         gain = (gain[0], "0")
     sure = abs(o.gain_mm) > max(COVERAGE * o.u_gain_mm, RESOLUTION_MM)
-    return ForecastLine(_name(o, say), before, after, gain, "unsure" if not sure else "better" if o.gain_mm > 0.0 else "worse")
+    return ForecastLine(_name(o, translate), before, after, gain, "unsure" if not sure else "better" if o.gain_mm > 0.0 else "worse")
 
 
-def _name(o: Forecast, say: Say) -> str:
+def _name(o: Forecast, translate: Translate) -> str:
     stem, _, rest = o.name.partition("_")
-    return say("figure.diagonal", name=rest) if stem == "diagonal" else say(f"whatif.{o.name}")
+    return translate("figure.diagonal", name=rest) if stem == "diagonal" else translate(f"whatif.{o.name}")
 
 
-def _picture(outcomes: Sequence[Forecast], say: Say) -> Markup:
-    pairs = [Pair(_name(o, say), (o.before_mm * UM, o.u_before_mm * UM), (o.after_mm * UM, o.u_after_mm * UM)) for o in outcomes]
-    names = (say("whatif.before"), say("whatif.after"))
-    # The SVG writer has escaped every text; escaping again would show the reader the tags.
-    return Markup(paired_bars(pairs, names, key="whatif", heading=say("whatif.bars"), unit=current().drawn()))  # noqa: S704
+def _picture(outcomes: Sequence[Forecast], translate: Translate) -> Markup:
+    pairs = [Pair(_name(o, translate), (o.before_mm * UM, o.u_before_mm * UM), (o.after_mm * UM, o.u_after_mm * UM)) for o in outcomes]
+    names = (translate("whatif.before"), translate("whatif.after"))
+    # The SVG writer has already escaped every text.
+    return Markup(paired_bars(pairs, names, key="whatif", heading=translate("whatif.bars"), unit=current().drawn()))  # noqa: S704

@@ -1,1 +1,1 @@
-"""The web process itself: its start, its guard of imports, its server."""
+"""The web process: entry point, import guard and server."""

@@ -13,10 +13,10 @@ from abbe.service.web.process import import_guard
 
 def main() -> int:
     """Serve until the core ends the channel; return the exit code."""
-    channel, listening = (socket.socket(fileno=int(word)) for word in sys.argv[1:3])
-    # Ctrl-C at the terminal goes to both; the core decides when the page ends.
+    channel, listening = (socket.socket(fileno=int(text)) for text in sys.argv[1:3])
+    # Ctrl-C at the terminal reaches both processes; the core decides when the web process ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    import_guard.build()
+    import_guard.install()
     from abbe.service.logs import configure_logs
     from abbe.service.web.process.serving import serve_pages
 
@@ -28,5 +28,5 @@ def main() -> int:
 if __name__ == "__main__":
     code = main()
     sys.stderr.flush()
-    # Everything is closed. Taking the interpreter down module by module takes longer than the core waits on a busy computer.
+    # Everything is closed. On a busy computer a regular interpreter shutdown takes longer than the core waits.
     os._exit(code)

@@ -1,4 +1,4 @@
-"""What the web process must never load: an attacker who takes it over finds no way to a device in it."""
+"""Modules that the web process must never load: an attacker who takes it over must find no way to a device in it."""
 
 from __future__ import annotations
 
@@ -20,27 +20,21 @@ FORBIDDEN = (
 )
 
 
-class Wall(MetaPathFinder):
-    """Refuses to import `FORBIDDEN`, early or late, by whomever."""
+class ImportGuard(MetaPathFinder):
+    """Refuses every import of a module in `FORBIDDEN`."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Refuse, or say nothing.
-
-        Raises
-        ------
-        ImportError
-            It is one of those.
-        """
-        if behind(fullname):
+        """Raise ImportError for a forbidden module; leave all others to the next finder."""
+        if is_forbidden(fullname):
             raise ImportError(f"the web process does not import {fullname}", name=fullname)
         return None
 
 
-def behind(module: str) -> bool:
-    """Tell whether a module is one that the web process must not load."""
+def is_forbidden(module: str) -> bool:
+    """Whether the web process must not load a module."""
     return any(module == name or module.startswith(f"{name}.") for name in FORBIDDEN)
 
 
-def build() -> None:
-    """From now on nothing behind the wall can be imported by this process."""
-    sys.meta_path.insert(0, Wall())
+def install() -> None:
+    """Refuse forbidden imports in this process from now on."""
+    sys.meta_path.insert(0, ImportGuard())

@@ -1,4 +1,4 @@
-"""The web process put together: channel, store, users, application, server; and its end when the core has ended."""
+"""Assembles the web process from channel, store, users, application and server, and ends it with the core."""
 
 from __future__ import annotations
 
@@ -26,21 +26,18 @@ from abbe.service.users.people import People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
-from abbe.service.web.core_link.logtail import keep_log
-from abbe.service.web.login.authentication import Authenticator, Front
-from abbe.service.web.login.connections import PatientProtocol
+from abbe.service.web.core_link.logtail import capture_log
+from abbe.service.web.login.authentication import Authenticator, Endpoint
+from abbe.service.web.login.connections import TimeLimitedProtocol
 from abbe.service.web.pages.rehearsal import Rehearsals
 
-# The web server inside the event loop of the web process: the core's socket, our signals, our end.
-
-
 HANDSHAKE_S = 10.0
-LONGEST_WORD_B = 1024
-"""A client of a WebSocket has nothing to say; what is longer ends the connection."""
+LONGEST_MESSAGE_B = 1024
+"""WebSocket clients have nothing to send; a longer message ends the connection."""
 
 
 class Server(uvicorn.Server):
-    """uvicorn that leaves the signals alone: the service stops its parts in its own order. ``answers`` is set when it serves."""
+    """uvicorn without signal handlers, since the service stops its parts in its own order. ``answers`` is set once it serves."""
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)
@@ -48,23 +45,23 @@ class Server(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture none."""
+        """Capture no signals."""
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to answer, and say so."""
+        """Start to serve, then set ``answers``."""
         await self._listen(sockets)
         self.answers.set()
 
     async def _listen(self, sockets: list[socket.socket] | None) -> None:
-        """Begin to listen. A visitor who never ends his TLS handshake is let go sooner than after asyncio's minute."""
+        """Listen, with a shorter limit for TLS handshakes than asyncio's minute."""
         if self.config.ssl is None or sockets is None:
             await super().startup(sockets)
             return
-        await super().startup([])  # all but the listening: uvicorn has no setting for how long a handshake may take
+        await super().startup([])  # everything but listening: uvicorn has no setting for the duration of a handshake
 
         def protocol() -> asyncio.Protocol:
-            return PatientProtocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
+            return TimeLimitedProtocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
 
         loop, tls = asyncio.get_running_loop(), self.config.ssl
         for listening in sockets:
@@ -72,14 +69,9 @@ class Server(uvicorn.Server):
 
 
 def make_server(app: FastAPI, certificate: str = "", key: str = "") -> Server:
-    """Return a server for ``app``; run it with ``await server.serve(sockets=[...])``, end it with ``should_exit``.
+    """A server for ``app``; run it with ``await server.serve(sockets=[...])``, end it with ``should_exit``.
 
-    Parameters
-    ----------
-    app : FastAPI
-        What it serves.
-    certificate, key : str
-        PEM files, checked before (`check_certificate`); empty: plain HTTP. Python's own settings refuse TLS below 1.2.
+    ``certificate``, ``key``: PEM files that `check_certificate` has accepted; empty: plain HTTP. Python's defaults refuse TLS below 1.2.
     """
     return Server(
         uvicorn.Config(
@@ -89,9 +81,9 @@ def make_server(app: FastAPI, certificate: str = "", key: str = "") -> Server:
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=PatientProtocol,
+            http=TimeLimitedProtocol,
             ws="websockets-sansio",
-            ws_max_size=LONGEST_WORD_B,
+            ws_max_size=LONGEST_MESSAGE_B,
             ws_ping_interval=20.0,
             ws_ping_timeout=20.0,
             ws_per_message_deflate=False,
@@ -99,7 +91,7 @@ def make_server(app: FastAPI, certificate: str = "", key: str = "") -> Server:
             proxy_headers=False,
             timeout_keep_alive=5,
             timeout_graceful_shutdown=1,
-            # How many are connected and at work at the same time is the protocol's business: uvicorn counts who says nothing, too.
+            # The protocol limits connections: uvicorn would count idle ones as well.
             limit_concurrency=None,
         )
     )
@@ -111,7 +103,7 @@ ALIVE_S = 2.0
 
 
 async def serve_pages(channel: socket.socket, listening: socket.socket) -> int:
-    """Serve until the channel ends; return the exit code. What is wrong is one line in the log: the core starts a new process."""
+    """Serve until the channel ends; return the exit code. An error is one line in the log; the core starts a new process."""
     wire = await Wire.over(channel)
     try:
         begin = await _begin(wire)
@@ -130,13 +122,13 @@ async def serve_pages(channel: socket.socket, listening: socket.socket) -> int:
 
 
 async def _begin(wire: Wire) -> Begin | None:
-    """What the core says first; None: it has ended before."""
+    """First message of the core; None: the core has ended."""
     body = await wire.receive()
     if body is None:
         return None
     first = from_core(body)
     if not isinstance(first, Begin) or first.protocol != PROTOCOL:
-        raise ChannelBroken("the core of the service speaks another version of the channel")
+        raise ChannelBroken("the core of the service has another version of the channel")
     return first
 
 
@@ -147,7 +139,7 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
     core = CoreLine(wire, clock)
     reader = Reader(store, begin.machine, clock, begin.control)
     view = StatusReader(reader, begin.version, core, core.next_due, begin.broker)
-    auth = Authenticator(store, people, AuditBook(store, begin.store_url), Front(begin.port, begin.behind_tls))
+    auth = Authenticator(store, people, AuditBook(store, begin.store_url), Endpoint(begin.port, begin.behind_tls))
     parts = Parts(
         core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns, begin.control
     )
@@ -157,22 +149,22 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
         schedules=begin.schedules,
         devices=lambda: core.devices,
         rules=Rules(**asdict(begin.rules)),
-        tail=keep_log(),
+        tail=capture_log(),
     )
     app = create_app(view, version=begin.version, hosts=begin.hosts, auth=auth, parts=parts, plant=plant, api=api)
     server = make_server(app, begin.certificate, begin.key)
     app.state.end = lambda: setattr(server, "should_exit", True)
-    heard = asyncio.create_task(core.listen(), name="core")
+    listening_to_core = asyncio.create_task(core.listen(), name="core")
     serving = asyncio.create_task(server.serve(sockets=[listening]), name="server")
     alive = asyncio.create_task(_alive(wire, server), name="alive")
-    await asyncio.wait({heard, serving, alive}, return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait({listening_to_core, serving, alive}, return_when=asyncio.FIRST_COMPLETED)
     server.should_exit = True
     core.end()
     await asyncio.wait({serving})
     alive.cancel()
-    heard.cancel()
-    await asyncio.wait({alive, heard})
-    for task in (serving, heard, alive):
+    listening_to_core.cancel()
+    await asyncio.wait({alive, listening_to_core})
+    for task in (serving, listening_to_core, alive):
         if not task.cancelled():
             task.result()
     return 0

@@ -1,4 +1,4 @@
-// "Done" for what a person is asked to do by hand: for exactly the prompt that stands beside the button, and no other.
+// The button "Done" of a manual step confirms exactly the prompt beside it.
 
 const READ_MS = 1000;
 let seen = "";
@@ -13,8 +13,8 @@ function nameOf(button) {
   return `${button.dataset.job}/${button.dataset.prompt}`;
 }
 
-// Nobody confirms what he has not read: whoever meant the prompt before does not hit the one that has just come. The second is the prompt's, not
-// the button's: the page may be replaced meanwhile.
+// The button stays disabled until a new prompt has been shown for a second, so that a late click on the previous prompt does not confirm it.
+// The second belongs to the prompt, since the page may replace the button meanwhile.
 function look() {
   const button = shown();
   if (!button) return;
@@ -46,14 +46,14 @@ async function done(button) {
   const headers = { "X-CSRF-Token": csrf };
   const answer = await fetch(`/api/v1/jobs/${job}/prompts/${prompt}/done`, { method: "POST", headers }).catch((trouble) => trouble);
   const problem = !answer.ok && answer.json ? await answer.json().catch(() => ({})) : {};
-  // It may be another prompt by now, with its own second, or another card.
+  // The card may have been replaced, or show another prompt, meanwhile.
   if (!button.isConnected || nameOf(button) !== name) return;
   button.disabled = false;
   if (answer.ok) card.hidden = true;
   else alert.textContent = problem.detail || String(answer.statusText || answer);
 }
 
-// The home page is replaced while it is open: the document stays.
+// Listen on the document, because the home page replaces its content.
 document.addEventListener("click", (event) => {
   const button = event.target.closest("button[data-prompt]");
   if (button) done(button);

@@ -1,4 +1,4 @@
-// The live run: two WebSockets (how things stand; what the path reads), two traces, and the buttons that hold and end the run.
+// The live run: two WebSockets (status and samples), two traces, and the buttons that control the run.
 
 import { Traces, framesOf } from "./traces.js";
 
@@ -10,11 +10,11 @@ const root = document.getElementById("live");
 const words = JSON.parse(root.dataset.words);
 const spans = JSON.parse(document.body.dataset.words);
 const job = root.dataset.job ?? "";
-// A campaign that the service runs for itself has no number: it is shown, and nobody steers it from here.
+// A campaign that the service started itself has no number: the screen shows it without buttons.
 const shows = "job" in root.dataset;
 const lost = document.getElementById("live-lost");
 const find = (id) => document.getElementById(id);
-// What the reader sees deviations in, and how many µm it is; a µin is finer than the tenth of a µm that is shown.
+// The reader's unit for deviations, and its size in µm; a µin is finer than the shown tenth of a µm.
 const unit = { sign: root.dataset.unit, size: Number(root.dataset.size) };
 const decimals = unit.size < 0.1 ? 0 : 1;
 
@@ -28,13 +28,13 @@ function span(seconds) {
   return spans[key].replace("{n}", Math.round(n));
 }
 
-// ---- connections: opened again for ever, and a line that says nothing is a lost one -------------------------------------------------
+// ---- connections: reconnect forever; a silent connection counts as lost -------------------------------------------------------------
 
-const heard = new Map();
+const connections = new Map();
 
 function keepOpen(path, patienceMs, onMessage) {
   const state = { at: performance.now(), gone: performance.now(), open: false };
-  heard.set(path, state);
+  connections.set(path, state);
   const connect = () => {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`);
     socket.binaryType = "arraybuffer";
@@ -46,7 +46,7 @@ function keepOpen(path, patienceMs, onMessage) {
     socket.onmessage = (event) => { state.at = performance.now(); onMessage(event.data); };
     socket.onclose = () => {
       clearInterval(watch);
-      // An attempt that is refused does not move it: refused again and again is lost.
+      // A refused attempt does not reset the time: repeated refusals count as lost.
       if (state.open) state.gone = performance.now();
       state.open = false;
       setTimeout(connect, AGAIN_MS);
@@ -55,7 +55,7 @@ function keepOpen(path, patienceMs, onMessage) {
   connect();
 }
 
-// ---- how things stand --------------------------------------------------------------------------------------------------------------
+// ---- status ------------------------------------------------------------------------------------------------------------------------
 
 let now = null;
 let traces = null;
@@ -70,7 +70,7 @@ function showState(state) {
   if (pause.textContent !== text) pause.textContent = text;
 }
 
-// The core tells how far the run is after each step; a path is one step of minutes, and how far it is its samples tell.
+// The core reports progress after each step; within a path, a step of minutes, the samples show the progress.
 function showProgress() {
   if (!now || now === "over" || !(now.total > 0)) return;
   const bar = find("live-bar");
@@ -79,7 +79,7 @@ function showProgress() {
   bar.value = Math.min(now.total, now.done + inPath);
 }
 
-// What a person is to do. The number stands at the button: an answer is for what stood there when it was pressed.
+// The prompt for a person. The button has its number, so an answer belongs to the prompt that was visible.
 function showPrompt(number, text) {
   const card = find("by-hand");
   const button = card.querySelector("button");
@@ -97,18 +97,18 @@ async function showEnd() {
   find("by-hand")?.remove();
   if (find("ask-stop")?.open) find("ask-stop").close();
   const answer = job ? await fetch(`/api/v1/jobs/${job}`, { headers: { "X-Abbe-Active": "0" } }).catch(() => null) : null;
-  const told = answer?.ok ? await answer.json() : null;
-  setText("live-outcome", words["live.ended"].replace("{state}", told ? words[`slot.${told.state}`] ?? told.state : "–"));
-  setText("live-text", told?.text ?? "");
-  if (told?.proposal) {
+  const ended = answer?.ok ? await answer.json() : null;
+  setText("live-outcome", words["live.ended"].replace("{state}", ended ? words[`slot.${ended.state}`] ?? ended.state : "–"));
+  setText("live-text", ended?.text ?? "");
+  if (ended?.proposal) {
     find("live-made").hidden = false;
-    find("live-made").querySelector("a").href = `/proposal?id=${told.proposal}`;
+    find("live-made").querySelector("a").href = `/proposal?id=${ended.proposal}`;
   }
   setText("live-state", words["measuring.ended"]);
   find("live-over").hidden = false;
 }
 
-function onMoment(text) {
+function onStatus(text) {
   const event = JSON.parse(text);
   if (!shows) {
     if (event.job) location.reload();
@@ -130,9 +130,9 @@ function onMoment(text) {
   setText("live-left", now.eta_s === null ? spans["job.unknown"] : spans["job.left"].replace("{span}", span(now.eta_s)));
 }
 
-keepOpen("/api/v1/live", SILENT_MS, onMoment);
+keepOpen("/api/v1/live", SILENT_MS, onStatus);
 
-// ---- what the path reads ----------------------------------------------------------------------------------------------------------
+// ---- samples of the path ----------------------------------------------------------------------------------------------------------
 
 let asked = false;
 let newest = 0;
@@ -182,10 +182,10 @@ if (shows) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { traces.drawStrip(); traces.drawPolar(true); });
 }
 
-// ---- once a second: is all of this still so? ---------------------------------------------------------------------------------------
+// ---- once a second: check for stale data -------------------------------------------------------------------------------------------
 
 setInterval(() => {
-  const old = [...heard.values()].some((state) => !state.open && performance.now() - state.gone > 2 * AGAIN_MS);
+  const old = [...connections.values()].some((state) => !state.open && performance.now() - state.gone > 2 * AGAIN_MS);
   lost.hidden = !old;
   if (!shows) return;
   if (now !== "over") setText("live-elapsed", span(Number(root.dataset.elapsed) + performance.now() / 1000));

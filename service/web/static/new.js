@@ -1,4 +1,4 @@
-// Starts what was run dry. The key comes with the page: pressed twice, or asked again after a lost answer, it is one job.
+// Starts the recipe of the dry run. The key comes with the page, so a second click or a repeated request starts no second job.
 
 const form = document.getElementById("start");
 

@@ -1,12 +1,12 @@
-// Orders something of a table - the one in force back, an approved one pushed - after a person has said so twice, and follows the job until
-// it has ended. The key comes with the page: pressed twice, or asked again after a lost answer, it is one order.
+// Orders a rollback or a push of a table after a second confirmation, and follows the job to its end. The key comes with the page, so a
+// second click or a repeated request is the same order.
 
 const form = document.getElementById("order");
 const dialog = document.getElementById("ask-order");
 const reason = form?.elements.reason;
 const POLL_MS = 1000;
 
-function say(text) {
+function showError(text) {
   form.querySelector("[role=alert]").textContent = text;
 }
 
@@ -26,7 +26,7 @@ async function follow(place) {
         return;
       }
     } else if (answer) {
-      say(`${answer.status} ${answer.statusText}`);
+      showError(`${answer.status} ${answer.statusText}`);
       document.getElementById("order-over").hidden = false;
       return;
     }
@@ -47,7 +47,7 @@ async function order() {
     return;
   }
   const problem = await answer.json().catch(() => ({}));
-  say(problem.detail || `${answer.status} ${answer.statusText}`);
+  showError(problem.detail || `${answer.status} ${answer.statusText}`);
 }
 
 form?.addEventListener("submit", (event) => {
@@ -65,7 +65,7 @@ dialog?.addEventListener("close", async () => {
   if (dialog.returnValue !== "order") return;
   const button = form.querySelector("button");
   button.disabled = true;
-  say("");
-  await order().catch((trouble) => say(String(trouble)));
+  showError("");
+  await order().catch((trouble) => showError(String(trouble)));
   button.disabled = false;
 });

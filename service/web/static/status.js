@@ -1,12 +1,12 @@
-// Tells whether the service still answers, on every screen. Refreshes the home page: what moves every 2 s from the JSON, everything else from
-// the server when the revision changes. Other screens are not replaced: somebody may be reading or filling in a form.
+// Shows on every screen whether the service answers. Refreshes the home page: progress every 2 s from the JSON, everything else from the
+// server when the revision changes. Other screens are not replaced, since a person may be reading or filling in a form.
 
 const PERIOD_MS = 2000;
 const PATIENCE_MS = 5000;
 
 const banner = document.getElementById("lost");
 const words = JSON.parse(document.body.dataset.words);
-// Whether a person has touched the page since it was last refreshed: only that keeps the session alive.
+// Whether a person has used the page since the last refresh: only that extends the session.
 let touched = false;
 for (const kind of ["pointerdown", "keydown", "wheel"]) addEventListener(kind, () => { touched = true; }, { passive: true });
 let revision = document.getElementById("content").dataset.revision;
@@ -33,14 +33,14 @@ function left(seconds) {
   return seconds === null ? words["job.unknown"] : filled("job.left", "span", span(seconds));
 }
 
-function showMoment(status) {
+function showStatus(status) {
   const now = Date.parse(status.now_utc);
   for (const element of document.querySelectorAll("[data-until]")) {
     const seconds = (Date.parse(element.dataset.until) - now) / 1000;
     const text = seconds > 0 ? filled("due.in", "span", span(seconds)) : words["due.now"];
     if (element.textContent !== text) element.textContent = text;
   }
-  // Only where what the age is of is fetched anew as well: an age that grows beside an old time would be wrong.
+  // Only on screens that also refresh the times: an age must not grow beside a stale time.
   for (const element of refreshes ? document.querySelectorAll("[data-since]") : []) {
     const text = filled("ago", "span", span((now - Date.parse(element.dataset.since)) / 1000));
     if (element.textContent !== text) element.textContent = text;
@@ -89,13 +89,13 @@ async function refresh() {
       throw new Error(`status ${answer.status}`);
     }
     const status = await answer.json();
-    // A screen of a silent core has no revision: its own address is asked again, now that somebody answers.
+    // The screen of an unavailable core has no revision: reload it, now that the core answers.
     if (revision === "") { location.reload(); return; }
     if (revision !== undefined && status.revision !== revision) await replaceContent(status.revision);
-    showMoment(status);
+    showStatus(status);
     connected(true);
   } catch {
-    // Whatever the reason, what stands on the page is from now on old.
+    // Whatever the reason, the page is stale from now on.
     connected(false, silent);
   }
   setTimeout(refresh, PERIOD_MS);

@@ -1,6 +1,6 @@
-// Strip and polar trace of a ball-bar path on two canvases. Samples are kept as least and largest value of a pixel column (strip) or of a
-// part of the path (polar): what is drawn does not grow with the rate, and no peak is left out. Samples come in µm; from `take` on
-// everything is in the reader's unit, so that the scales are round numbers of it.
+// Strip and polar trace of a ball-bar path on two canvases. Each pixel column (strip) or part of the path (polar) keeps its least and largest
+// sample, so drawing does not depend on the rate and shows every peak. Samples arrive in µm; from `take` on all values are in the reader's
+// unit, so that its scales are round numbers.
 
 const STRIP_S = 20;
 const PARTS = 1440;
@@ -63,7 +63,7 @@ export class Traces {
     this.count = Math.max(this.count, first + values.length);
   }
 
-  // Columns that no sample falls into any more are empty again before the ring comes round.
+  // Clear skipped columns, which still have samples of the previous round of the ring.
   advance(column) {
     if (column <= this.column) return;
     const from = Math.max(this.column + 1, column - this.columns + 1);
@@ -168,10 +168,10 @@ export class Traces {
   }
 
   angle(share) {
-    const told = this.path.angle_deg;
-    const at = share * (told.length - 1);
-    const k = Math.min(Math.floor(at), told.length - 2);
-    return ((told[k] + (at - k) * (told[k + 1] - told[k])) * Math.PI) / 180;
+    const angles = this.path.angle_deg;
+    const at = share * (angles.length - 1);
+    const k = Math.min(Math.floor(at), angles.length - 2);
+    return ((angles[k] + (at - k) * (angles[k + 1] - angles[k])) * Math.PI) / 180;
   }
 }
 
@@ -180,7 +180,7 @@ function widen(low, high, at, value) {
   if (!(high[at] >= value)) high[at] = value;
 }
 
-// Frames lie one behind the other in a message: version, path, first sample, how many, when the last one arrived, then the values.
+// A message contains frames in sequence: version, path, first sample, count, arrival of the last sample, then the values.
 export function* framesOf(buffer) {
   const view = new DataView(buffer);
   for (let at = 0; at + 24 <= buffer.byteLength; ) {

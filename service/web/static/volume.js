@@ -1,4 +1,4 @@
-// The map of the volume: turned, zoomed and asked by mouse, touch and keyboard. Without WebGL2 the slice and the table below say the same.
+// The volume map: rotation, zoom and selection by mouse, touch and keyboard. Without WebGL2 the slice and the table show the same data.
 
 import { painter, rotation } from "/static/volume_gl.js";
 import { moved, prepared, shape } from "/static/volume_shape.js";
@@ -18,11 +18,11 @@ function styleNow(top) {
   return { top, steps, grey: rgba("--frame", 0.6), nominal: rgba("--frame", 0.35), ink: rgba("--ink") };
 }
 
-// The reader's units, sign and how many of ours: numbers come in mm and µm, and are converted once.
+// The reader's units with sign and size: numbers arrive in mm and µm and are converted once.
 const given = scene?.dataset ?? {};
 const unit = { place: given.place, mm: Number(given.placeSize), error: given.error, um: Number(given.errorSize) };
 
-// Two significant digits of U decide, as everywhere in Abbe: 470 is rounded to tens.
+// Rounds to two significant digits of U, as everywhere in Abbe: with U = 470, to tens.
 function rounded(value, expanded) {
   const digits = expanded > 0 ? Math.min(6, 1 - Math.floor(Math.log10(Number(expanded.toPrecision(2))))) : 3;
   const text = digits < 0 ? String(Math.round(value / 10 ** -digits) * 10 ** -digits) : value.toFixed(digits);
@@ -174,7 +174,7 @@ function start(map, paint) {
   choose(map.length.indexOf(Math.max(...map.length)));
 }
 
-// One pointer turns, two zoom; one that hardly moved chooses.
+// One pointer rotates, two zoom; a click without movement selects.
 function hands(canvas, act) {
   const down = new Map();
   let travelled = 0;

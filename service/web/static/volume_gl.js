@@ -1,4 +1,4 @@
-// Paints coloured lines and triangles with WebGL2, seen along parallel rays. Positions lie in a cube of side 1 about the origin.
+// Draws coloured lines and triangles with WebGL2 in parallel projection. Positions lie in a cube of side 1 around the origin.
 
 const VERTEX = `#version 300 es
 in vec3 place; in vec4 paint; uniform mat3 turn; uniform vec2 zoom; out vec4 colour;
@@ -16,7 +16,7 @@ function compiled(gl, kind, text) {
   return shader;
 }
 
-// Rows: right, up, and away from the viewer, who looks down by the pitch; Z of the machine points up.
+// Rows: right, up, and away from the viewer, whose view points down by the pitch; Z of the machine points up.
 export function rotation(yaw, pitch) {
   const [c, s, k, h] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
   return [[c, s, 0], [-s * h, c * h, k], [-s * k, c * k, -h]];

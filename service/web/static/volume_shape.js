@@ -1,4 +1,4 @@
-// The map as lines and triangles: commanded grid, deformed grid, arrows, a slice. Where the error is not known there is grey and no arrow.
+// The map as lines and triangles: commanded grid, deformed grid, arrows, a slice. Unknown errors are grey and have no arrow.
 
 const STEPS = 5;
 
@@ -13,8 +13,8 @@ function nodes([xs, ys, zs]) {
   return out;
 }
 
-// Places in a cube of side 1 about the middle of the strokes. Texts of places (`axes`, `at`), `deviation`, `length` and `expanded` are in the
-// reader's units, where a place in inches has four decimals; `move` is what a deviation is in the cube.
+// Positions in a cube of side 1 around the middle of the strokes. Texts of positions (`axes`, `at`), `deviation`, `length` and `expanded` are in
+// the reader's units, positions in inches with four decimals; `move` converts a deviation to the cube.
 export function prepared(answer, unit) {
   const mm = [answer.x_mm, answer.y_mm, answer.z_mm];
   const n = answer.nodes;

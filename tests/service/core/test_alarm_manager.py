@@ -15,7 +15,7 @@ from typing import Any, cast
 import pytest
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import How, SteerJob
+from abbe.service.channel.messages import Steering, SteerJob
 from abbe.service.compensation import push_approved
 from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.push_approved import Approved, PushOrder
@@ -109,7 +109,7 @@ class Bench:
     def jobs(self, state: str = "") -> list[JobState]:
         return [job for job in self.book.seen() if job.state.startswith(state)]
 
-    async def steer(self, how: How, who: str = "user:bob") -> tuple[str, str]:
+    async def steer(self, how: Steering, who: str = "user:bob") -> tuple[str, str]:
         running = self.book.running
         assert running is not None
         answer = await self.book.steer(SteerJob("steer", 1, running.id, how, who))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.errors import LinkDown
-from abbe.service.channel.messages import MOST_JOBS, Answer, How, StartJob, SteerJob
+from abbe.service.channel.messages import MOST_JOBS, Answer, StartJob, Steering, SteerJob
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, PushRecovery
 from abbe.service.core.rights import may_measure
@@ -67,7 +67,7 @@ class Bench:
         await settle()
         return answer
 
-    async def steer(self, job: str, how: How, who: str = "user:bob") -> str:
+    async def steer(self, job: str, how: Steering, who: str = "user:bob") -> str:
         answer = await self.book.steer(SteerJob("steer", 1, job, how, who))
         await settle()
         return answer.outcome

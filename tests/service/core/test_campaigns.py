@@ -17,7 +17,7 @@ import pytest
 
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import Answer, DoneByHand, How, StartJob, SteerJob
+from abbe.service.channel.messages import Answer, DoneByHand, StartJob, Steering, SteerJob
 from abbe.service.core.board import Board
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import CampaignOrder, OrderContext, full_campaigns
@@ -100,7 +100,7 @@ class Bench:
         await settle()
         return answer.outcome
 
-    async def steer(self, job: str, how: How) -> str:
+    async def steer(self, job: str, how: Steering) -> str:
         return (await self.book.steer(SteerJob("steer", 1, job, how, "token:bob/ci"))).outcome
 
     async def ended(self) -> JobState:
@@ -164,7 +164,7 @@ async def test_who_may_measure_but_not_propose_starts_checks_only_and_says_done(
 
 
 @pytest.mark.parametrize("how", ["stop", "abort"])
-async def test_who_ends_it_ends_the_wait(bench: Bench, how: How) -> None:
+async def test_who_ends_it_ends_the_wait(bench: Bench, how: Steering) -> None:
     bench.notes = ("abbe measure --resume goes on",)
     job = (await bench.start()).job
     assert await bench.steer(job, "pause") == "done"

@@ -249,7 +249,7 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
     clock = FakeClock(NOW)
     line = CoreLine(pair.web, clock)
     with pytest.raises(CoreSilent):
-        line.moment()
+        line.snapshot()
     listening = asyncio.create_task(line.listen())
     with line.listener() as snapshots:
         assert snapshots is not None
@@ -258,7 +258,7 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
         pair.core.send(m.Jobs("jobs", (JOB,)))
         pair.core.close()  # everything before the end is heard before the end
         await listening
-        assert (line.moment().changes, line.jobs()) == (3 * QUEUE - 1, (JOB,))
+        assert (line.snapshot().changes, line.jobs()) == (3 * QUEUE - 1, (JOB,))
         line.end()
         heard = [moment.changes async for moment in snapshots()]
         assert heard == list(range(2 * QUEUE + 1, 3 * QUEUE))  # the newest that fit, and the end
@@ -276,9 +276,9 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
 def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
     """In a fresh interpreter: everything that the process loads, and what it is refused afterwards."""
     program = (
-        "import sys\nimport abbe.service.web.process.__main__\nfrom abbe.service.web.process import import_guard\nimport_guard.build()\n"
+        "import sys\nimport abbe.service.web.process.__main__\nfrom abbe.service.web.process import import_guard\nimport_guard.install()\n"
         "import abbe.service.web.process.serving, abbe.service.logs\n"
-        "bad = [name for name in sys.modules if import_guard.behind(name)]\nassert not bad, bad\n"
+        "bad = [name for name in sys.modules if import_guard.is_forbidden(name)]\nassert not bad, bad\n"
         "for name in ('abbe.drivers.registry', 'pymodbus.client', 'serial', 'abbe.service.push.adapter', 'abbe.service.push.execute'):\n"
         "    try:\n        __import__(name)\n    except ImportError as error:\n        assert 'does not import' in str(error), error\n"
         "    else:\n        raise AssertionError(name)\nprint('shut')\n"
@@ -289,7 +289,7 @@ def test_the_web_process_loads_nothing_that_reaches_a_device() -> None:
 
 def test_the_wall_knows_parts_from_beginnings() -> None:
     assert [
-        import_guard.behind(name)
+        import_guard.is_forbidden(name)
         for name in ("abbe.drivers.registry", "abbe.drivers.api", "serial", "serialise", "abbe.service.web", "abbe.service.core.jobs")
     ] == [
         True,

@@ -20,7 +20,7 @@ from abbe.service.queries.reader import Reader, read_as
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
-from abbe.service.web import words
+from abbe.service.web import formatting
 from abbe.service.web.app import create_app
 from abbe.service.web.document import HEADERS
 from abbe.service.web.page import figure_verdict
@@ -225,10 +225,10 @@ def test_a_point_shows_the_verdict_of_its_figure(verdict: str, diagonal: float, 
 
 
 def test_words() -> None:
-    assert words.figure_name("body_diagonal_um") == ("Body diagonal", "µm")
-    assert words.figure_name("helix_rms_um") == ("Helix RMS", "µm")
-    assert words.figure_name("odd") == ("Odd", "")
-    assert [words.number(v) for v in (123.4, 11.84, 0.123, None)] == ["123", "11.8", "0.12", "–"]
+    assert formatting.figure_name("body_diagonal_um") == ("Body diagonal", "µm")
+    assert formatting.figure_name("helix_rms_um") == ("Helix RMS", "µm")
+    assert formatting.figure_name("odd") == ("Odd", "")
+    assert [formatting.number(v) for v in (123.4, 11.84, 0.123, None)] == ["123", "11.8", "0.12", "–"]
 
 
 async def test_a_skipped_slot_changes_the_revision(site: Site) -> None:

@@ -21,7 +21,7 @@ from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
 from abbe.service.web.document import HEADERS
 from abbe.service.web.listening import check_exposure
-from abbe.service.web.login.access import MUTATING, PUBLIC, Open, cells, needs
+from abbe.service.web.login.access import MUTATING, PUBLIC, Open, needs, route_permissions
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from tests.service.users.conftest import PHRASE, World
@@ -85,7 +85,7 @@ async def gate(world: World) -> AsyncIterator[Gate]:
         world.people.add(f"a-{role}", role, PHRASE)
     world.people.add("a-second-admin", "admin", PHRASE)
     auth = Authenticator(world.store, world.people, world.book, now_s=world.clock.monotonic_s, rate_hz=1e6, burst=1e6)
-    auth.noise._burst = 1e6
+    auth.recorded_refusals._burst = 1e6
     app = app_of(world, auth)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
         yield Gate(world, app, auth, client)
@@ -122,7 +122,7 @@ def everybody(gate: Gate) -> list[Somebody]:
 async def test_every_route_by_everybody(gate: Gate) -> None:
     with_one_route_for_each_right(gate.app)
     # An approval names its proposal; by whom it is accepted is asked in tests/service/web/pages.
-    table = [cell for cell in cells(gate.app.routes) if cell[1] not in {"/login", "/logout", "/static", "/proposal/approve"}]
+    table = [cell for cell in route_permissions(gate.app.routes) if cell[1] not in {"/login", "/logout", "/static", "/proposal/approve"}]
     asserted = 0
     for somebody in everybody(gate):
         for method, path, need in table:
@@ -143,12 +143,12 @@ async def test_logout_by_everybody(gate: Gate) -> None:
 
 
 async def test_every_route_says_what_it_needs(gate: Gate) -> None:
-    undeclared = [(method, path) for method, path, need in cells(gate.app.routes) if need is None]
+    undeclared = [(method, path) for method, path, need in route_permissions(gate.app.routes) if need is None]
     assert undeclared == []
-    public = {path for _, path, need in cells(gate.app.routes) if isinstance(need, Open)}
+    public = {path for _, path, need in route_permissions(gate.app.routes) if isinstance(need, Open)}
     assert public == {"/icon.svg", "/healthz", "/readyz", "/static", "/login"}
     without = app_of(gate.world, None)
-    assert all(need is not None for _, _, need in cells(without.routes))
+    assert all(need is not None for _, _, need in route_permissions(without.routes))
 
 
 async def test_a_route_without_a_declaration_is_shut_and_found(gate: Gate) -> None:
@@ -156,7 +156,7 @@ async def test_a_route_without_a_declaration_is_shut_and_found(gate: Gate) -> No
     async def new() -> str:
         return "open"
 
-    assert [(method, path) for method, path, need in cells(gate.app.routes) if need is None] == [("GET", "/api/v1/new")]
+    assert [(method, path) for method, path, need in route_permissions(gate.app.routes) if need is None] == [("GET", "/api/v1/new")]
     for headers in (gate.session("a-admin"), gate.token("a-admin", "t", ["users"]), {}):
         assert (await gate.ask("GET", "/api/v1/new", headers=headers)).status_code == 403
 
@@ -168,7 +168,7 @@ async def test_every_changing_route_refuses_foreign_pages(gate: Gate) -> None:
     foreign = ("http://evil.example", "null", "http://127.0.0.1:8081", "http://127.0.0.1:8080.evil.example", "http://[", "file://", "")
     for role in Role:
         good = gate.session(f"a-{role}")
-        for method, path, need in cells(gate.app.routes):
+        for method, path, need in route_permissions(gate.app.routes):
             if method not in MUTATING or (need is not PUBLIC and need not in ALLOWED[role]):
                 continue
             bad = [{**good, "Origin": origin} for origin in foreign]
@@ -187,7 +187,7 @@ async def test_every_changing_route_refuses_foreign_pages(gate: Gate) -> None:
 async def test_every_changing_route_leaves_one_record(gate: Gate) -> None:
     with_one_route_for_each_right(gate.app)
     for headers in (gate.session("a-admin"), gate.token("a-viewer", "t", ["read"]), OWN):
-        for method, path, _ in sorted(cells(gate.app.routes), key=lambda cell: cell[1] == "/logout"):
+        for method, path, _ in sorted(route_permissions(gate.app.routes), key=lambda cell: cell[1] == "/logout"):
             before = len(gate.world.store.audit.events())
             status = (await gate.ask(method, path, headers=headers)).status_code
             new = gate.world.store.audit.events()[before:]
@@ -297,7 +297,7 @@ async def test_without_users_everybody_may_look_and_nobody_may_change(world: Wor
     app = app_of(world, auth)
     with_one_route_for_each_right(app)
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE) as client:
-        for method, path, need in cells(app.routes):
+        for method, path, need in route_permissions(app.routes):
             if path in {"/static", "/login"}:
                 continue
             status = (await client.request(method, path, headers=OWN)).status_code

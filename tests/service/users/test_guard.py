@@ -18,15 +18,15 @@ from abbe.service.users.roles import Permission
 from abbe.service.web.app import as_in_host_header, create_app
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.login.authentication import Authenticator, Front
+from abbe.service.web.login.authentication import Authenticator, Endpoint
 from tests.service.users.conftest import PHRASE, World
 from tests.service.users.test_access import BASE, OWN, Gate, app_of, gate, log_in
 
 __all__ = ["gate"]  # the fixture
 
 
-def behind(world: World, front: Front) -> tuple[FastAPI, Authenticator]:
-    auth = Authenticator(world.store, world.people, world.book, front, now_s=world.clock.monotonic_s)
+def behind(world: World, endpoint: Endpoint) -> tuple[FastAPI, Authenticator]:
+    auth = Authenticator(world.store, world.people, world.book, endpoint, now_s=world.clock.monotonic_s)
     return app_of(world, auth), auth
 
 
@@ -82,7 +82,7 @@ async def test_a_change_whose_answer_breaks_off_is_recorded_as_that(gate: Gate) 
 
 async def test_defects_are_recorded_however_many(gate: Gate) -> None:
     """Refusals of one address are thinned out; what may have changed something is not."""
-    gate.auth.noise._burst = 1.0
+    gate.auth.recorded_refusals._burst = 1.0
 
     @gate.app.post("/api/v1/bad")
     @needs(Permission.USERS)
@@ -188,10 +188,10 @@ async def test_nothing_about_a_machine_is_kept_by_a_browser(gate: Gate) -> None:
         assert "strict-transport-security" not in answer.headers
 
 
-@pytest.mark.parametrize("front", [Front(), Front(8080, behind_tls=True)])
-async def test_tls_is_said_to_be_here_to_stay(world: World, front: Front) -> None:
-    app, _ = behind(world, front)
-    async with client_of(app, "http://127.0.0.1" if front.behind_tls else "https://127.0.0.1") as client:
+@pytest.mark.parametrize("endpoint", [Endpoint(), Endpoint(8080, behind_tls=True)])
+async def test_tls_is_said_to_be_here_to_stay(world: World, endpoint: Endpoint) -> None:
+    app, _ = behind(world, endpoint)
+    async with client_of(app, "http://127.0.0.1" if endpoint.behind_tls else "https://127.0.0.1") as client:
         for path in ("/healthz", "/nothing", "/static/page.css"):
             assert (await client.get(path)).headers["strict-transport-security"] == "max-age=31536000", path
 
@@ -199,7 +199,7 @@ async def test_tls_is_said_to_be_here_to_stay(world: World, front: Front) -> Non
 async def test_two_services_on_one_host_do_not_log_each_other_out(world: World) -> None:
     """Browsers send a cookie to every port of a host: here one jar for both, as a browser has it."""
     world.people.add("ana", "admin", PHRASE)
-    (first, _), (second, auth) = behind(world, Front(8080)), behind(world, Front(8081))
+    (first, _), (second, auth) = behind(world, Endpoint(8080)), behind(world, Endpoint(8081))
     jar: dict[str, str] = {}
 
     async def ask(app: FastAPI, port: int, method: str, path: str, **more: Any) -> httpx.Response:
@@ -223,7 +223,7 @@ async def test_two_services_on_one_host_do_not_log_each_other_out(world: World) 
 
 async def test_behind_a_proxy_with_tls_cookies_are_secure_and_origins_https(world: World) -> None:
     world.people.add("ana", "admin", PHRASE)
-    app, _ = behind(world, Front(8080, behind_tls=True))
+    app, _ = behind(world, Endpoint(8080, behind_tls=True))
     form = {"name": "ana", "password": PHRASE}
     async with client_of(app, "http://localhost") as client:
         for origin, status in (("http://localhost", 403), ("https://evil.example", 403), ("https://localhost", 303)):
@@ -236,8 +236,12 @@ async def test_behind_a_proxy_with_tls_cookies_are_secure_and_origins_https(worl
 
 async def test_behind_a_proxy_the_visitor_is_who_the_proxy_says_last(world: World) -> None:
     seen = []
-    for front, came_from in ((Front(1, behind_tls=True), "127.0.0.1"), (Front(1), "127.0.0.1"), (Front(1, behind_tls=True), "192.0.2.7")):
-        app, _ = behind(world, front)
+    for endpoint, came_from in (
+        (Endpoint(1, behind_tls=True), "127.0.0.1"),
+        (Endpoint(1), "127.0.0.1"),
+        (Endpoint(1, behind_tls=True), "192.0.2.7"),
+    ):
+        app, _ = behind(world, endpoint)
 
         @app.get("/api/v1/whence")
         @needs(Permission.READ)
@@ -275,13 +279,13 @@ async def test_guesses_from_ever_new_addresses_do_not_keep_a_user_out(world: Wor
     """He gets in by a browser he has used before, also from a new address after a restart, and at the computer itself."""
     world.people.add("ana", "operator", PHRASE)
     form = {"name": "ana", "password": PHRASE}
-    app, _ = behind(world, Front())
+    app, _ = behind(world, Endpoint())
     async with client_of(app, client=("192.0.2.1", 1)) as client:
         first = await client.post("/login", data=form, headers=OWN)
         assert first.status_code == 303
     device = first.cookies["abbe-device"]
     assert device not in str(world.store.audit.events())
-    app, _ = behind(world, Front())  # started again: nothing is remembered
+    app, _ = behind(world, Endpoint())  # started again: nothing is remembered
     begin = world.people.passwords.hashes
     for n in range(300):
         async with client_of(app, client=(f"10.1.{n // 200}.{n % 200}", 1)) as client:

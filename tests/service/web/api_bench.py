@@ -198,7 +198,7 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
         people.add(f"a-{role}", role, PHRASE)
     book = AuditBook(store, url)
     auth = Authenticator(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
-    auth.noise._burst = 1e9
+    auth.recorded_refusals._burst = 1e9
     app = app_of(store, clock, auth)
     return Plant(store, url, clock, people, book, app, auth, approvable), stack
 

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from abbe.service.users.roles import ALLOWED, Role
-from abbe.service.web.login.access import MUTATING, PUBLIC, cells
+from abbe.service.web.login.access import MUTATING, PUBLIC, route_permissions
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.service.web.api_bench import Plant, app_of, served
 
@@ -36,7 +36,7 @@ def filled(path: str, number: str = "1") -> str:
 
 async def test_every_route_by_every_role(plant: Plant) -> None:
     """Whoever may is not kept out at the auth; whoever may not gets no further, whatever there is behind."""
-    table = [cell for cell in cells(plant.app.routes) if cell[1] not in {"/login", "/logout", "/static"}]
+    table = [cell for cell in route_permissions(plant.app.routes) if cell[1] not in {"/login", "/logout", "/static"}]
     asserted = 0
     async with httpx.AsyncClient(transport=httpx.ASGITransport(plant.app, False), base_url=BASE) as client:
         everybody = {"anonymous": ({"Origin": BASE}, frozenset()), "foreign token": ({"Authorization": "Bearer abbe_0_0"}, frozenset())}
@@ -56,7 +56,7 @@ async def test_every_route_by_every_role(plant: Plant) -> None:
 
 async def test_the_document_declares_every_route_and_every_status(plant: Plant) -> None:
     document = plant.app.openapi()
-    routes = {(method, path): need for method, path, need in cells(plant.app.routes)}
+    routes = {(method, path): need for method, path, need in route_permissions(plant.app.routes)}
     api = {cell for cell in routes if cell[1].startswith("/api/v1") and cell[1] != "/api/v1/openapi.json"}
     declared = {(method.upper(), path) for path, methods in document["paths"].items() for method in methods}
     assert declared == api | {("GET", "/healthz"), ("GET", "/readyz")}

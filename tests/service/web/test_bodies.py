@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from abbe.service.web.bodies import LONGEST_B
-from abbe.service.web.login.access import MUTATING, cells
+from abbe.service.web.login.access import MUTATING, route_permissions
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.service.web.api_bench import Plant
 from tests.service.web.test_table_orders import BODY, PATH, Desk, desk
@@ -26,7 +26,7 @@ async def pieces(size_b: int, each_b: int = 1000) -> AsyncIterator[bytes]:
 
 
 def changing(desk: Desk) -> list[tuple[str, str]]:
-    return [(method, path) for method, path, _ in cells(desk.app.routes) if method in MUTATING]
+    return [(method, path) for method, path, _ in route_permissions(desk.app.routes) if method in MUTATING]
 
 
 async def test_every_route_that_changes_something_has_a_limit(desk: Desk, plant: Plant) -> None:

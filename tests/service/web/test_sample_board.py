@@ -42,21 +42,21 @@ def read(data: bytes) -> list[tuple[int, int, list[float]]]:
 
 async def test_who_comes_late_gets_what_there_is_and_then_everything() -> None:
     board = SampleBoard()
-    board.hear_path(PATH)
-    board.hear_samples(told(0, 1.0, 2.0))
-    board.hear_samples(told(2, -0.5))
+    board.set_path(PATH)
+    board.add_samples(told(0, 1.0, 2.0))
+    board.add_samples(told(2, -0.5))
     with board.listener() as parts:
         assert parts is not None
-        board.hear_samples(told(3, 4.0))
-        board.hear_path(RecordedPath())
+        board.add_samples(told(3, 4.0))
+        board.set_path(RecordedPath())
         board.end()
         got = [part async for part in parts()]
     assert [json.loads(part)["number"] for part in got if isinstance(part, str)] == [3, 0]
     assert [read(part) for part in got if isinstance(part, bytes)] == [[(3, 0, [1.0, 2.0]), (3, 2, [-0.5])], [(3, 3, [4.0])]]
     with board.listener() as parts:
         assert parts is not None
-        board.hear_path(PATH)
-        board.hear_samples(told(0, 1.5))
+        board.set_path(PATH)
+        board.add_samples(told(0, 1.5))
         board.end()
         got = [part async for part in parts()]
     assert [json.loads(part)["number"] for part in got if isinstance(part, str)] == [0, 3]
@@ -67,9 +67,9 @@ async def test_a_slow_browser_misses_the_oldest_and_hears_of_every_path() -> Non
     board = SampleBoard()
     with board.listener() as parts:
         assert parts is not None
-        board.hear_path(PATH)
+        board.set_path(PATH)
         for k in range(3 * QUEUE):
-            board.hear_samples(told(k, float(k)))
+            board.add_samples(told(k, float(k)))
         got = parts()
         assert [json.loads(await anext(got))["number"] for _ in range(2)] == [0, 3]  # what was so, and what is
         frames = [await anext(got) for _ in range(QUEUE)]
@@ -79,9 +79,9 @@ async def test_a_slow_browser_misses_the_oldest_and_hears_of_every_path() -> Non
 
 async def test_it_is_bounded() -> None:
     board = SampleBoard()
-    board.hear_path(PATH)
+    board.set_path(PATH)
     for k in range(KEPT_FRAMES + 5):
-        board.hear_samples(told(k, 0.0))
+        board.add_samples(told(k, 0.0))
     assert len(board._frames) == KEPT_FRAMES
     open_ones = [board.listener(f"user:{k // MOST_EACH}") for k in range(MOST_LISTENERS + 1)]
     assert [one.__enter__() is None for one in open_ones] == [False] * MOST_LISTENERS + [True]
@@ -98,4 +98,4 @@ async def test_it_is_bounded() -> None:
 @pytest.mark.parametrize("values", ["not base64!", "AAA=", "AACAPwA="])
 def test_what_are_no_samples_breaks_the_channel(values: str) -> None:
     with pytest.raises(ChannelBroken):
-        SampleBoard().hear_samples(LiveSamples("samples", 1, 0, 0.0, values))
+        SampleBoard().add_samples(LiveSamples("samples", 1, 0, 0.0, values))

@@ -25,7 +25,7 @@ from abbe.service.web.api.once import REPLAYED
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
-from abbe.service.web.login.access import cells
+from abbe.service.web.login.access import route_permissions
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.service.core.test_channel import MOMENT
 from tests.service.web.api_bench import NAME, Plant
@@ -89,7 +89,7 @@ async def desk(plant: Plant) -> AsyncIterator[Desk]:
 
 
 async def test_only_who_approves_gets_to_the_core(desk: Desk, plant: Plant) -> None:
-    assert [need for method, path, need in cells(desk.app.routes) if path == PATH] == [Permission.APPROVE]
+    assert [need for method, path, need in route_permissions(desk.app.routes) if path == PATH] == [Permission.APPROVE]
     assert (await desk.client.post(PATH, json=BODY, headers={"Origin": BASE})).status_code == 401
     for role in Role:
         may = Permission.APPROVE in ALLOWED[role]

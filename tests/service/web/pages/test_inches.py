@@ -26,7 +26,7 @@ from abbe.service.web import frame, language
 from abbe.service.web.frame import Frame
 from abbe.service.web.page import environment
 from abbe.service.web.pages.compare import pictures
-from abbe.service.web.pages.live import script_words
+from abbe.service.web.pages.live import script_texts
 from abbe.service.web.pages.rehearsal import CAMPAIGN
 from abbe.service.web.pages.runs import run_document
 from abbe.service.web.pages.whatif import forecast
@@ -179,7 +179,7 @@ def test_compared_runs(running: Served) -> None:
 def test_compared_lines() -> None:
     x, y, u = np.array([0.0, 254.0, 508.0]), np.array([0.0, 2.54, -5.08]), np.full(3, 0.254)
     lines = [ComparedCurve(False, x, k * y, u, x[:, None]) for k in (1.0, 2.0)]
-    shown = pictures(lines, RunDifference(x, y, u), lambda key, **values: language.say("en", key, **values))
+    shown = pictures(lines, RunDifference(x, y, u), lambda key, **values: language.translate("en", key, **values))
     both, apart = (str(svg) for svg, _ in shown)
     assert "A: −200 … 100 µin; B: −400 … 200 µin" in both
     assert ": 200 µin." in apart
@@ -232,7 +232,7 @@ def test_a_live_run_gives_its_script_the_unit() -> None:
     now = datetime(2026, 11, 22, 6, tzinfo=UTC)
     job = RunningCheck(id="0123456789ab", schedule="", recipe="quick-check", since_utc=now)
     moment = SimpleNamespace(job=job, next_due=[], now_utc=now)
-    words = script_words("en")
+    words = script_texts("en")
     screen = environment().get_template("live.html")
     page = html.unescape(screen.render(machine="m", zone="UTC", moment=moment, may_measure=True, words=words))
     assert f'data-unit="µin" data-size="{UIN}"' in page

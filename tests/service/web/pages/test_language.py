@@ -69,7 +69,7 @@ def test_no_words_stand_in_a_template_itself() -> None:
     ],
 )
 def test_the_browser_s_wish_is_heard(header: str, expected: str) -> None:
-    assert language.wanted(header) == expected
+    assert language.preferred(header) == expected
 
 
 def test_figures_and_spans_have_names_in_every_language() -> None:

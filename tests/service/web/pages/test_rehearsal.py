@@ -17,7 +17,7 @@ from abbe.service.site import machine_from_doc
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.page import HERE, environment
-from abbe.service.web.pages.new import expired
+from abbe.service.web.pages.new import expired_certificates
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 from abbe.service.web.schemas import LONGEST_RECIPE
 from tests.service.core.fakes import utc
@@ -107,8 +107,8 @@ async def test_a_name_that_its_rate_makes_too_long_is_refused() -> None:
 def test_certificates_that_are_over_are_told() -> None:
     today = utc(2026, 11, 22, 6).date()
     rules = RulesSummary({}, {"ballbar": today.replace(year=2025), "laser": today}, None)
-    assert expired(rules, today) == [("ballbar", today.replace(year=2025))]
-    assert expired(None, today) == []
+    assert expired_certificates(rules, today) == [("ballbar", today.replace(year=2025))]
+    assert expired_certificates(None, today) == []
 
 
 def _fields() -> dict[str, object]:

@@ -12,7 +12,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
-from abbe.service.web.login.access import cells
+from abbe.service.web.login.access import route_permissions
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.page import HERE
 from tests.pages_world import PROPOSER, USERS, Filled, Served, as_user, screens
@@ -196,7 +196,7 @@ def test_a_language_is_kept_by_a_cookie(running: Served) -> None:
 def test_every_address_says_what_it_needs(running: Served) -> None:
     view = StatusReader(Reader(running.store, "m", SystemClock()), "0", running.board, list, "")
     app = create_app(view, version="0", auth=running.auth)
-    own = {path: need for _, path, need in cells(app.routes)}
+    own = {path: need for _, path, need in route_permissions(app.routes)}
     assert all(need is not None for need in own.values())
     assert own["/run"] is Permission.READ
     assert own["/audit"] is Permission.AUDIT

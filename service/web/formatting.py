@@ -1,4 +1,4 @@
-"""Times and figures in words, for the page."""
+"""Times, names of figures and numbers as text for the screens."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from datetime import UTC, datetime, tzinfo
 _UNITS = {"um": "µm", "urad": "µrad", "mm": "mm", "ppm": "ppm", "s": "s", "c": "°C", "percent": "%"}
 
 
-def stamp(moment: datetime, zone: tzinfo = UTC) -> str:
-    """Return a moment as people of the zone write it down: ``2026-11-23 06:00:12``."""
-    return f"{moment.astimezone(zone):%Y-%m-%d %H:%M:%S}"
+def stamp(time: datetime, zone: tzinfo = UTC) -> str:
+    """A time in a time zone: ``2026-11-23 06:00:12``."""
+    return f"{time.astimezone(zone):%Y-%m-%d %H:%M:%S}"
 
 
 def figure_name(key: str) -> tuple[str, str]:
-    """Return name and unit of a figure: ``body_diagonal_um`` is ("Body diagonal", "µm")."""
+    """Name and unit of a figure: ``body_diagonal_um`` is ("Body diagonal", "µm")."""
     stem, _, unit = key.rpartition("_")
     if not stem or unit not in _UNITS:
         stem, unit = key, ""
@@ -22,7 +22,7 @@ def figure_name(key: str) -> tuple[str, str]:
 
 
 def number(value: float | None) -> str:
-    """Return a figure with as many digits as its size deserves, and a dash for one that is missing."""
+    """A value with zero to two decimals by its size; a dash for None."""
     if value is None:
         return "–"
     size = abs(value)
