@@ -1,7 +1,7 @@
 """All messages between core and web process: frozen, validated at both ends, bounded in length.
 
 The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`); the web process forwards what a person
-requests (`StartJob`, `SteerJob`, `DoneByHand`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
+requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
 table: a request names the table in force by its push and CRC, and the push journal determines which table replaces it.
 """
 
@@ -147,7 +147,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Up:
+class Serving:
     """The web process accepts connections."""
 
     __pydantic_config__ = _STRICT
@@ -156,7 +156,7 @@ class Up:
 
 
 @dataclass(frozen=True, slots=True)
-class Alive:
+class Heartbeat:
     """Heartbeat: the event loop of the web process runs."""
 
     __pydantic_config__ = _STRICT
@@ -188,7 +188,7 @@ class SteerJob:
 
 
 @dataclass(frozen=True, slots=True)
-class DoneByHand:
+class ConfirmPrompt:
     """Confirm that prompt number ``prompt`` of a job, and no other prompt, is done."""
 
     __pydantic_config__ = _STRICT
@@ -228,9 +228,9 @@ class PushNow:
     who: Word
 
 
-CoreRequest = StartJob | SteerJob | DoneByHand | RollBack | PushNow
+CoreRequest = StartJob | SteerJob | ConfirmPrompt | RollBack | PushNow
 """Requests that the core answers with an `Answer`."""
-FromWeb = Up | Alive | CoreRequest
+FromWeb = Serving | Heartbeat | CoreRequest
 
 FROM_CORE: TypeAdapter[FromCore] = TypeAdapter(Annotated[FromCore, Field(discriminator="kind")])
 FROM_WEB: TypeAdapter[FromWeb] = TypeAdapter(Annotated[FromWeb, Field(discriminator="kind")])

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import structlog
 
 from abbe.service.campaigns.builtin_recipes import split_recipe_name
-from abbe.service.channel.messages import MOST_JOBS, Answer, DoneByHand, Outcome, StartJob, SteerJob
+from abbe.service.channel.messages import MOST_JOBS, Answer, ConfirmPrompt, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
 from abbe.service.domain.bounds import TEXT, WORD
 from abbe.service.domain.job_state import JobState
@@ -282,7 +282,7 @@ class JobRegistry:
         self._changed()
         return _answer(asked.request, "done", "", asked.job)
 
-    async def done_by_hand(self, asked: DoneByHand) -> Answer:
+    async def done_by_hand(self, asked: ConfirmPrompt) -> Answer:
         """Confirm that what a job asks for is done; only for the prompt that is open."""
         entry = await self._asked_of(asked)
         if isinstance(entry, Answer):
@@ -293,7 +293,7 @@ class JobRegistry:
         self._changed()
         return _answer(asked.request, "done", "", asked.job)
 
-    async def _asked_of(self, asked: SteerJob | DoneByHand) -> _Entry | Answer:
+    async def _asked_of(self, asked: SteerJob | ConfirmPrompt) -> _Entry | Answer:
         """The running job that a user may steer, or the answer why not."""
         refused = await self._refused(asked.who)
         if refused:

@@ -19,20 +19,20 @@ import structlog
 from abbe.service.capture.live import LiveFeed, Stretch
 from abbe.service.channel.messages import (
     PROTOCOL,
-    Alive,
     Answer,
     Begin,
+    ConfirmPrompt,
     CoreRequest,
-    DoneByHand,
+    Heartbeat,
     Jobs,
     LivePath,
     LiveSamples,
     PushNow,
     RollBack,
+    Serving,
     Snapshot,
     StartJob,
     SteerJob,
-    Up,
     from_web,
 )
 from abbe.service.channel.wire import Wire
@@ -272,16 +272,16 @@ class WebProcess:
             message = from_web(body)
             self._heard_s = self._clock.monotonic_s()
             match message:
-                case Up(protocol=protocol):
+                case Serving(protocol=protocol):
                     if protocol != PROTOCOL:
                         raise ChannelBroken(f"the web process speaks version {protocol} of the channel, the core {PROTOCOL}")
                     self._up = True
                     log.info("page up", restarts=self.restarts)
-                case StartJob() | SteerJob() | DoneByHand() | RollBack() | PushNow():
+                case StartJob() | SteerJob() | ConfirmPrompt() | RollBack() | PushNow():
                     answer = await self._answered(message)
                     wire.send(Jobs("jobs", self._book.seen()))  # first: who gets the number of a job can ask for it
                     wire.send(answer)
-                case Alive():
+                case Heartbeat():
                     pass
 
     async def _answered(self, message: CoreRequest) -> Answer:
@@ -291,7 +291,7 @@ class WebProcess:
                     return await self._book.start(message)
                 case SteerJob():
                     return await self._book.steer(message)
-                case DoneByHand():
+                case ConfirmPrompt():
                     return await self._book.done_by_hand(message)
             if self._orders is None:
                 return Answer("answer", message.request, "conflict", "this service takes no orders of tables", "")

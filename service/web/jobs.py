@@ -79,7 +79,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
         """Confirm that a prompt of the job is done; then the machine moves. Refused (409) if another prompt is open."""
         visit: Visit = request.state.visit
         visit.target = f"job {job}, prompt {prompt}"
-        return answered(core, await core.done_by_hand(job, prompt, visit.principal.name))
+        return answered(core, await core.confirm_prompt(job, prompt, visit.principal.name))
 
     def add_steering(how: Steering, summary: str) -> None:
         @app.post(

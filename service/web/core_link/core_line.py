@@ -10,8 +10,8 @@ from itertools import count
 
 from abbe.service.channel.messages import (
     Answer,
+    ConfirmPrompt,
     CoreRequest,
-    DoneByHand,
     Jobs,
     LivePath,
     LiveSamples,
@@ -162,9 +162,9 @@ class CoreLine:
         number = next(self._numbers)
         return await self._ask(SteerJob("steer", number, job, how, who))
 
-    async def done_by_hand(self, job: str, prompt: int, who: str) -> Answer:
+    async def confirm_prompt(self, job: str, prompt: int, who: str) -> Answer:
         """Confirm that one prompt of a job is done. Raises CoreSilent without an answer."""
-        return await self._ask(DoneByHand("hand", next(self._numbers), job, prompt, who))
+        return await self._ask(ConfirmPrompt("hand", next(self._numbers), job, prompt, who))
 
     async def roll_back(self, push: int, crc: int, reason: str, key: str, who: str) -> Answer:
         """Replace the table in force, given by push and CRC, by the one before it. Raises CoreSilent as `start` does."""

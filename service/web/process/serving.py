@@ -13,7 +13,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import PROTOCOL, Alive, Begin, Up, from_core
+from abbe.service.channel.messages import PROTOCOL, Begin, Heartbeat, Serving, from_core
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, ChannelBroken
@@ -156,7 +156,7 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
     app.state.end = lambda: setattr(server, "should_exit", True)
     listening_to_core = asyncio.create_task(core.listen(), name="core")
     serving = asyncio.create_task(server.serve(sockets=[listening]), name="server")
-    alive = asyncio.create_task(_alive(wire, server), name="alive")
+    alive = asyncio.create_task(_send_heartbeats(wire, server), name="alive")
     await asyncio.wait({listening_to_core, serving, alive}, return_when=asyncio.FIRST_COMPLETED)
     server.should_exit = True
     core.end()
@@ -170,9 +170,9 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
     return 0
 
 
-async def _alive(wire: Wire, server: Server) -> None:
+async def _send_heartbeats(wire: Wire, server: Server) -> None:
     await server.answers.wait()
-    wire.send(Up("up", PROTOCOL))
+    wire.send(Serving("up", PROTOCOL))
     while True:
         await asyncio.sleep(ALIVE_S)
-        wire.send(Alive("alive"))
+        wire.send(Heartbeat("alive"))

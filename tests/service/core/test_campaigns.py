@@ -17,7 +17,7 @@ import pytest
 
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import Answer, DoneByHand, StartJob, Steering, SteerJob
+from abbe.service.channel.messages import Answer, ConfirmPrompt, StartJob, Steering, SteerJob
 from abbe.service.core.board import Board
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import CampaignOrder, OrderContext, full_campaigns
@@ -96,7 +96,7 @@ class Bench:
                 await settle()
 
     async def done(self, job: str, prompt: int, who: str = "token:bob/ci") -> str:
-        answer = await self.book.done_by_hand(DoneByHand("hand", 1, job, prompt, who))
+        answer = await self.book.done_by_hand(ConfirmPrompt("hand", 1, job, prompt, who))
         await settle()
         return answer.outcome
 

@@ -104,11 +104,11 @@ CORE = [
     m.Answer("answer", 1, "busy", "the machine measures", ""),
 ]
 WEB = [
-    m.Up("up", 1),
-    m.Alive("alive"),
+    m.Serving("up", 1),
+    m.Heartbeat("alive"),
     m.StartJob("start", 1, "quick-check", "k", "user:bob"),
     m.SteerJob("steer", 2, "0" * 12, "pause", "x"),
-    m.DoneByHand("hand", 3, "0" * 12, 2, "user:bob"),
+    m.ConfirmPrompt("hand", 3, "0" * 12, 2, "user:bob"),
     m.RollBack("rollback", 3, 7, 0xFFFFFFFF, "worse since then", "k", "user:ann"),
     m.PushNow("push", 4, 3, "k", "user:ann"),
 ]

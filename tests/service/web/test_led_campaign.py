@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from abbe.service.channel.messages import Answer, DoneByHand, Jobs, Outcome, Snapshot, StartJob, from_web
+from abbe.service.channel.messages import Answer, ConfirmPrompt, Jobs, Outcome, Snapshot, StartJob, from_web
 from abbe.service.channel.wire import Wire
 from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobState
@@ -102,7 +102,7 @@ async def test_only_who_measures_says_that_it_is_done(desk: Desk, plant: Plant) 
             answer = await desk.client.post(DONE, headers=who)
             assert (answer.status_code, len(desk.asked) - before) == ((202, 1) if may else (403, 0)), role
     last = desk.asked[-1]
-    assert isinstance(last, DoneByHand)
+    assert isinstance(last, ConfirmPrompt)
     assert (last.job, last.prompt, last.who.split("/")[0]) == (NUMBER, 3, "token:a-metrologist")
     assert (await desk.client.post(DONE, headers=plant.session("operator") | {"X-CSRF-Token": "x"})).status_code == 403
 
