@@ -39,7 +39,7 @@ class VolumeQuery:
 
 @dataclass(frozen=True, slots=True)
 class NodeLine:
-    """A node in the reader's units: position; dX, dY, dZ and length with U (k = 2); ``significant``: the deviation exceeds its U."""
+    """A node in the reader's units: position; dX, dY, dZ and length with U (k = 2); ``significant``: its 95 % ellipsoid excludes 0."""
 
     place: tuple[str, str, str]
     parts: tuple[tuple[str, str], ...]
