@@ -263,7 +263,7 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
         heard = [moment.changes async for moment in snapshots()]
         assert heard == list(range(2 * QUEUE + 1, 3 * QUEUE))  # the newest that fit, and the end
     clock.now_s += SILENT_S + 0.1
-    for look in (line.moment, line.jobs, line.next_due, lambda: line.job, lambda: line.devices):
+    for look in (line.snapshot, line.jobs, line.next_due, lambda: line.job, lambda: line.devices):
         with pytest.raises(CoreSilent):
             look()
     with pytest.raises(CoreSilent):

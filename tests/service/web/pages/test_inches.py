@@ -196,8 +196,8 @@ def test_a_dry_run() -> None:
     assert dry is not None
     told = SimpleNamespace(job=None, next_due=[])
     known = {"choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100, "usual_hz": 100}
-    known |= {"max_feed": TOLD.max_feed_mm_min, "may_measure": True, "led": False, "key": "k", "past_due": [], "temperature_c": None}
-    page = html.unescape(environment().get_template("new.html").render(machine="m", zone="UTC", moment=told, dry=dry, **known))
+    known |= {"max_feed": TOLD.max_feed_mm_min, "may_measure": True, "guided": False, "key": "k", "expired": [], "temperature_c": None}
+    page = html.unescape(environment().get_template("new.html").render(machine="m", zone="UTC", status=told, dry=dry, **known))
     assert f"{dry.fastest_mm_min / IN:.2f} in/min (Limit {6000 / IN:.2f})" in page
     for _, low, high, least, most in dry.used:
         assert f"{low / IN:.2f} … {high / IN:.2f} in (Limit {least / IN:.2f} … {most / IN:.2f})" in page
@@ -211,9 +211,9 @@ def test_a_dry_run() -> None:
     # What the full campaign has mounted is told, not ticked off.
     full = PLANS.run(CAMPAIGN, 100, Unit("in", IN))
     assert full is not None
-    known |= {"chosen": CAMPAIGN, "led": True, "may_propose": True}
+    known |= {"chosen": CAMPAIGN, "guided": True, "may_propose": True}
     led = html.unescape(
-        environment().get_template("new.html").render(machine="m", zone="UTC", moment=told, dry=replace(full, startable=True), **known)
+        environment().get_template("new.html").render(machine="m", zone="UTC", status=told, dry=replace(full, startable=True), **known)
     )
     mounts = re.findall(r"<li>((?:Bar|Laser).*)</li>", led)
     for one, line in zip(full.set_ups, mounts, strict=True):
@@ -234,7 +234,7 @@ def test_a_live_run_gives_its_script_the_unit() -> None:
     moment = SimpleNamespace(job=job, next_due=[], now_utc=now)
     words = script_texts("en")
     screen = environment().get_template("live.html")
-    page = html.unescape(screen.render(machine="m", zone="UTC", moment=moment, may_measure=True, words=words))
+    page = html.unescape(screen.render(machine="m", zone="UTC", status=moment, may_measure=True, texts=words))
     assert f'data-unit="µin" data-size="{UIN}"' in page
     assert re.findall(r"</span> (µ\w+)", page) == ["µin", "µin"]
     assert "µm" not in page
