@@ -174,6 +174,6 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
 
 
 def standing(q_mm: F1, t_s: float, temp_c: Mapping[str, F1]) -> Places:
-    """One moment at which the machine stands and nobody knows from where it came."""
+    """One instant at which the machine stands, with an unknown approach."""
     rest = np.zeros((1, 3))
     return Places(q_mm[None], rest, np.full((1, 3), FAR_MM), rest, rest, np.array([t_s]), temp_c)

@@ -194,7 +194,7 @@ class ErrorMotions:
     squareness_rad: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the names once; nobody can change them later."""
+        """Check the names once; they cannot change later."""
         for key in self.functions:
             if key.removesuffix(REVERSE) not in PLACES:
                 raise ValueError(f"error motion {key!r}: expected one of {', '.join(PLACES)}, or such a name with {REVERSE}")

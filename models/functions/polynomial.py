@@ -17,7 +17,7 @@ from abbe.models.functions.axis_function import frozen_vector, positions, same_s
 class Polynomial:
     """value(x) = sum of c_k (x - origin)^k.
 
-    It has no end: outside any stroke it goes on, and grows. Whoever must not extrapolate has to ask where the data ended.
+    It is unbounded: outside any stroke it continues and grows. Callers that must not extrapolate have to check the range of the data.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def bar_length_sd(u_length_mm: float | None, calibrated: bool | None, priors: Pr
     """Prior standard deviation of a bar's length, mm, from what its run states (run-format.md 3).
 
     The stated ``u_length_mm`` counts, unless the length is said to be uncalibrated or nothing is said at all: then a ball-bar must not
-    lend the machine a scale that nobody measured.
+    lend the machine an unmeasured scale.
     """
     if calibrated is False or (calibrated is None and u_length_mm is None):
         return max(priors.bar_unknown_mm, u_length_mm or 0.0)

@@ -146,7 +146,7 @@ def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) ->
     ------
     SurfaceNotDetermined
         The points do not determine the terms, or a combination a thousand times worse than the best (RANK_TOLERANCE), with what cannot be
-        told apart; or they are not more than the terms.
+        separated; or they are not more than the terms.
     ValueError
         Shapes differ or a value is not finite.
     """
