@@ -97,7 +97,7 @@ def _proportion(terms: tuple[Term, ...], family: Family) -> str:
 
 
 def _unit(term: Term) -> tuple[float, str, str]:
-    """How a coefficient is shown to people: factor, unit, and over which travel; order 1 of a Legendre series as its change over the stroke."""
+    """A coefficient as people read it: factor, unit, and over which way; order 1 of a Legendre series as its change over the stroke."""
     size, unit = (1e3, "µm") if term.order > 0 and term.component < 3 else (1e6, "µrad")
     return (2.0 * size, unit, " over the stroke") if term.order else (size, unit, "")
 

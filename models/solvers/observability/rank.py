@@ -36,7 +36,7 @@ def as_meant(run: RunData) -> RunData:
 
     No straight path moves by more than `STRAIGHT_MM`, no beam by more than `NEAR_BEAM`; step diagonals stay as they are. A ball-bar runs on
     the sphere of its nominal length: rounded positions, chords and means of blocks lie beside it by `BAR_TRAVEL_MM` at most. Off the
-    sphere a common scale of the machine would differ from the length of the bar in the eighth digit, and the rank would count it as observed.
+    sphere a common scale of the machine would differ from the length of the bar in the eighth digit, and the rank would count it.
     """
     if run.kind == "bar":
         return replace(run, axes_mm=_resting(_on_the_sphere(run)))
@@ -67,7 +67,7 @@ def _resting(axes_mm: F2) -> F2:
 
 
 HAND_SET = ("cup", "tilt", "zero")
-"""Set-up unknowns that mounting by hand causes and no run states; with uncalibrated bar lengths they are free, in the solver's rank as in the report's.
+"""Set-up unknowns that no run states; with uncalibrated bar lengths they are free, in the solver's rank as in the report's.
 All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`abbe.models.solvers.priors`). They are known for the
 rank, and count in every uncertainty: else a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time, as
 the height is in a helix) a squareness."""
