@@ -52,7 +52,7 @@ from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.storage.engine import parse_url
-from abbe.service.storage.private import database_seen_by_others
+from abbe.service.storage.private import database_readable_by_others
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.users.roles import Permission
@@ -300,7 +300,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
     listening = bind(setup.web.host, setup.web.port)
     try:
         store = await asyncio.to_thread(Store.open, setup.store_url)
-        if words := database_seen_by_others(setup.store_url):
+        if words := database_readable_by_others(setup.store_url):
             log.warning("database", text=words)
         try:
             host, port = listening.getsockname()[:2]

@@ -1,4 +1,4 @@
-"""The audit of a database with its two files beside it: the key of the seals (0600), and the heads, one line a record."""
+"""The audit of a database and its two files beside it: the key of the seals (0600), and the heads, one line per record."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from abbe.service.storage.engine import parse_url
 from abbe.service.storage.private import private_file
 from abbe.service.storage.store import Store
 
-# The two files of the audit: made for their owner only, appended to, and refused with words that say whose they are.
+# The two files of the audit: created for their owner only, append-only; a refusal names their owner.
 
 
 def create(path: Path, content: bytes) -> None:
-    """Write a new file aside and link it: a second process finds the file of the first, complete."""
+    """Write a new file under another name and link it: a second process finds the complete file of the first."""
     aside = Path(f"{path}.{secrets.token_hex(4)}")
     file = private_file(aside)
     try:
@@ -42,14 +42,14 @@ def create(path: Path, content: bytes) -> None:
 
 
 def can_create(path: Path) -> None:
-    """Raise the error of the system that making this file would end in; leave nothing behind."""
+    """Raise the OSError that creating this file would raise; leave nothing behind."""
     aside = Path(f"{path}.{secrets.token_hex(4)}")
     os.close(private_file(aside))
     aside.unlink()
 
 
 def can_append(path: Path) -> None:
-    """Raise the error of the system that appending to this file, or making it, would end in; leave nothing behind."""
+    """Raise the OSError that appending to this file, or creating it, would raise; leave nothing behind."""
     try:
         os.close(os.open(path, os.O_WRONLY | os.O_APPEND))
     except FileNotFoundError:
@@ -57,7 +57,7 @@ def can_append(path: Path) -> None:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append a line; on return it is on disk. A line before it that a power cut has torn stays by itself."""
+    """Append a line; on return it is on disk. A torn line before it (power cut) stays a line of its own."""
     with suppress(FileExistsError):
         os.close(private_file(path))
     file = os.open(path, os.O_RDWR | os.O_APPEND)
@@ -65,7 +65,7 @@ def append_line(path: Path, text: str) -> None:
         size = os.fstat(file).st_size
         torn = size > 0 and os.lseek(file, -1, os.SEEK_END) >= 0 and os.read(file, 1) != b"\n"
         line = (b"\n" if torn else b"") + f"{text}\n".encode()
-        # One short write at the end of the file: lines of two processes do not mix.
+        # One short write with O_APPEND: lines of two processes do not mix.
         if os.write(file, line) != len(line):
             raise OSError(errno.ENOSPC, "only a part of the line could be written")
         os.fsync(file)
@@ -74,20 +74,22 @@ def append_line(path: Path, text: str) -> None:
 
 
 def refusal(path: Path, error: OSError) -> AuditBroken:
-    """Why a file of the audit cannot be used: what the system says, whose the file is, who asks, and what to do."""
-    owner, words = "", ""
+    """The error for an unusable file of the audit: system message, owner of the file, own account, remedy."""
+    owner, details = "", ""
     with suppress(OSError, KeyError, NotImplementedError):
         there = path if path.exists() else path.parent
         owner = there.owner()
-        words = f" ({'it' if there == path else there} belongs to {owner}, rights {stat.S_IMODE(there.stat().st_mode):04o}{_me()})"
+        details = (
+            f" ({'it' if there == path else there} belongs to {owner}, rights {stat.S_IMODE(there.stat().st_mode):04o}{_own_account()})"
+        )
     who = f"run this as {owner}, or give the file" if owner not in {"", "root"} else "give the file"
     return AuditBroken(
-        f"the audit cannot be used: {path}: {error.strerror or error}{words}",
+        f"the audit cannot be used: {path}: {error.strerror or error}{details}",
         f"{who} to the account of the service (chown) with rights 0600; see docs/how-to/users.md",
     )
 
 
-def _me() -> str:
+def _own_account() -> str:
     if not hasattr(os, "geteuid"):
         return ""
     import pwd
@@ -107,30 +109,25 @@ KEY, HEADS = ".audit-key", ".audit-head"
 class AuditBook:
     """Writes and proves the audit. Any thread may call.
 
-    Parameters
-    ----------
-    store : Store
-        The database.
-    url : str
-        Of it, with its path: the files lie beside a SQLite file. Of a server they lie in the folder that `ABBE_AUDIT_FOLDER` names, else
-        in ``~/.local/state/abbe``, by the database's own name.
+    The files lie beside a SQLite file (``url``). For a server they lie in the folder that `ABBE_AUDIT_FOLDER` names, otherwise in
+    ``~/.local/state/abbe``, named after the id of the database.
     """
 
     def __init__(self, store: Store, url: str) -> None:
         self._store = store
         self._key: bytes | None = None
-        base = place(store, url)
+        base = files_base(store, url)
         self._memory = base is None
         self.key_file, self.head_file = files_of(str(base))
         self._heads: list[Anchor] = []
 
     def ready(self) -> None:
-        """Make sure that a record can be written, before something is done that needs one. Leaves nothing behind.
+        """Check that a record can be written, before an action that needs one. Leaves nothing behind.
 
         Raises
         ------
         AuditBroken, StoreError
-            None can: which file or database, whose it is, what to do.
+            Names the unusable file or database, its owner and the remedy.
         """
         if not self._memory:
             files_ready(self.key_file, self.head_file)
@@ -142,7 +139,7 @@ class AuditBook:
         Raises
         ------
         AuditBroken, StoreError
-            It cannot be written.
+            The record cannot be written.
         """
         key = self._key_of(make=True)
         cleaned = AuditEvent(
@@ -150,14 +147,14 @@ class AuditBook:
             action=_clean(event.action)[:200],
             target=_clean(event.target)[:2000],
             outcome=_clean(event.outcome)[:200],
-            doc=_cleaned(event.doc),
+            doc=_clean_document(event.doc),
         )
         record = self._store.audit.append(lambda last, utc: follow(last, utc, cleaned, key))
         self._keep(anchor_of(record, key))
         return record
 
     def verify(self) -> list[str]:
-        """Everything that is wrong; an empty list: all is there and as written. An audit that was never begun has nothing wrong."""
+        """All faults; an empty list: the audit is complete and unchanged, or was never begun."""
         heads = self._heads if self._memory else heads_in(self.head_file)
         records = self._store.audit.events()
         try:
@@ -195,12 +192,12 @@ class AuditBook:
 
 
 def heads_in(file: Path) -> list[Anchor]:
-    """The heads that a file has kept, in their order.
+    """The heads in a file, in their order.
 
     Raises
     ------
     AuditBroken
-        It cannot be read.
+        The file cannot be read.
     """
     try:
         lines = file.read_text(encoding="ascii", errors="replace").splitlines()
@@ -212,20 +209,20 @@ def heads_in(file: Path) -> list[Anchor]:
 
 
 def files_of(base: str) -> tuple[Path, Path]:
-    """Key and heads of an audit."""
+    """Paths of the key and the heads of an audit."""
     return Path(f"{base}.audit-key"), Path(f"{base}.audit-head")
 
 
 def sqlite_base(database: Path) -> str:
-    """Path of the audit's files of a SQLite file, without their ending. A folder for several databases keeps those of one name apart."""
+    """Path of a SQLite file's audit files without suffix; in a shared folder a hash separates databases of the same name."""
     folder, path = os.environ.get(ENVIRONMENT), database.resolve()
     if not folder:
         return str(path)
     return str(Path(folder) / f"{path.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:8]}")
 
 
-def _sqlite_place(store: Store | None, database: Path) -> str:
-    """`sqlite_base`, or the name that earlier versions gave in a folder, if that key sealed this database's last record."""
+def _sqlite_files_base(store: Store | None, database: Path) -> str:
+    """`sqlite_base`, or the path of earlier versions in a shared folder, if its key sealed this database's last record."""
     base, folder = sqlite_base(database), os.environ.get(ENVIRONMENT)
     if store is None or not folder or files_of(base)[0].exists():
         return base
@@ -238,12 +235,12 @@ def _sqlite_place(store: Store | None, database: Path) -> str:
 
 
 def read_key(file: Path, *, make: bool) -> bytes:
-    """Read the key of the seals; with ``make`` a new one is written if there is none.
+    """Read the key of the seals; with ``make`` create a missing one.
 
     Raises
     ------
     AuditBroken
-        It is missing, is no key, or cannot be read or made.
+        The key is missing, invalid, or cannot be read or created.
     """
     try:
         if make and not file.exists():
@@ -259,12 +256,12 @@ def read_key(file: Path, *, make: bool) -> bytes:
 
 
 def files_ready(key_file: Path, head_file: Path) -> None:
-    """Make sure that key and heads can be used or made; nothing is left behind.
+    """Check that key and heads can be used or created; leave nothing behind.
 
     Raises
     ------
     AuditBroken
-        Which cannot.
+        Names the unusable file.
     """
     file = key_file
     try:
@@ -278,14 +275,14 @@ def files_ready(key_file: Path, head_file: Path) -> None:
         raise refusal(file, error) from None
 
 
-def place(store: Store | None, url: str) -> str | None:
-    """Path of the audit's files without their ending; None for a database in memory. ``store`` is only asked for a server's name."""
+def files_base(store: Store | None, url: str) -> str | None:
+    """Path of the audit's files without suffix; None for a database in memory. ``store`` is read only for the id of a server database."""
     parsed = parse_url(url)
     folder = os.environ.get(ENVIRONMENT)
     if parsed.drivername == "sqlite" or store is None:
         if parsed.database in {None, "", ":memory:"}:
             return None
-        return _sqlite_place(store, Path(str(parsed.database)))
+        return _sqlite_files_base(store, Path(str(parsed.database)))
     home = Path(folder) if folder else Path.home() / ".local" / "state" / "abbe"
     try:
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -297,7 +294,7 @@ def place(store: Store | None, url: str) -> str | None:
 
 
 def _anchor(line: str) -> Anchor | None:
-    """A kept head; None for a line that a power cut has torn. An attacker who tears lines could as well remove them."""
+    """Parse a kept head; None for a torn line (power cut). An attacker who tears lines could as well remove them."""
     parts = line.split(" ")
     if len(parts) == 3 and parts[0].isdigit() and [len(part) for part in parts[1:]] == [64, 64] and len(parts[0]) < 18:
         return Anchor(int(parts[0]), parts[1], parts[2])
@@ -305,7 +302,7 @@ def _anchor(line: str) -> Anchor | None:
 
 
 def this_account() -> str:
-    """The account of the operating system that runs this process: ``os:NAME@HOST``."""
+    """The operating system account of this process: ``os:NAME@HOST``."""
     try:
         name = getpass.getuser()
     except (KeyError, OSError):
@@ -314,14 +311,14 @@ def this_account() -> str:
 
 
 def _clean(text: str) -> str:
-    """Without passwords, and as every terminal, file and database takes it."""
+    """Mask passwords and make every character safe for terminals, files and databases."""
     return visible(mask_secrets(text))
 
 
-def _cleaned(value: Any) -> Any:
-    """The same for all texts of a document."""
+def _clean_document(value: Any) -> Any:
+    """`_clean` for all texts of a document, cut to 2000 characters."""
     if isinstance(value, dict):
-        return {_clean(str(key)): _cleaned(inner) for key, inner in value.items()}
+        return {_clean(str(key)): _clean_document(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_cleaned(inner) for inner in value]
+        return [_clean_document(inner) for inner in value]
     return _clean(value)[:2000] if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""Records of the audit and the proof that they are all there and as written. Pure."""
+"""The chain of audit records and the proof that it is complete and unchanged. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from abbe.service.push.entries import GENESIS, canonical
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """What was kept of the audit's end outside of the database."""
+    """A head of the audit kept outside of the database: id, digest and seal of a record."""
 
     id: int
     digest: str
@@ -21,12 +21,12 @@ class Anchor:
 
 
 def key_name(key: bytes) -> str:
-    """What a record calls the key of its seal: says nothing about the key."""
+    """Name of a key in a record; it reveals nothing about the key."""
     return hashlib.sha256(b"abbe audit key " + key).hexdigest()[:16]
 
 
 def mac_of(key: bytes, digest: str) -> str:
-    """Seal of a record: without the key no chain can be forged."""
+    """Seal of a record: nobody can forge a chain without the key."""
     return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
 
 
@@ -37,7 +37,7 @@ def digest_of(event: AuditEvent) -> str:
 
 
 def follow(last: AuditEvent | None, utc: str, event: AuditEvent, key: bytes) -> AuditEvent:
-    """Make of an event the record that follows ``last``."""
+    """Turn an event into the record that follows ``last``."""
     number, prev = (1, GENESIS) if last is None else (last.id + 1, last.digest)
     placed = replace(event, id=number, utc=utc, prev=prev, key=key_name(key))
     digest = digest_of(placed)
@@ -45,18 +45,11 @@ def follow(last: AuditEvent | None, utc: str, event: AuditEvent, key: bytes) -> 
 
 
 def faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
-    """Everything that is wrong with an audit; an empty list: it is complete and unchanged.
+    """All faults of an audit; an empty list: it is complete and unchanged.
 
-    Parameters
-    ----------
-    records : sequence of AuditEvent
-        All of them, in the order of their numbers.
-    anchors : sequence of Anchor
-        What was kept outside.
-    key : bytes
-        Of the seals.
+    ``records``: all records, in the order of their ids; ``anchors``: the heads kept outside of the database; ``key``: of the seals.
     """
-    found, head, mine = [], GENESIS, key_name(key)
+    found, head, own_key = [], GENESIS, key_name(key)
     for number, record in enumerate(records, 1):
         if record.id != number:
             found.append(f"record {number} is missing")
@@ -65,33 +58,33 @@ def faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes)
             found.append(f"record {number} does not follow the one before it")
         if record.digest != _digest_or_none(record):
             found.append(f"record {number} was changed after it was written")
-        if record.key != mine:
+        if record.key != own_key:
             found.append(f"record {number} is sealed with a key that is not here ({record.key})")
         elif not hmac.compare_digest(record.mac, mac_of(key, record.digest)):
             found.append(f"record {number} was not sealed by this service")
         head = record.digest
-    return found + _against(records, anchors, key)
+    return found + _anchor_faults(records, anchors, key)
 
 
 def _digest_or_none(record: AuditEvent) -> str | None:
     try:
         return digest_of(record)
-    except (TypeError, ValueError):  # no JSON any more
+    except (TypeError, ValueError):  # no longer JSON
         return None
 
 
-def _against(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
-    """What the kept heads say: the database must hold each of them."""
-    found, held = [], {record.id: record.digest for record in records}
+def _anchor_faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
+    """Faults against the kept heads: the database must hold each of them."""
+    found, stored = [], {record.id: record.digest for record in records}
     for anchor in anchors:
         if not hmac.compare_digest(anchor.mac, mac_of(key, f"{anchor.id} {anchor.digest}")):
             found.append(f"the head kept for record {anchor.id} was not sealed by this service")
-        elif anchor.id not in held:
+        elif anchor.id not in stored:
             found.append(f"the audit ended with record {anchor.id} at least, and holds {len(records)}")
-        elif held[anchor.id] != anchor.digest:
+        elif stored[anchor.id] != anchor.digest:
             found.append(f"record {anchor.id} is not the one whose head was kept")
     if records and not anchors:
-        found.append("no head was kept outside of the database: nobody knows how long the audit was")
+        found.append("no head was kept outside of the database: the length of the audit is not proved")
     return found
 
 

@@ -1,4 +1,4 @@
-"""`abbe backup`: database, samples that it does not have yet and audit, as of one moment, while the service runs."""
+"""`abbe backup`: database, samples not yet in it, and audit, consistent as of one instant, while the service runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from abbe.service.backup.backup_files import (
     MACHINE,
     audit_faults,
     counts,
-    listed,
+    file_list,
 )
 from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
 from abbe.service.domain.audit_event import AuditEvent
@@ -39,17 +39,7 @@ SERVER_HELP = "copy it with pg_dump --format=custom, bring it back with pg_resto
 
 @dataclass(frozen=True, slots=True)
 class BackupSource:
-    """What is backed up.
-
-    Parameters
-    ----------
-    url : str
-        Database.
-    capture : CaptureSettings
-        Where samples are before the database has them.
-    machine_file : Path or None
-        Copied along.
-    """
+    """What to back up: the database, the capture's folder of samples not yet in it, and optionally the machine file."""
 
     url: str
     capture: CaptureSettings
@@ -62,7 +52,7 @@ def sqlite_file(url: str, what: str) -> Path:
     Raises
     ------
     BackupRefused
-        It is on a server, or in memory.
+        The database is on a server, or in memory.
     """
     parsed = parse_url(url)
     if parsed.drivername != "sqlite":
@@ -73,32 +63,25 @@ def sqlite_file(url: str, what: str) -> Path:
 
 
 def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> dict[str, Any]:
-    """Make a backup: a new folder (0700, files 0600) that is there as a whole or not at all. Nothing is interrupted by it.
+    """Make a backup: the new folder ``target`` (0700, files 0600), complete or not at all. The service keeps running.
 
-    Everything that was on the disk when this was called is in it: samples first, for they leave their segment only when the database has
-    them; then the database as of one instant; the audit's heads last, as far as that database goes.
+    The backup holds everything that was on the disk at the call: samples first, because they leave their segment only when the database
+    has them; then the database as of one instant; finally the audit's heads up to that database.
 
     Parameters
     ----------
-    source : BackupSource
-        What.
-    target : Path
-        New folder.
-    utcnow : callable
-        Clock.
     with_key : bool
-        Whether the backup includes the audit's key. Without it the holder of the backup cannot forge an audit, and `restore`
-        asks for the key.
+        Include the audit's key. Without it the holder of the backup cannot forge an audit, and `restore` asks for the key.
 
     Returns
     -------
     dict
-        The backup's list (``backup.json``). ``audit.faults``: what is wrong with the audit that was copied.
+        The backup's list (``backup.json``). ``audit.faults``: faults of the copied audit.
 
     Raises
     ------
     BackupRefused
-        The folder exists or cannot be made, or the database is on a server.
+        The folder exists or cannot be created, or the database is on a server.
     StoreError
         The database cannot be copied, or the copy is damaged.
     """
@@ -140,7 +123,7 @@ def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[],
     revision = prove_copy(part / DATABASE)
     audit = _audit(part, source, with_key=with_key)
     if source.machine_file is not None:
-        _copied(source.machine_file, part / MACHINE)
+        _copy_private(source.machine_file, part / MACHINE)
     doc = {
         "format": FORMAT,
         "made_utc": made,
@@ -151,7 +134,7 @@ def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[],
         "rows": counts(part / DATABASE),
         "segments": segments,
         "audit": audit,
-        "files": listed(part),
+        "files": file_list(part),
     }
     (part / LIST).touch(mode=0o600)
     (part / LIST).write_text(json.dumps(doc, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -161,7 +144,7 @@ def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[],
 
 
 def _segments(folder: Path, source: BackupSource) -> int:
-    """Copy what the capture holds; a segment that goes away meanwhile is in the database, which is copied after it."""
+    """Copy the capture's segments. One that vanishes meanwhile is in the database, which is copied afterwards."""
     own = segment_folder(source.url, source.capture)
     found = [path for one in (own, *other_folders(source.url, source.capture, own)) for path in sorted(one.glob("run-*"))]
     if found:
@@ -169,10 +152,10 @@ def _segments(folder: Path, source: BackupSource) -> int:
     copied = 0
     for path in found:
         target = folder / path.name
-        if target.exists():  # of two folders: the present one's counts
+        if target.exists():  # of two folders the present one takes precedence
             continue
         try:
-            _copied(path, target)
+            _copy_private(path, target)
         except FileNotFoundError:
             target.unlink(missing_ok=True)
             continue
@@ -181,7 +164,7 @@ def _segments(folder: Path, source: BackupSource) -> int:
 
 
 def _audit(part: Path, source: BackupSource, *, with_key: bool) -> dict[str, Any]:
-    """Copy the audit's files: heads after the database, so that none is missing, and none beyond what the copied database holds."""
+    """Copy the audit's files. Heads come after the database, so that none is missing; later ones are dropped."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():
@@ -193,11 +176,11 @@ def _audit(part: Path, source: BackupSource, *, with_key: bool) -> dict[str, Any
     (part / HEADS).write_text("".join(kept), encoding="ascii", errors="replace")
     records, found = audit_faults(part / DATABASE, part / HEADS, book.key_file)
     if with_key:
-        _copied(book.key_file, part / KEY)
+        _copy_private(book.key_file, part / KEY)
     return {"records": records, "key": with_key, "faults": found}
 
 
-def _copied(source: Path, target: Path) -> None:
-    """Copy a file into one that only its owner may read."""
+def _copy_private(source: Path, target: Path) -> None:
+    """Copy a file into a new one with rights 0600."""
     with source.open("rb") as origin, os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as copy:
         shutil.copyfileobj(origin, copy)

@@ -1,4 +1,4 @@
-"""What a backup consists of: a folder with the database, what the database does not have yet, the audit's files, and a list of them."""
+"""Content of a backup: a folder with the database, samples not yet in it, the audit's files, and a list of all files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LONGEST_LIST = 64 << 20
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A backup whose files are those that were written. ``doc``: its list."""
+    """A backup whose files match its list, ``doc``."""
 
     folder: Path
     doc: dict[str, Any]
@@ -41,7 +41,7 @@ class Backup:
 
     @property
     def segments(self) -> list[Path]:
-        """What the capture had not given to the database, or had set aside."""
+        """Segments of the capture that were not yet in the database, or were set aside."""
         return sorted((self.folder / CAPTURE).glob("run-*"))
 
 
@@ -54,11 +54,11 @@ def digest_of(path: Path) -> str:
     return found.hexdigest()
 
 
-def listed(folder: Path) -> dict[str, dict[str, Any]]:
-    """Every file below a folder but the list: its size and digest, by its path in the folder. Raises OSError."""
+def file_list(folder: Path) -> dict[str, dict[str, Any]]:
+    """Size and digest of every file below a folder except the list, by relative path. Raises OSError."""
     found = dict[str, dict[str, Any]]()
     for path in sorted(folder.rglob("*")):
-        if not is_plain(path):  # a link, a pipe, a device: no backup has one, and a copy would follow it
+        if not is_plain(path):  # a link, pipe or device: no backup has one, and a copy would follow it
             found[path.relative_to(folder).as_posix()] = {}
         elif path.is_file() and path != folder / LIST:
             found[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest_of(path)}
@@ -66,18 +66,18 @@ def listed(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_backup(folder: Path) -> Backup:
-    """Find a backup and compare each of its files with the list.
+    """Read a backup and compare each of its files with the list.
 
     Raises
     ------
     BackupRefused
-        It is none, of a newer version, or a file is missing, too many or not as it was written: which one.
+        The folder is no backup, or one of a newer version; or names a file that is missing, additional or changed.
     """
     try:
         doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
         if doc.get("format") != FORMAT:
             raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", f"this version of Abbe reads {FORMAT}")
-        wanted, found = doc["files"], listed(folder)
+        wanted, found = doc["files"], file_list(folder)
         wrong = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
     except FileNotFoundError:
         raise BackupRefused(f"{folder} is no backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
@@ -92,9 +92,9 @@ def read_backup(folder: Path) -> Backup:
 
 
 def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, list[str]]:
-    """Number of records in the audit of a copied database, and everything that is wrong with them.
+    """Number of records in the audit of a copied database, and all their faults.
 
-    Without a key nothing is said about seals; then the second is empty.
+    Without a key the audit cannot be checked, and the list of faults is empty.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, li
         A file cannot be read.
     """
     if not rows_of(database, "SELECT 1 FROM sqlite_master WHERE name = 'audit'"):
-        return 0, []  # of a version before the audit
+        return 0, []  # from a version without an audit
     records = _records(database)
     if key is None or not records:
         return len(records), []
@@ -110,13 +110,13 @@ def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, li
 
 
 def _records(database: Path) -> list[AuditEvent]:
-    """The audit of a copied database. Documents are text there."""
+    """The audit of a copied database, whose documents are text."""
     names = [one.name for one in fields(AuditEvent)]
     rows = (dict(zip(names, row, strict=True)) for row in rows_of(database, f"SELECT {', '.join(names)} FROM audit ORDER BY id"))  # noqa: S608 - our own names
     return [AuditEvent(**row | {"doc": json.loads(row["doc"])}) for row in rows]
 
 
 def counts(database: Path) -> dict[str, int]:
-    """How many rows a copied database has in the tables that people ask for."""
+    """Row counts of the main tables of a copied database."""
     there = {str(row[0]) for row in rows_of(database, "SELECT name FROM sqlite_master WHERE type = 'table'")}
     return {name: int(rows_of(database, f"SELECT count(*) FROM {name}")[0][0]) for name in COUNTED if name in there}  # noqa: S608 - our own names

@@ -1,4 +1,4 @@
-"""`abbe restore`: a backup becomes a database again, after everything in it was proved, and never over one that is in use."""
+"""`abbe restore`: turn a backup into a database again. Everything is proved first, and a database in use is never replaced."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from abbe.service.backup.backup_files import CAPTURE, DATABASE, HEADS, KEY, Back
 from abbe.service.capture.settings import segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused
-from abbe.service.storage.copying import is_locked, prove_copy, sync_file, users_of
+from abbe.service.storage.copying import is_locked, processes_using, prove_copy, sync_file
 from abbe.service.storage.migrate import known_revisions
 from abbe.service.storage.store import Store
 
-BESIDE = ("", "-journal", "-wal", "-shm")
-"""A SQLite file and what belongs to it: without its journal a database that was cut off is damaged."""
+SQLITE_SUFFIXES = ("", "-journal", "-wal", "-shm")
+"""Suffixes of a SQLite file and its journals: without its journal an interrupted database is damaged."""
 
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """What was brought back. ``aside``: where what was there before lies now."""
+    """What was restored. ``aside``: new paths of the files that were there before."""
 
     backup: Backup
     database: Path
@@ -36,60 +36,54 @@ class Restored:
 
 
 @dataclass(frozen=True, slots=True)
-class _Places:
-    """Where everything goes."""
+class _Targets:
+    """Target paths of a restore."""
 
     database: Path
     capture: Path
     key: Path
     heads: Path
 
-    def taken(self) -> list[Path]:
-        """What is there already."""
-        database = [Path(f"{self.database}{ending}") for ending in BESIDE]
+    def existing(self) -> list[Path]:
+        """Target paths that exist."""
+        database = [Path(f"{self.database}{ending}") for ending in SQLITE_SUFFIXES]
         return [path for path in (*database, self.capture, self.key, self.heads) if path.exists()]
 
 
 def restore(
     folder: Path, into: BackupSource, utcnow: Callable[[], datetime], *, replace: bool = False, key_file: Path | None = None
 ) -> Restored:
-    """Bring a backup back.
+    """Restore the backup in ``folder``.
 
-    Everything is proved on a copy beside the place before anything there is touched; what was there is renamed, not deleted; the database
-    comes last. Whenever this is cut off, there is the old database, the new one, or none - and none half.
+    Everything is proved on a copy beside the target before the target is touched; existing files are renamed, not deleted; the database is
+    moved last. An interruption leaves the old database, the new one, or none, but never a partial one.
 
     Parameters
     ----------
-    folder : Path
-        The backup.
-    into : BackupSource
-        Where to.
-    utcnow : callable
-        Clock.
     replace : bool
-        Whether a database that is there is put aside.
+        Put an existing database aside; otherwise refuse.
     key_file : Path, optional
         Key of the audit, for a backup without it.
 
     Raises
     ------
     BackupRefused
-        The backup is damaged or of a newer version, its audit was changed, there is a database already, or it is in use.
+        The backup is damaged or of a newer version, its audit was changed, or the target database exists or is in use.
     StoreError
         The copied database is damaged.
     """
     database = sqlite_file(into.url, "restore")
     backup = read_backup(folder)
-    places = _free(into, database, replace=replace)
+    targets = _check_targets(into, database, replace=replace)
     part = database.parent / f".{database.name}.restoring-{secrets.token_hex(4)}"
     try:
         part.mkdir(mode=0o700)
         shutil.copytree(backup.folder, part, dirs_exist_ok=True)
         if key_file is not None:
             shutil.copyfile(key_file, part / KEY)
-        records = _proved(part, folder)
-        aside = _put_aside(places, utcnow()) if replace else ()
-        _placed(part, places)
+        records = _prove(part, folder)
+        aside = _put_aside(targets, utcnow()) if replace else ()
+        _move_into_place(part, targets)
     except OSError as err:
         raise BackupRefused(f"{database} could not be restored: {err}", "look at disk space and rights") from err
     finally:
@@ -102,23 +96,23 @@ def restore(
     return Restored(backup, database, records, len(backup.segments), aside)
 
 
-def _free(into: BackupSource, database: Path, *, replace: bool) -> _Places:
-    """Where everything goes, if it may."""
+def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Targets:
+    """Return the target paths, or refuse if they exist or are in use."""
     if not database.parent.is_dir():
         raise BackupRefused(f"folder {database.parent} does not exist", "create it, or give another --store")
-    if users := users_of(database):
+    if users := processes_using(database):
         raise BackupRefused(f"{database} is in use by process {users[0]}", "stop the service first: systemctl stop abbe")
     if database.exists() and is_locked(database):
         raise BackupRefused(f"{database} is in use: somebody writes it", "stop the service first: systemctl stop abbe")
-    places = _Places(database, segment_folder(into.url, into.capture), *files_of(sqlite_base(database)))
-    taken = places.taken()
-    if taken and not replace:
-        raise BackupRefused(f"{taken[0]} exists", "give --replace to put what is there aside, or another --store")
-    return places
+    targets = _Targets(database, segment_folder(into.url, into.capture), *files_of(sqlite_base(database)))
+    existing = targets.existing()
+    if existing and not replace:
+        raise BackupRefused(f"{existing[0]} exists", "give --replace to put what is there aside, or another --store")
+    return targets
 
 
-def _proved(part: Path, backup: Path) -> int:
-    """Prove a copied backup; return the number of the audit's records."""
+def _prove(part: Path, backup: Path) -> int:
+    """Prove a copied backup; return its number of audit records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
         raise BackupRefused(f"{backup} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")
@@ -132,12 +126,12 @@ def _proved(part: Path, backup: Path) -> int:
     return records
 
 
-def _put_aside(places: _Places, now: datetime) -> tuple[Path, ...]:
-    """Rename what is there: database first, then what belongs to it."""
+def _put_aside(targets: _Targets, now: datetime) -> tuple[Path, ...]:
+    """Rename existing files, the database first; return their new paths."""
     stamp = f".replaced-{now:%Y%m%dT%H%M%S}"
     moved = []
-    for path in places.taken():
-        ending = next((one for one in BESIDE[1:] if path == Path(f"{places.database}{one}")), "")
+    for path in targets.existing():
+        ending = next((one for one in SQLITE_SUFFIXES[1:] if path == Path(f"{targets.database}{one}")), "")
         target = Path(f"{str(path).removesuffix(ending)}{stamp}{ending}")
         if target.exists():
             raise BackupRefused(f"{target} exists", "try again in a second")
@@ -146,25 +140,25 @@ def _put_aside(places: _Places, now: datetime) -> tuple[Path, ...]:
     return tuple(moved)
 
 
-def _placed(part: Path, places: _Places) -> None:
-    """Rename everything into its place, the database last."""
-    segments, owner = sorted((part / CAPTURE).glob("run-*")), places.database.parent.stat()
+def _move_into_place(part: Path, targets: _Targets) -> None:
+    """Move every file to its target, the database last."""
+    segments, owner = sorted((part / CAPTURE).glob("run-*")), targets.database.parent.stat()
     if segments:
-        places.capture.mkdir(mode=0o700, parents=True, exist_ok=True)
-        _given_to(places.capture, owner)
-    moves = [(path, places.capture / path.name) for path in segments]
-    moves += [(part / HEADS, places.heads), (part / KEY, places.key), (part / DATABASE, places.database)]
+        targets.capture.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _chown_if_root(targets.capture, owner)
+    moves = [(path, targets.capture / path.name) for path in segments]
+    moves += [(part / HEADS, targets.heads), (part / KEY, targets.key), (part / DATABASE, targets.database)]
     for source, target in moves:
         if source.exists():
             os.chmod(source, 0o600)
-            _given_to(source, owner)
+            _chown_if_root(source, owner)
             sync_file(source)
             shutil.move(source, target)  # the audit's folder may be on another disk
     for folder in {target.parent for _, target in moves if target.parent.is_dir()}:
         sync_file(folder)
 
 
-def _given_to(path: Path, owner: os.stat_result) -> None:
-    """A database that root restores gets the owner of its folder: else the service could not write it."""
+def _chown_if_root(path: Path, owner: os.stat_result) -> None:
+    """As root, give a restored file the owner of its folder, so that the service can write it."""
     if os.geteuid() == 0:
         os.chown(path, owner.st_uid, owner.st_gid)

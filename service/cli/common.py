@@ -119,9 +119,9 @@ def reader(store: Store, machine: str = "", control: str = "") -> Reader:
 
 def warn_of_readers(url: str) -> None:
     """Say on stderr if others than its owner may read the file of a database: hashes of passwords are in it."""
-    from abbe.service.storage.private import database_seen_by_others
+    from abbe.service.storage.private import database_readable_by_others
 
-    if (words := database_seen_by_others(url)) and sys.stderr is not None:
+    if (words := database_readable_by_others(url)) and sys.stderr is not None:
         sys.stderr.write(f"warning: {words}\n")
 
 

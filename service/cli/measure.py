@@ -186,7 +186,7 @@ def correct(
     from abbe.service.cli.waiting import taken_back_when_safe
     from abbe.service.compensation.correct import Correction
     from abbe.service.compensation.correct import correct as work_correct
-    from abbe.service.compensation.gate import PushContext, ready
+    from abbe.service.compensation.gate import PushContext, check_preconditions
     from abbe.service.compensation.proposals import check_certificates
     from abbe.service.config import load_machine
     from abbe.service.errors import TakenBack
@@ -206,7 +206,7 @@ def correct(
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink)
-                control = await ready(context)
+                control = await check_preconditions(context)
                 said.append(control.hint)
                 runs = await verification_before(session, store, site, before, sink)
                 async with taken_back_when_safe(session, store, site, wait_s):
@@ -258,7 +258,7 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
 
     with lock_machine(site.urls.cnc):
         accept_by = by_whom() if accept_table else ""
-        async with recovered_session(store, site, ask=person_at_console(), accept_by=accept_by, told=told) as session:
+        async with recovered_session(store, site, ask=person_at_console(), accept_by=accept_by, report=told) as session:
             yield session
 
 

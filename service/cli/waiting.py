@@ -39,7 +39,7 @@ async def taken_back_when_safe(session: Session, store: Store, site: Site, wait_
             "make the machine ready: it is watched, and the old table comes back by itself as soon as that is safe; Ctrl-C ends the waiting"
         )
         try:
-            done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), say=say)
+            done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), notify=say)
         except asyncio.CancelledError as ended:
             ended.add_note("the unverified table is STILL ACTIVE; the next abbe command takes it back before anything else")
             raise

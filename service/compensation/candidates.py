@@ -1,4 +1,4 @@
-"""What a proposal of tables is held against before it may go to a controller: its promise, its measurement, its machine, and now."""
+"""The candidate of a proposal and the context that it is checked against: machine, controller, table in force, time."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ MONTH = timedelta(days=30)
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """Tables that were computed, and from what.
+    """Computed tables and what the model promises of them.
 
-    ``tables``: absolute, in the controller's unit; ``change``: what they add to those in force, as computed. ``drift_mm``: what the
-    solution leaves of the run that was measured last and not used; None where there is none. ``ended_s``, ``last_s``: end of
-    the oldest and of the newest run that identifies, UTC.
+    ``tables``: absolute, in the controller's unit; ``change``: what they add to those in force, as computed. ``drift_mm``: residual of the
+    solution in the newest unused run; None without one. ``ended_s``, ``last_s``: end of the oldest and of the newest identifying run,
+    seconds UTC.
     """
 
     tables: NineTables
@@ -46,13 +46,7 @@ class Promise:
 
 
 def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: TableFormat) -> Candidate:
-    """A proposal as it is signed by the one who ordered it.
-
-    Parameters
-    ----------
-    runs : list of dict
-        The runs that were solved, ``abbe-run/1``.
-    """
+    """Make a signed candidate of computed tables; ``runs``: the solved runs, ``abbe-run/1``."""
     columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
     blank = Candidate(site.name, FORMAT_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
     digest = content_digest(blank)
@@ -60,13 +54,13 @@ def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: Tab
 
 
 def _column(promise: Promise, a: int, i: int) -> Column:
-    values = promise.tables.correction_mm[a][:, i] + 0.0  # -0.0 is another number where bytes are compared
+    values = promise.tables.correction_mm[a][:, i] + 0.0  # -0.0 has other bytes than 0.0
     left = -promise.change.correction_mm[a][:, i] + 0.0
     return Column(AXES[a], AXES[i], tuple(promise.tables.position_mm[a].tolist()), tuple(values.tolist()), tuple(_plain(left)))
 
 
 def _plain(values: Any) -> list[float]:
-    """Without numbers too small to be any."""
+    """Numbers below 1e-15 become zero: the checks refuse denormal ones."""
     return [0.0 if abs(v) < 1e-15 else float(v) for v in values]
 
 
@@ -96,12 +90,12 @@ def until_s(day: date) -> float:
 
 
 def mark_of(boots: Iterable[int | None]) -> str:
-    """What must not change between measuring and pushing: the controller was not restarted. Names every boot that was seen."""
-    seen = sorted({-1 if boot is None else int(boot) for boot in boots})
-    return "boot " + ", ".join("not known" if boot < 0 else f"{boot:08X}" for boot in seen)
+    """A mark that must not change between measuring and pushing: the boot ids of the controller, each once."""
+    distinct = sorted({-1 if boot is None else int(boot) for boot in boots})
+    return "boot " + ", ".join("not known" if boot < 0 else f"{boot:08X}" for boot in distinct)
 
 
-async def scene_of(
+async def candidate_context(
     site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
 ) -> CandidateContext:
     """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
@@ -115,7 +109,7 @@ async def scene_of(
 
 
 def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
-    """The tables that were in force `MONTH` ago, as far as pushes tell; before the first push that of its base, else the present one."""
+    """The tables that were in force `MONTH` ago by the journal: before the first push its base, without any push the present ones."""
     kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
     if not kept:
         return base.tables
@@ -123,7 +117,7 @@ def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | N
 
 
 def _on_grid(tables: NineTables | None, grid: NineTables) -> dict[tuple[str, str], tuple[float, ...]]:
-    """Tables on the new one's grid."""
+    """Tables interpolated onto another grid; zeros for no correction."""
     if tables is None:
         return {(a, i): (0.0,) * grid.position_mm[k].size for k, a in enumerate(AXES) for i in AXES}
     found = {}

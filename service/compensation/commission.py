@@ -1,8 +1,8 @@
-"""Commissioning of a control's tables: a known step is written, measured with the ball-bar, and sign, axis and unit are inferred.
+"""Commissioning of a control's tables: write a known step, measure it with the ball-bar, and infer sign, axis and unit.
 
 A first step of half a micrometre shows a wrong unit while it is harmless (taken for millimetres it is half a millimetre, within the
-bar's stroke). Then 10 um for each axis, each taken back before the next. The bar hangs in all the time; every table goes through the same
-door as any other, and whatever goes wrong takes the old one back.
+bar's stroke). Then each axis gets 10 µm, rolled back before the next. The bar stays mounted throughout; every table goes through the push
+machine like any other, and any failure rolls back.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from abbe.service.tables.nine_tables import check_limits
 KIND = "sign-proof"
 STEP_MM, FIRST_MM = 0.010, 0.0005
 HARMLESS = 10.0
-"""The first step must not move the tool by more than so many times itself."""
+"""The first step must not move the tool by more than this multiple of itself."""
 STROKE_MM, LARGEST_RATIO = 1.0, 1000.0
-"""Stroke of the bar either way, and how much too large a wrong unit may make a number."""
+"""Stroke of the bar either way; largest factor by which a wrong unit enlarges a step."""
 PLACES = 24
 GRID = (25, 21, 19)
 U_READING_MM = 0.0003
@@ -45,8 +45,8 @@ UPRIGHT = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Proved:
-    """What commissioning found, and its number in the store."""
+class SignCommissioning:
+    """What commissioning found, and its id in the store."""
 
     proof: SignProof
     solution_id: int
@@ -61,8 +61,8 @@ class CommissioningContext:
     site: Site
     bar: BarPlaces
 
-    async def with_table(self, what: str, tables: NineTables, base: Base, lsb_nm: int) -> PlaceReadings:
-        """Read all places with other tables in force; the old ones are in force again afterwards, whatever happens."""
+    async def read_with_table(self, what: str, tables: NineTables, base: Base, lsb_nm: int) -> PlaceReadings:
+        """Read all places with test tables in force; afterwards the old ones are in force again, whatever happens."""
         now = await read_base(self.session.controller)
         if now.crc != base.crc:
             raise TableMismatch("somebody changed the active table during commissioning", "begin again")
@@ -79,17 +79,17 @@ class CommissioningContext:
         return found[0]
 
 
-async def commission(session: Session, store: Store, site: Site, *, progress: ProgressSink) -> Proved:
-    """Find out what the control does with a correction. About ten minutes of machine time, one mounting of cup and bar.
+async def commission(session: Session, store: Store, site: Site, *, progress: ProgressSink) -> SignCommissioning:
+    """Measure what the control does with a correction. Takes about ten minutes of machine time and one mounting of cup and bar.
 
-    An interlock always ends it, whatever the machine file lets a measurement wait for: a test table is in force meanwhile.
+    Any interlock ends it, even one that the machine file lets a measurement wait for, because a test table is in force.
 
     Raises
     ------
     TableRefused
         The first small step moved the tool too far, or the control's unit is too coarse for it. The old table is in force.
     StillActive, TableMismatch, Interlock, MeasurementFault, DriverError
-        As of any push and any measurement.
+        From pushing and measuring.
     """
     site = replace(site, watching=replace(site.watching, suspending=Suspending()))
     await recover(session.controller, store, site)
@@ -98,17 +98,17 @@ async def commission(session: Session, store: Store, site: Site, *, progress: Pr
     known = identity(await session.controller.identify())
     number = sum(c.name.startswith(KIND) for c in await asyncio.to_thread(store.campaigns.all)) + 1
     context = CommissioningContext(session, store, site, BarPlaces(session, store, site, progress, f"{KIND} {number}", PLACES))
-    steps = _steps(context, base, lsb_nm)  # and their limits, before anything is mounted
+    steps = _steps(context, base, lsb_nm)  # also checks their limits, before anything is mounted
     async with context.bar.cleared_away():
         proof = await _prove(context, base, steps)
         campaign = await asyncio.to_thread(store.campaigns.find, f"{context.bar.name} before")
         solution_id = await store.write(store.solutions.add, campaign.id, KIND, context.bar.run_ids, _doc(proof) | {"identity": known})
-    return Proved(proof, solution_id)
+    return SignCommissioning(proof, solution_id)
 
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """The tables to be written: a first small step of all axes, then one for each; and how large the steps are in the control's unit."""
+    """The tables to write: a first small step of all axes, then one step per axis; step sizes in whole units of the control."""
 
     lsb_nm: int
     small_mm: float
@@ -134,9 +134,9 @@ def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
 
 
 async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> SignProof:
-    """All passes and what follows from them; a wrong unit is stored before it is raised."""
+    """Read all passes and infer the proof; a wrong unit is stored before the error is raised."""
     before = await context.bar.read("before")
-    first = await context.with_table("first", steps.small, base, steps.lsb_nm)
+    first = await context.read_with_table("first", steps.small, base, steps.lsb_nm)
     moved_mm = float(np.abs(first.deviation_mm - before.deviation_mm).max())
     if moved_mm > HARMLESS * max(steps.small_mm, FIRST_MM):
         moved = f"a step of {steps.small_mm * 1e3:g} µm moved the tool by {moved_mm * 1e3:.1f} µm"
@@ -145,7 +145,7 @@ async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> Si
         doc = {"step_mm": steps.small_mm, "faults": [what], "proved": False}
         await context.store.write(context.store.solutions.add, campaign.id, KIND, context.bar.run_ids, doc)
         raise TableRefused(what, "the old table is in force; look up the unit of the control's table and its entry in the machine file")
-    read = [await context.with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
+    read = [await context.read_with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
     after = await context.bar.read("after")
     return sign_proof(steps.step_mm, _shifts(context.bar.directions(before), before, read, after))
 
@@ -161,7 +161,7 @@ def _base_tables(site: Site, base: Base) -> NineTables:
 
 
 def _stepped(context: CommissioningContext, tables: NineTables, axes: tuple[int, ...], step_mm: float) -> NineTables:
-    """The tables with a step for some axes, in force wherever the bar reads."""
+    """The tables with a step for some axes, over the whole reach of the bar."""
     for axis in axes:
         centre, reach = context.bar.centre_mm[axis], context.bar.radius_mm + 1.0
         low_mm = centre - (1.0 if axis == UPRIGHT else reach)  # the places are on the upper hemisphere
@@ -173,7 +173,7 @@ def _stepped(context: CommissioningContext, tables: NineTables, axes: tuple[int,
 
 
 def _shifts(directions: F2, before: PlaceReadings, read: list[PlaceReadings], after: PlaceReadings) -> tuple[Shift, Shift, Shift]:
-    # after "before" comes the small step, then X, Y, Z, then "after": five equal times
+    # "before", small step, X, Y, Z, "after": five equal intervals
     found = [
         bar_shift(directions, before.deviation_mm, one.deviation_mm, after.deviation_mm, U_READING_MM, share=(k + 2) / 5.0)
         for k, one in enumerate(read)
@@ -194,7 +194,7 @@ def _doc(proof: SignProof) -> dict[str, Any]:
 async def commissioned(controller: Identity, store: Store, site: Site) -> bool | None:
     """Whether the last commissioning of this machine's control has proved sign, axis and unit.
 
-    None: there was none, or since then another control or another firmware was put in.
+    None: there was none, or control or firmware were replaced since then.
     """
     info = identity(await controller.identify())
     doc = await asyncio.to_thread(_last, store, site)
@@ -210,7 +210,7 @@ def _last(store: Store, site: Site) -> dict[str, Any] | None:
 
 
 async def check_commissioned(controller: Identity, store: Store, site: Site) -> None:
-    """Refuse a table for a control whose use of tables was never proved.
+    """Refuse a table for a control that was never commissioned successfully.
 
     Raises
     ------
@@ -220,8 +220,8 @@ async def check_commissioned(controller: Identity, store: Store, site: Site) -> 
     found = await commissioned(controller, store, site)
     if found is False:
         raise TableRefused(
-            "the last commissioning of this machine found that its control does not do what is written",
-            "mend that, then abbe comp commission again; nothing was written",
+            "the last commissioning of this machine found that its control does not act as the tables say",
+            "correct the control, then run abbe comp commission again; nothing was written",
         )
     if found is None:
         raise TableRefused(

@@ -1,7 +1,8 @@
-"""Commissioning of a controller's promises: each flag of `Capabilities` is proved by trying what must be refused, and what must be taken.
+"""Commissioning of a controller's capabilities: each flag is proved by attempts that must be refused and attempts that must be accepted.
 
-Everything is tried with an exact copy of the table in force in the bank at rest. Whatever is accepted wrongly, and wherever this is broken
-off, the same numbers act as before. Nobody is asked to open, press or restart anything: what only that could show is said as not shown.
+Every attempt uses an exact copy of the table in force in the inactive bank. Whatever the controller wrongly accepts, and wherever this is
+interrupted, the same corrections act as before. No person opens, presses or restarts anything: what only that could show is reported as
+not shown.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from abbe.drivers.api import BankState, Controller
 from abbe.drivers.errors import Refused
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.level_trial import ID_WORD, Shown, Trial, while_moving
+from abbe.service.compensation.level_trial import ID_WORD, Observation, Trial, while_moving
 from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof
 from abbe.service.compensation.recover import recover
 from abbe.service.domain.document import Doc
@@ -26,45 +27,45 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from abbe.service.tables.push_journal import JournalView
 
-RESTART = "that a restart changes the boot id, and what it leaves in the banks: nobody restarted the controller"
+RESTART = "that a restart changes the boot id, and what it leaves in the banks: this test restarts nothing"
 NOT_SHOWN = (
-    "that an open door, an e-stop or drives that are off refuse an activation: nobody was asked to open or press anything",
+    "that an open door, an e-stop or drives that are off refuse an activation: this test asks no person to open or press anything",
     "that a command repeated with its old number does nothing: the driver never repeats one",
 )
 SHORT_LEASE_MS, RUNS_OUT_S, POLL_S = 300, 5.0, 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Levels:
-    """What was proved of a controller. ``shown``: every single observation; ``not_shown``: what this test cannot show."""
+class ProvedLevels:
+    """The proved capabilities of a controller. ``shown``: every observation; ``not_shown``: what this test cannot show."""
 
     capabilities: Capabilities
-    shown: tuple[Shown, ...]
+    shown: tuple[Observation, ...]
     not_shown: tuple[str, ...]
     identity: Doc
     solution_id: int
 
     def rows(self) -> list[tuple[str, bool, str]]:
-        """For people: flag, proved or not, how (or the reason against it)."""
+        """For people: flag, whether it is proved, how (or the reason against it)."""
         found = flags_of(self.capabilities)
         return [(name, ok, how(self.shown, name)) for name, ok in found.items() if name != "can_disable"]
 
 
-async def commission_levels(controller: Controller, store: Store, site: Site, clock: Clock | None = None) -> Levels:
-    """Prove what a controller does for a safe push. One short move; the table in force stays what it is.
+async def commission_levels(controller: Controller, store: Store, site: Site, clock: Clock | None = None) -> ProvedLevels:
+    """Prove the capabilities of a controller. Makes one short move; the table in force stays the same.
 
     Raises
     ------
     UnsafeToMove
-        Somebody holds the lease of the banks, or a push is under way.
+        Another owner has the lease of the banks, or a push is under way.
     StillActive
         An interrupted push could not be finished (yet).
     TableMismatch
-        The table in force is not what its CRC says, or not what it was before.
+        The table in force does not match its CRC, or is not the one from before this test.
     DriverError
         The link failed, or the controller restarted meanwhile: begin again.
     """
-    await recover(controller, store, site)  # the bank at rest may hold the table that an interrupted push goes back to
+    await recover(controller, store, site)  # the inactive bank may hold the table that an interrupted push rolls back to
     info = await controller.identify()
     base = await read_base(controller)
     if base.status.lease_owner:
@@ -80,20 +81,20 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
     other_boots = earlier - {info.boot_id}
     if other_boots:
         trial.note("boot_id", "it is another one than an earlier run of this controller had")
-    capabilities = Capabilities(**{f.name: trial.proved(f.name) for f in fields(Capabilities)})
+    capabilities = Capabilities(**{f.name: trial.is_proved(f.name) for f in fields(Capabilities)})
     not_shown = (*(() if other_boots else (RESTART,)), *NOT_SHOWN)
     doc = {
         "identity": identity(info), "boot_id": info.boot_id, "flags": flags_of(capabilities), "level": capabilities.level,
         "shown": [[s.flag, s.ok, s.what] for s in trial.shown], "not_shown": list(not_shown),
     }  # fmt: skip
     solution_id = await store.write(_keep, store, site, doc)
-    return Levels(capabilities, tuple(trial.shown), not_shown, identity(info), solution_id)
+    return ProvedLevels(capabilities, tuple(trial.shown), not_shown, identity(info), solution_id)
 
 
-def how(shown: tuple[Shown, ...], flag: str) -> str:
-    """How a flag was proved, or the reason against it."""
+def how(shown: tuple[Observation, ...], flag: str) -> str:
+    """The observations that proved a flag, or those against it."""
     of_it = [s for s in shown if s.flag == flag]
-    return "; ".join(s.what for s in of_it if not s.ok) or "; ".join(s.what for s in of_it) or "it could not be tried"
+    return "; ".join(s.what for s in of_it if not s.ok) or "; ".join(s.what for s in of_it) or "not tried"
 
 
 def _keep(store: Store, site: Site, doc: Doc) -> int:
@@ -103,14 +104,14 @@ def _keep(store: Store, site: Site, doc: Doc) -> int:
 
 
 def _earlier_boots(store: Store, site: Site) -> set[int]:
-    """Boot ids that earlier pushes and commissionings of this machine have met."""
+    """Boot ids of earlier pushes and commissionings of this machine."""
     boots = {push.boot for push in JournalView.read(store, site.name, site.control, origins=False).bases()}
     last = last_proof(store, site)
     return boots | ({int(last["boot_id"])} if last else set())
 
 
 async def _try_all(t: Trial, site: Site) -> None:
-    await t.hold()
+    await t.take_lease()
     if not await _two_banks(t):
         return
     try:
@@ -134,13 +135,13 @@ async def _boot_id(t: Trial) -> None:
 
 
 async def _two_banks(t: Trial) -> bool:
-    """Two memories, of which the one in force takes no writes. Only the table's number is another one meanwhile: it does not act."""
+    """Check that there are two banks and that the active one refuses writes. Only the table's number differs meanwhile: without effect."""
     image, c = t.base.image, t.controller
     now = await t.status()
     begin, end = 2 * ID_WORD, 2 * ID_WORD + 4
     number = image[begin:end]
     marked = image[:begin] + bytes(b ^ 0x5A for b in number) + image[end:]
-    why = await t.accepts(c.write_bank(1 - now.active_bank, marked))
+    why = await t.refusal_of(c.write_bank(1 - now.active_bank, marked))
     if why:
         t.fail("two_banks", f"the bank at rest takes no writes: {why}")
         return False
@@ -148,11 +149,11 @@ async def _two_banks(t: Trial) -> bool:
     t.judge(
         "two_banks", apart, "a write into the bank at rest is read from there and nowhere else", "a write into one bank is not kept apart"
     )
-    why = await t.accepts(c.write_bank(now.active_bank, number, first=ID_WORD))
+    why = await t.refusal_of(c.write_bank(now.active_bank, number, first=ID_WORD))
     t.judge("two_banks", bool(why), "the bank in force takes no writes", "the bank in force takes writes")
-    if not apart:  # the number is put back wherever it went
-        await t.accepts(c.write_bank(now.active_bank, number, first=ID_WORD))
-    why = await t.accepts(c.write_bank(1 - now.active_bank, image))
+    if not apart:  # restore the number wherever it was written
+        await t.refusal_of(c.write_bank(now.active_bank, number, first=ID_WORD))
+    why = await t.refusal_of(c.write_bank(1 - now.active_bank, image))
     return not why and apart
 
 
@@ -161,28 +162,28 @@ async def _generation(t: Trial) -> None:
     t.judge("generation", one.gen == two.gen, "it stands while nothing changes", "it changes although nothing was changed")
     for _ in range(2):
         gen = (await t.status()).gen
-        await t.accepts(t.write_again())
-        t.counted(gen, (await t.status()).gen, "a write")
+        await t.refusal_of(t.rewrite())
+        t.check_counted(gen, (await t.status()).gen, "a write")
 
 
 async def _lease(t: Trial) -> None:
     c = t.controller
-    await t.accepts(c.release(t.owner))
+    await t.refusal_of(c.release(t.owner))
     other = 1 - (await t.status()).active_bank
-    t.refused("lease", await t.accepts(c.seal(other, t.owner)), "to seal without the lease")
-    await t.accepts(t.write_again())
-    await t.hold()
+    t.expect_refusal("lease", await t.refusal_of(c.seal(other, t.owner)), "to seal without the lease")
+    await t.refusal_of(t.rewrite())
+    await t.take_lease()
     mine = (await t.status()).lease_owner == t.owner
-    t.judge("lease", mine, "it is told who has it", "it does not tell who has it")
-    t.refused("lease", await t.accepts(c.lease(t.stranger, 60_000, anyway=True)), "that a second owner takes it")
-    t.refused("lease", await t.accepts(c.release(t.stranger, anyway=True)), "that a second owner gives it away")
-    t.refused("lease", await t.accepts(c.seal(1 - (await t.status()).active_bank, t.stranger)), "that a second owner seals")
-    now = await t.sealed()
-    t.refused("lease", await t.activate(now, owner=t.stranger), "that a second owner activates")
-    now = await t.sealed()
-    await t.accepts(c.release(t.owner))
-    t.refused("lease", await t.activate(now), "to activate without the lease")
-    await t.accepts(c.lease(t.owner, SHORT_LEASE_MS))
+    t.judge("lease", mine, "the status names its owner", "the status does not name its owner")
+    t.expect_refusal("lease", await t.refusal_of(c.lease(t.stranger, 60_000, anyway=True)), "that a second owner takes it")
+    t.expect_refusal("lease", await t.refusal_of(c.release(t.stranger, anyway=True)), "that a second owner gives it away")
+    t.expect_refusal("lease", await t.refusal_of(c.seal(1 - (await t.status()).active_bank, t.stranger)), "that a second owner seals")
+    now = await t.seal_copy()
+    t.expect_refusal("lease", await t.activate(now, owner=t.stranger), "that a second owner activates")
+    now = await t.seal_copy()
+    await t.refusal_of(c.release(t.owner))
+    t.expect_refusal("lease", await t.activate(now), "to activate without the lease")
+    await t.refusal_of(c.lease(t.owner, SHORT_LEASE_MS))
     end_s = t.clock.monotonic_s() + RUNS_OUT_S
     while (await t.status()).lease_owner and t.clock.monotonic_s() < end_s:
         await t.clock.sleep(POLL_S)
@@ -190,42 +191,42 @@ async def _lease(t: Trial) -> None:
 
 
 async def _swap(t: Trial) -> None:
-    now = await t.sealed()
-    t.refused("swap_compares", await t.activate(now, crc=t.base.crc ^ 0xFFFF), "an activation with another CRC")
-    now = await t.sealed()
-    t.refused("swap_compares", await t.activate(now, gen=(now.gen - 1) % 2**32), "an activation with another generation")
-    before = await t.sealed()
-    await t.accepts(t.write_again())
-    await t.sealed()
-    t.refused("swap_compares", await t.activate(before), "an activation after the bank was written again")
+    now = await t.seal_copy()
+    t.expect_refusal("swap_compares", await t.activate(now, crc=t.base.crc ^ 0xFFFF), "an activation with another CRC")
+    now = await t.seal_copy()
+    t.expect_refusal("swap_compares", await t.activate(now, gen=(now.gen - 1) % 2**32), "an activation with another generation")
+    before = await t.seal_copy()
+    await t.refusal_of(t.rewrite())
+    await t.seal_copy()
+    t.expect_refusal("swap_compares", await t.activate(before), "an activation after the bank was written again")
 
 
 async def _right(t: Trial) -> None:
-    """The other half of every refusal: what is right is taken. Without it, a controller that takes nothing would be proved."""
-    now = await t.sealed()
+    """Check that a correct activation is accepted: otherwise a controller that refuses everything would pass."""
+    now = await t.seal_copy()
     other = 1 - now.active_bank
     why = await t.activate(now)
     after = await t.status()
     if after.active_bank == other:
-        t.note("swap_compares", "what is right is taken")
-        t.counted(now.gen, after.gen, "an activation")
+        t.note("swap_compares", "a correct activation is accepted")
+        t.check_counted(now.gen, after.gen, "an activation")
     elif after.bank_state[other] in (BankState.LAID_ASIDE, BankState.UNKNOWN):
-        t.note("swap_compares", "what is right is taken, to act after the next start")
-        await t.accepts(t.write_again())  # given up
+        t.note("swap_compares", "a correct activation is accepted, effective after the next start")
+        await t.refusal_of(t.rewrite())  # a write discards the laid-aside copy
     else:
-        t.fail("swap_compares", f"what is right is refused as well: {why or 'it was acknowledged, but nothing changed'}")
+        t.fail("swap_compares", f"a correct activation is refused as well: {why or 'it was acknowledged, but nothing changed'}")
 
 
 async def _put_back(t: Trial) -> None:
-    """The bank that was in force is so again; at least the same table is. The copy stays in the bank at rest, the lease is free."""
+    """Activate the original bank, or at least the same table. The copy stays in the inactive bank; the lease is free."""
     now = await t.status()
     if now.active_bank != t.base.status.active_bank or now.bank_crc[now.active_bank] != t.base.crc:
-        with suppress(Refused):  # then the same table acts, from the other bank
-            await t.activate(await t.sealed())
-    await t.accepts(t.controller.release(t.owner))
+        with suppress(Refused):  # the same table acts from the other bank
+            await t.activate(await t.seal_copy())
+    await t.refusal_of(t.controller.release(t.owner))
     now = await t.status()
     if now.lease_owner in (t.owner, t.stranger):
-        await t.accepts(t.controller.release(now.lease_owner))
+        await t.refusal_of(t.controller.release(now.lease_owner))
     in_force = await t.controller.read_bank(now.active_bank, len(t.base.image))
     if in_force != t.base.image:
-        raise TableMismatch("the table in force is not what it was before this test", "look at the controller; write the table anew")
+        raise TableMismatch("the table in force is not what it was before this test", "look at the controller; write the table again")

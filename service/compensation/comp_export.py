@@ -1,4 +1,4 @@
-"""From a stored solution to a control's table files, and from files to what they would do."""
+"""Export a stored solution as a control's table files, and read such files back."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ONLY_FRESH = "the tables hold for a machine that was measured without any: what 
 
 @dataclass(frozen=True)
 class Exported:
-    """Files for a control, the kinds of tables that were weighed against each other, and what a person has to know."""
+    """Files for a control, the kinds of tables that were compared, and notes for people."""
 
     files: tuple[TextFile, ...]
     choices: tuple[FormatChoice, ...]
@@ -50,7 +50,7 @@ def identified(doc: dict[str, Any]) -> Identified:
     Raises
     ------
     FileFormatError
-        The document holds no coefficients or no machine.
+        The document holds no coefficients, or no machine.
     """
     for key, what in (("prediction", "coefficients"), ("machine", "machine")):
         if not isinstance(doc.get(key), dict):
@@ -58,12 +58,12 @@ def identified(doc: dict[str, Any]) -> Identified:
     try:
         machine = machine_from_doc(doc["machine"])
         terms, coefficients, _ = stored_prediction(StoredPrediction.read(doc["prediction"]))
-        told = doc.get("parameters", {})
-        lost = {a: told.get(f"backlash_{a}", {}) for a in AXES}
-        seen = {a: float(v["value"]) for a, v in lost.items() if v and v["status"] != "not observable"}
+        parameters = doc.get("parameters", {})
+        lost = {a: parameters.get(f"backlash_{a}", {}) for a in AXES}
+        observed = {a: float(v["value"]) for a, v in lost.items() if v and v["status"] != "not observable"}
     except (ValueError, KeyError, TypeError) as error:
         raise FileFormatError(f"the solution cannot be read: {error}", "solve the campaign again: abbe solve") from None
-    return Identified(machine, terms, coefficients, seen)
+    return Identified(machine, terms, coefficients, observed)
 
 
 def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> dict[str, Any]:
@@ -88,12 +88,12 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
 
 
 def control_for(key: str) -> ControlModel:
-    """A control by its key, or a format by its: what a control with that format alone can do.
+    """A control by its key; for the key of a format, a control that has that format only.
 
     Raises
     ------
     FormatRefused
-        Neither of them.
+        There is neither.
     """
     if key in CONTROLS:
         return CONTROLS[key]
@@ -121,7 +121,7 @@ def control_for(key: str) -> ControlModel:
 
 
 def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> FormatSettings:
-    """What the writers need to know: reference, decimals of the control's unit, Fanuc's unit."""
+    """Settings for the writers: reference, decimals of the control's unit, Fanuc's unit."""
     x, y, z = (float(v) for v in reference_mm)
     return FormatSettings(
         reference_mm=(x, y, z),
@@ -137,29 +137,29 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
     Parameters
     ----------
     key : str
-        Of a format or a control.
+        Key of a format or of a control.
     reference_mm : array, shape (3,), optional
         Where the tables are zero; default: start of every stroke.
     fresh : bool
-        It is known that no correction was in force while the machine was measured (`abbe.service.tables.measured_with`).
+        No correction was in force while the machine was measured (`abbe.service.tables.measured_with`).
 
     Raises
     ------
     FormatRefused
-        No such format, or the tables do not fit it.
+        There is no such format, or the tables do not fit it.
     """
     control = control_for(key)
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     found = choices(known, control, reference)
     best = best_of(found)
     if best.numbers == 0:
-        raise FormatRefused(f"no kind of table of {control.name} leaves less than none", "the machine needs none; nothing was written")
+        raise FormatRefused(f"no kind of table of {control.name} reduces the errors", "the machine needs none; nothing was written")
     files = files_of(best.compensation, control, settings_for(control, known.machine, reference))
     return Exported(files, found, _notes(best.compensation, control, fresh=fresh))
 
 
 def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Each part in the format in which the control holds it."""
+    """Write each part in the format that the control uses for it."""
     own = Compensation(comp.own)
     cross = Compensation(comp.cross, comp.products)
     if control.own == control.cross:
@@ -181,8 +181,8 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[s
     out = [] if fresh else [ONLY_FRESH]
     lost = {a: v for a, v in comp.lost_motion_mm.items() if abs(v) > 0.5e-3 * 1e-3}
     if lost:
-        words = ", ".join(f"{a} {v * 1e3:.2f} µm" for a, v in lost.items())
-        out.append(f"lost motion is in no table: set the control's own backlash parameter ({words})")
+        values = ", ".join(f"{a} {v * 1e3:.2f} µm" for a, v in lost.items())
+        out.append(f"lost motion is in no table: set the control's own backlash parameter ({values})")
     for key in formats_in(control):
         form = FORMATS[key]
         out.append(f"{form.name}: {form.sign.evidence}; acts after: {form.live}")
@@ -195,29 +195,29 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[s
 
 
 def expected(known: Identified, control: ControlModel, reference_mm: F1 | None = None) -> Compensation:
-    """What an export to this control would have written, rounded as there, without what is no table."""
+    """What an export to this control would write, rounded alike; tables only."""
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     comp = best_of(choices(known, control, reference)).compensation
     return replace(rounded(comp, control.unit_mm), lost_motion_mm={})
 
 
 def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """Tables of one format, or of all the formats of a control together.
+    """Read the tables of one format, or of all formats of a control together.
 
     Raises
     ------
     TableFileError
-        A file is not what the control would read as a whole, or belongs to none of its formats.
+        The control would not read a file as a whole, or a file belongs to none of its formats.
     """
     control = control_for(key)
     tables: list[Any] = []
     out = Compensation()
     names = formats_in(control)
     for name in names:
-        mine = files if len(names) == 1 else tuple(f for f in files if belongs(f, name))
-        if not mine:
+        own_files = files if len(names) == 1 else tuple(f for f in files if belongs(f, name))
+        if not own_files:
             continue
-        part = format_of(name).read(mine, settings)
+        part = format_of(name).read(own_files, settings)
         tables += part.tables
         out = replace(out, products=out.products + part.products, lattice=out.lattice or part.lattice, motions=out.motions or part.motions)
     if not tables and not out.products and out.lattice is None and out.motions is None:
@@ -237,22 +237,22 @@ SUFFIXES = {
 
 
 def belongs(file: TextFile, key: str) -> bool:
-    """Whether a file of a control's folder is one of this format, by its name."""
+    """Whether a file in a control's folder has this format, by its name."""
     return file.name.lower().endswith(SUFFIXES.get(key, ""))
 
 
 def formats_in(control: ControlModel) -> tuple[str, ...]:
-    """Formats that a control reads; several tell their files apart by name, so they always go into a folder."""
+    """Formats that a control reads. Where there are several, file names distinguish them, so the files always go into a folder."""
     return tuple(dict.fromkeys(k for k in (control.own, control.cross, control.lattice, control.motions) if k))
 
 
 def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False) -> list[Path]:
-    """One file to ``out``; several, or with ``folder``, into a new folder ``out``: all of them or, after any mistake, none.
+    """Write one file to ``out``; several, or with ``folder``, into a new folder ``out``: all of them or, after any error, none.
 
     Raises
     ------
     FileFormatError
-        It cannot be written, or the folder is there already.
+        A file cannot be written, or the folder exists.
     """
     if len(files) == 1 and not folder:
         write_page(files[0].text, out)
@@ -277,12 +277,12 @@ def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False)
 
 
 def read_files(path: Path) -> tuple[TextFile, ...]:
-    """A file, or all files of a folder by name.
+    """Read a file, or all files of a folder in order of name.
 
     Raises
     ------
     FileFormatError
-        It is not there, too large, or no text.
+        A file is missing, too large, or no text.
     """
     try:
         paths = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")) if path.is_dir() else [path]
@@ -301,12 +301,12 @@ def read_files(path: Path) -> tuple[TextFile, ...]:
 
 
 def reference_of(text: str | None) -> F1 | None:
-    """``"0,-200,-300"`` as positions of X, Y, Z, mm; None for None.
+    """Parse ``"0,-200,-300"`` as positions of X, Y, Z, mm; None gives None.
 
     Raises
     ------
     FileFormatError
-        Not three numbers.
+        The text is not three numbers.
     """
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""Signing the files of an export, and judging files that are brought in: signed for this machine, or only a candidate."""
+"""Sign the files of an export, and judge imported files: signed for this machine, or a candidate only."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ LONGEST_DAYS = 366.0
 
 @dataclass(frozen=True, slots=True)
 class SealStatus:
-    """What files are worth: ``claims`` None: a candidate, to be looked at and compared, never to be pushed as it is."""
+    """The verdict on a signature. ``claims`` None: the files are a candidate, to be compared but never pushed as they are."""
 
     claims: Claims | None
     why: str
 
     @property
     def signed(self) -> bool:
-        """Whether everything was signed for this machine by somebody trusted, and still holds."""
+        """Whether a trusted person signed everything for this machine and the signature still holds."""
         return self.claims is not None
 
 
 @dataclass(frozen=True, slots=True)
 class SigningRequest:
-    """What the person who brings files in says: their format, whose signatures count besides the machine file's, the base in force."""
+    """What an import states: the format, trusted keys besides the machine file's, the base in force."""
 
     form: str
     trusted: tuple[str, ...] = ()
@@ -45,13 +45,13 @@ class SigningRequest:
 
 
 def signature_file(path: Path) -> Path:
-    """Where the signature of a file or folder lies: beside it."""
+    """Path of the signature, beside its file or folder."""
     return path.with_name(path.name + ".sig")
 
 
 @dataclass(frozen=True, slots=True)
 class TableSeal:
-    """How a person signs: his key, from now on for so many days, on which base."""
+    """How a person signs: key, days of validity from now, base."""
 
     key: Path
     days: float
@@ -59,16 +59,16 @@ class TableSeal:
 
 
 def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSeal) -> MachineFile:
-    """Everything that can speak against signing, before a file is written.
+    """Check everything that can prevent signing before any file is written.
 
     Raises
     ------
     KeyRefused, SignatureRefused
-        No key, no sensible span, no machine file, or the solution is of another machine.
+        There is no key, no valid span, no machine file, or the solution belongs to another machine.
     """
     read_key(seal.key)
     if config is None:
-        raise SignatureRefused("a signature is for a machine, and none is given", "give --machine FILE; nothing was written")
+        raise SignatureRefused("a signature needs a machine, and none is given", "give --machine FILE; nothing was written")
     if not 0 < seal.days <= LONGEST_DAYS:
         raise SignatureRefused(f"a signature cannot hold for {seal.days:g} days", f"more than 0, at most {LONGEST_DAYS:g}")
     name = doc["machine"].get("name")
@@ -80,12 +80,12 @@ def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSe
 
 
 def sign_files(out: Path, form: str, config: MachineFile, seal: TableSeal, now: datetime) -> Path:
-    """Sign the files at ``out``. Returns the file with the signature.
+    """Sign the files at ``out``; return the path of the signature.
 
     Raises
     ------
     KeyRefused, SignatureRefused, FileFormatError
-        No key, or a file cannot be read or written.
+        There is no key, or a file cannot be read or written.
     """
     span = (now, now + timedelta(days=seal.days))
     claims = claims_of(config.name, form, contents(out), seal.base, site_of(config).limits.digest(), span)
@@ -95,7 +95,7 @@ def sign_files(out: Path, form: str, config: MachineFile, seal: TableSeal, now: 
 
 
 def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None, ask: SigningRequest, now: datetime) -> SealStatus:
-    """What the files at ``path`` are worth, whose text was ``read`` already.
+    """Judge the signature of the files at ``path``, whose text is ``read``.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     if not seal.exists():
         return SealStatus(None, "not signed")
     if config is None:
-        return SealStatus(None, "signed, but for which machine has to be known: give --machine")
+        return SealStatus(None, "signed, but the machine is unknown: give --machine")
     try:
         sealed = read_plain(seal, LARGEST)
     except NotPlainError as error:
@@ -129,7 +129,7 @@ def contents(path: Path) -> dict[str, bytes]:
     Raises
     ------
     FileFormatError
-        One cannot be read.
+        A file cannot be read.
     """
     try:
         paths = sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith(".")) if path.is_dir() else [path]

@@ -1,6 +1,6 @@
-"""From an identification campaign, or a stored proposal, to a verified table: push, prove the sign, measure again, keep or go back.
+"""From an identification campaign, or a stored proposal, to a verified table: push, probe the sign, measure again, keep or roll back.
 
-`correct` is `proposals.make` and `push` in one go; both take the same way through the push machine, with the same questions.
+`correct` is `proposals.make` followed by `push`; both use the same push machine with the same questions.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.campaigns.measure import MeasureOptions, measure
-from abbe.service.compensation.gate import Admission, PushContext, admit, check_promise, ready
-from abbe.service.compensation.proposal_checks import HoldReason
+from abbe.service.compensation.gate import Admission, PushContext, admit, check_preconditions, check_promise
+from abbe.service.compensation.proposal_checks import PushPrecheck
 from abbe.service.compensation.proposals import (
-    Made,
+    StoredProposal,
     check_before_runs,
     check_same_table,
     check_temperature,
     gather,
     load_runs,
     make,
-    solved_again,
+    solve_again,
 )
 from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
@@ -40,18 +40,17 @@ from abbe.service.sequences.interlocks import Suspending
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.verification.verify import VerificationDecision, VerificationFigures, check_before, decide, figure_rows, figures
 
-UNSEEN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
+NO_NEWER_RUN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
 VERIFY, SIGN = "verify-after-push-", "sign-check"
 PLACES = 12
-"""Of the ball-bar, before and after a new table comes into force."""
+"""Places that the ball-bar reads before and after a new table comes into force."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What was solved, pushed and found. ``bank`` and ``image`` are what the controller holds active at the end.
+    """What was solved, pushed and measured. ``bank`` and ``image``: active in the controller at the end.
 
-    ``not_for_tables``: effects that the machine's model knows and that no table takes out, each with its remedy. ``proposal``: its number
-    in the store.
+    ``not_for_tables``: known effects that no table corrects, each with its remedy. ``proposal``: its number in the store.
     """
 
     solved: Solved
@@ -76,26 +75,24 @@ async def correct(
 
     Parameters
     ----------
-    context : PushContext
-        Devices, store and machine.
     campaign : str or int
         Identification campaign in the store.
     before : list of dict
         Verification runs measured with the present table, as ``abbe-run/1``.
     control : LevelStatus, optional
-        From `abbe.service.compensation.gate.ready`, where that was asked before; default: it is asked now.
+        Result of an earlier `abbe.service.compensation.gate.check_preconditions`. Default: it is called now.
 
     Raises
     ------
     TableRefused
-        A limit is broken, or the tables promise too little: nothing was written.
+        A limit is exceeded, or the tables promise too little: nothing was written.
     TableMismatch
         Runs were measured with another table than the active one, or the controller does not hold what was sent.
     StillActive
-        An unverified table could not be taken back yet.
+        An unverified table could not be rolled back yet.
     """
     store, site = context.store, context.site
-    control = control or await ready(context)
+    control = control or await check_preconditions(context)
     gathered = await gather(context.session.controller, store, site, campaign)
     check_same_table(gathered.base, before)
     check_temperature(site, gathered.runs)
@@ -105,52 +102,47 @@ async def correct(
 
 
 async def push(context: PushContext, admission: Admission, before: list[dict[str, Any]]) -> Correction:
-    """Push a stored proposal that the gate let pass (`abbe.service.compensation.gate.admit`), then as `correct`.
+    """Push an admitted proposal (`abbe.service.compensation.gate.admit`), then verify as `correct` does.
 
-    Parameters
-    ----------
-    context : PushContext
-        Devices, store and machine; who stops it, and whether a person attends.
-    admission : Admission
-        Of the proposal.
-    before : list of dict
-        Verification runs measured with the present table, as ``abbe-run/1``.
+    ``before``: verification runs measured with the present table, as ``abbe-run/1``.
 
     Raises
     ------
     TableRefused, TableMismatch, StillActive
-        As of `correct`.
+        As for `correct`.
     Stopped, Aborted
-        Asked for; the old table is in force.
+        A person asked for it; the old table is in force.
     """
-    proposed = admission.held.proposed
+    proposed = admission.precheck.proposed
     context.progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
-    made = Made(admission.held.number, proposed, await solved_again(context.store, context.site, proposed.campaign, proposed.base_tables))
+    made = StoredProposal(
+        admission.precheck.number, proposed, await solve_again(context.store, context.site, proposed.campaign, proposed.base_tables)
+    )
     await context.control.gate()
     return await _push(context, admission, made, before)
 
 
-async def _push(context: PushContext, admission: Admission, made: Made, before: list[dict[str, Any]]) -> Correction:
-    """Push an admitted proposal and verify it. Any interlock ends it: nothing waits while an unverified table is in force."""
-    session, store, proposed, held = context.session, context.store, made.proposed, admission.held
+async def _push(context: PushContext, admission: Admission, made: StoredProposal, before: list[dict[str, Any]]) -> Correction:
+    """Push an admitted proposal and verify it. Any interlock ends the push: an unverified table must not wait in force."""
+    session, store, proposed, precheck = context.session, context.store, made.proposed, admission.precheck
     site = replace(context.site, watching=replace(context.site.watching, suspending=Suspending()))
     context = replace(context, site=site)
-    check_same_table(held.base, before)
+    check_same_table(precheck.base, before)
     evidence = proposed.candidate.evidence
     newest_s = evidence.ended_s if evidence.last_s is None else evidence.last_s
-    check_before_runs(site, held.base, before, newest_s, context.clock.utc().timestamp())
+    check_before_runs(site, precheck.base, before, newest_s, context.clock.utc().timestamp())
     old = figures(before)
     check_before(old)
     helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
-    misfit_mm = None if helix is None else helix_misfit(made.solved, _as_solved(helix, made.solved, held.base.tables))
+    misfit_mm = None if helix is None else helix_misfit(made.solved, _as_other_runs(helix, made.solved, precheck.base.tables))
     bar = None
     if session.ballbar is not None and session.fixture is not None:
         number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns.all)) + 1
         bar = BarPlaces(session, store, site, context.progress, f"{SIGN} {number}", PLACES, context.control)
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
-    work = _Correcting(context, admission, misfit_mm, bar, old)
-    wanted = WantedTable(proposed.tables, held.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
+    work = _PushQuestions(context, admission, misfit_mm, bar, old)
+    wanted = WantedTable(proposed.tables, precheck.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
     pushed, after, decision = await _push_and_verify(work, wanted)
     bank = pushed.bank if decision.keep else pushed.previous_bank
     image = await session.controller.read_bank(bank)
@@ -160,8 +152,8 @@ async def _push(context: PushContext, admission: Admission, made: Made, before: 
     )
 
 
-def _as_solved(run: dict[str, Any], solved: Solved, table: NineTables | None) -> dict[str, Any]:
-    """A run as those that were solved were: less what the table in force did beyond its smooth corrections."""
+def _as_other_runs(run: dict[str, Any], solved: Solved, table: NineTables | None) -> dict[str, Any]:
+    """Prepare a run as the solved runs were: remove what the table in force did beyond its smooth corrections."""
     if table is None:
         return run
     lost = np.array([v for v, _ in solved.joint.backlash_mm().values()])
@@ -169,13 +161,13 @@ def _as_solved(run: dict[str, Any], solved: Solved, table: NineTables | None) ->
 
 
 @dataclass
-class _Correcting:
-    """Answers the push machine's questions about one proposal: are there reasons against it, goes the tool where it says, is it better?"""
+class _PushQuestions:
+    """Answers the push machine's questions on one proposal: reasons against it, sign probe, verification."""
 
     context: PushContext
     admission: Admission
     drift_mm: float | None
-    """What the solution leaves of the newest run, which it has not seen."""
+    """Residual of the solution in the newest run, from which it was not solved."""
     bar: BarPlaces | None
     before: VerificationFigures
     read_before: PlaceReadings | None = None
@@ -185,28 +177,28 @@ class _Correcting:
     pushing: Pushing | None = None
 
     @property
-    def held(self) -> HoldReason:
+    def precheck(self) -> PushPrecheck:
         """The proposal as it was admitted."""
-        return self.admission.held
+        return self.admission.precheck
 
-    def drifted(self) -> list[str]:
-        """Why the machine is not what was measured any more, by a run that was not known when the proposal was admitted."""
+    def drift_reasons(self) -> list[str]:
+        """Why the machine has drifted since it was measured, by a run that is newer than the admission."""
         if self.drift_mm is None:
-            return [UNSEEN]
+            return [NO_NEWER_RUN]
         return [reason] if (reason := drift_reason(self.drift_mm, self.context.site.limits)) else []
 
     def reasons(self) -> list[str]:
-        """Everything against it, asked by the push machine: decisions and time as they are by then."""
-        now = self.held.renewed(self.context.store, self.context.clock.utc().timestamp())
-        return [*now.reasons(self.drift_mm), *([UNSEEN] if self.drift_mm is None else [])]
+        """All reasons against the proposal with the present decisions and time."""
+        now = self.precheck.renewed(self.context.store, self.context.clock.utc().timestamp())
+        return [*now.reasons(self.drift_mm), *([NO_NEWER_RUN] if self.drift_mm is None else [])]
 
     async def probe(self) -> Verdict:
-        """Sign, axis and unit of this table, physically; the bar is taken out afterwards, for the verification mounts its own."""
+        """Probe sign, axis and unit of this table physically; then clear the bar away: the verification mounts its own."""
         if self.bar is None or self.read_before is None:
             return Verdict(True, "no ball-bar is configured: the sign rests on the commissioning")
         after = await self.bar.read("after")
         await self.bar.clear_away()
-        each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.held.base.tables, self.held.proposed.tables)
+        each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.precheck.base.tables, self.precheck.proposed.tables)
         found = probe(each, self.read_before.deviation_mm, after.deviation_mm)
         return Verdict(found.agrees, found.text + ("" if all(found.seen) else "; that rests on the commissioning"))
 
@@ -223,12 +215,12 @@ class _Correcting:
         return Verdict(self.decision.keep, self.decision.text)
 
 
-async def _push_and_verify(work: _Correcting, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:
-    """Push, prove the sign, measure again, keep or go back. Whatever stops it takes the old table back."""
+async def _push_and_verify(work: _PushQuestions, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:
+    """Push, probe, measure again, keep or roll back. Whatever stops it rolls back."""
     context = work.context
-    if drifted := work.drifted():  # before the ball-bar is read
-        raise TableRefused.because(drifted)
-    questions = Questions(work.reasons, work.held.by, work.probe, work.verify, work.held.approval(context.clock))
+    if drift_reasons := work.drift_reasons():  # before the ball-bar is read
+        raise TableRefused.because(drift_reasons)
+    questions = Questions(work.reasons, work.precheck.by, work.probe, work.verify, work.precheck.approval(context.clock))
     work.pushing = pushing = Pushing(
         context.session.controller, context.store, context.site,
         level=work.admission.level, attended=context.attended, control=context.control,
@@ -247,7 +239,7 @@ async def _push_and_verify(work: _Correcting, wanted: WantedTable) -> tuple[Push
     decision = work.decision if pushed.kept == work.decision.keep else VerificationDecision(pushed.kept, pushed.why)
     try:
         await _store_verification(context, work.verified_as, pushed, work.after, decision)
-    except AbbeError as error:  # what the control does is decided and done; only the note of it is missing
+    except AbbeError as error:  # the table is decided and acts; only the record is missing
         error.add_note(f"the table is {'kept and in force' if decision.keep else 'taken back'}: {decision.text}")
         raise
     return pushed, work.after, decision

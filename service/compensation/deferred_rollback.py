@@ -1,4 +1,4 @@
-"""An unverified table is still active because the way back is not open: wait until it is, and go it at that edge."""
+"""Deferred rollback: an unverified table is still active because the machine is not safe. Wait until it is, then roll back at once."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from abbe.service.storage.store import Store
 
 LIMIT_S = 600.0
 """How long a command waits by default."""
-POLL_S, REMIND_S, AGAIN_S = 0.1, 30.0, 2.0
-"""How often the controller is asked; how often a person is reminded; pause after a try that the controller did not let through."""
+POLL_S, REMIND_S, RETRY_S = 0.1, 30.0, 2.0
+"""Interval of looks at the controller; interval of reminders to a person; pause after the controller has refused a rollback."""
 
-Say = Callable[[str], None]
+Notify = Callable[[str], None]
 
 
-async def finish_when_safe(controller: TableController, store: Store, site: Site, *, limit_s: float, clock: Clock, say: Say) -> str | None:
-    """Wait until the machine is safe and the controller answers, then take the old table back at once.
+async def finish_when_safe(
+    controller: TableController, store: Store, site: Site, *, limit_s: float, clock: Clock, notify: Notify
+) -> str | None:
+    """Wait until the machine is safe and the controller answers, then roll back to the old table at once.
 
-    Nothing is reset and nothing moves: a person makes the machine ready. May be cancelled at any time; the next start of any command
-    tries again first, as always.
+    Nothing is reset and nothing moves: a person makes the machine ready. May be cancelled at any time; the next command tries again
+    before anything else.
 
     Parameters
     ----------
     limit_s : float
         How long to wait, seconds of the clock.
-    clock : Clock
-        Monotonic time.
-    say : callable
-        Hears, whenever it changes and every `REMIND_S`, that an unverified table is active, and what is waited for.
+    notify : callable
+        Receives a message that an unverified table is active and what blocks the rollback: on every change and every `REMIND_S`.
 
     Returns
     -------
@@ -55,25 +55,26 @@ async def finish_when_safe(controller: TableController, store: Store, site: Site
         return None
     port = ControllerPort(controller, no_actors(), clock)
     end_s = clock.monotonic_s() + limit_s
-    said, remind_s = "", 0.0
+    last_reason, remind_s = "", 0.0
     while True:
-        why, pause_s = _closed(await port.execute(Operation(OperationKind.LOOK), ())), POLL_S
+        why, pause_s = _blocked_by(await port.execute(Operation(OperationKind.LOOK), ())), POLL_S
         if not why:
             try:
                 return await finish_push(controller, store, site, clock)
             except StillActive as error:
-                why, pause_s = str(error), AGAIN_S
+                why, pause_s = str(error), RETRY_S
         now_s = clock.monotonic_s()
-        if why != said or now_s >= remind_s:
-            say(f"AN UNVERIFIED TABLE IS ACTIVE. Waiting for the machine, {max(end_s - now_s, 0.0):.0f} s more: {why}")
-            said, remind_s = why, now_s + REMIND_S
+        if why != last_reason or now_s >= remind_s:
+            notify(f"AN UNVERIFIED TABLE IS ACTIVE. Waiting for the machine, {max(end_s - now_s, 0.0):.0f} s more: {why}")
+            last_reason, remind_s = why, now_s + REMIND_S
         if now_s >= end_s:
             raise StillActive(f"the unverified table is STILL ACTIVE after {limit_s:.0f} s of waiting: {why}", READY)
         await clock.sleep(min(pause_s, end_s - now_s))
 
 
-def _closed(look: Outcome) -> str:
-    """Why the way back is not open, by one look; empty if it is."""
+def _blocked_by(look: Outcome) -> str:
+    """What blocks the rollback, by one look; empty if nothing does."""
     if isinstance(look, Done):
         return look.value.unsafe if isinstance(look.value, Truth) else "no answer"
-    return "the controller does not answer" if isinstance(look, Doubt) else look.text  # the link's own words count down: one line a look
+    # The message of the link counts down: its text would differ, and notify, at every look.
+    return "the controller does not answer" if isinstance(look, Doubt) else look.text

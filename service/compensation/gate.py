@@ -1,7 +1,7 @@
-"""The one gate before a table is measured for or pushed: all reasons against it, at once.
+"""The one gate in front of every push: it reports all reasons against a table at once.
 
-`ready` asks what holds for any table of this control, `admit` everything of one proposal. A push takes the `Admission` and cannot
-begin without it; only `admit` makes one.
+`check_preconditions` asks what holds for any table of this control, `admit` everything about one proposal. A push takes the `Admission`
+and cannot begin without it; only `admit` makes one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from abbe.models.compensation.tables import Predicted
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
-from abbe.service.compensation.proposal_checks import HoldReason, hold
+from abbe.service.compensation.proposal_checks import PushPrecheck, precheck
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proved_levels import LevelStatus, check_level
 from abbe.service.compensation.recover import recover
@@ -34,21 +34,9 @@ from abbe.service.storage.store import Store
 class PushContext:
     """What a push works with.
 
-    Parameters
-    ----------
-    session, store, site : Session, Store, Site
-        Open devices, database, machine.
-    progress : callable
-        Hears how far it is.
-    clock : Clock
-        Now.
-    rate_hz : int
-        Of the ball-bar, in verifications.
-    attended : bool
-        A person orders it. Else the limits of unattended pushes hold as well, and a person's approval is needed in any case.
-    control : Control
-        Who may stop or pause it. While a table is in force that nothing has verified it cannot be paused, and a stop takes the old
-        one back.
+    ``rate_hz``: of the ball-bar, in verifications. ``attended``: a person orders the push; otherwise the limits of unattended pushes hold
+    as well, and an approval is always needed. ``control``: stops or pauses the push; while an unverified table is in force the push cannot
+    be paused, and a stop rolls it back.
     """
 
     session: Session
@@ -63,70 +51,67 @@ class PushContext:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """The token of a push: a proposal that had no reason against it, with what its controller and people said then.
+    """The token of a push: a proposal with no reason against it, and the readings and decisions that this rests on.
 
-    ``level``: capability level of the controller (`abbe.service.push.levels`). ``hint``: what has to be said about the control; empty:
-    nothing.
+    ``level``: capability level of the controller (`abbe.service.push.levels`). ``hint``: a warning about the control for people, or empty.
     """
 
-    held: HoldReason
+    precheck: PushPrecheck
     level: int
     hint: str
 
 
-async def ready(context: PushContext) -> LevelStatus:
-    """Make sure that a table could be pushed into this control and verified; return what its commissioning has proved.
+async def check_preconditions(context: PushContext) -> LevelStatus:
+    """Check that this control can take a table and that the table could be verified; return its proved level.
 
     Raises
     ------
     TableRefused
-        It could not: its tables were never proved, it allows no such push.
+        The control was never commissioned, or allows no such push.
     AbbeError, DriverError
-        As of `recover` and `check_devices`.
+        From `recover` and `check_devices`.
     """
-    level, refused = await _control(context)
+    level, refused = await _check_control(context)
     if refused:
         raise _refused(refused)
     return level
 
 
 async def admit(context: PushContext, number: int, control: LevelStatus | None = None) -> Admission:
-    """Let a stored proposal pass if there is no reason against it now. Nothing is written.
+    """Admit a stored proposal if there is no reason against it now. Nothing is written.
 
-    What can change until the table is written is asked once more by the push machine (`abbe.service.push.machine`): bank and generation
-    of the table in force, the decisions of people, the age of the measurement.
+    The push machine (`abbe.service.push.machine`) checks again what can change before the table is written: bank and generation of the
+    table in force, decisions of people, age of the measurement.
 
     Parameters
     ----------
-    context : PushContext
-        Devices, store and machine.
     number : int
-        Of the proposal.
+        Number of the proposal.
     control : LevelStatus, optional
-        From `ready`, where that was asked before; default: it is asked now.
+        Result of an earlier `check_preconditions`. Default: it is called now.
 
     Raises
     ------
     TableRefused
-        All reasons against it.
+        With all reasons against it.
     StoreError
         There is no such proposal, or its row was changed.
     AbbeError, DriverError
-        As of `ready`.
+        From `check_preconditions`.
     """
-    level, refused = (control, []) if control is not None else await _control(context)
+    level, refused = (control, []) if control is not None else await _check_control(context)
     proposed = await asyncio.to_thread(load, context.store, number)
-    held = await hold(context.session.controller, context.store, context.site, number, proposed, context.clock, attended=context.attended)
-    reasons = held.reasons()
+    checked = await precheck(
+        context.session.controller, context.store, context.site, number, proposed, context.clock, attended=context.attended
+    )
+    reasons = checked.reasons()
     if refused or reasons:
         raise _refused(refused, reasons)
-    return Admission(held, level.level, level.hint)
+    return Admission(checked, level.level, level.hint)
 
 
-async def _control(context: PushContext) -> tuple[LevelStatus, list[TableRefused]]:
-    """What the control was proved to do, and why it takes no table. What an earlier push left is finished first, and every device that a
-    verification needs has answered.
-    """
+async def _check_control(context: PushContext) -> tuple[LevelStatus, list[TableRefused]]:
+    """Finish an interrupted push, check every device that a verification needs; return the proved level and the refusals."""
     session, store, site = context.session, context.store, context.site
     if not session.recovered:
         await recover(session.controller, store, site)
@@ -148,12 +133,12 @@ def _refused(refused: Sequence[TableRefused], reasons: Sequence[str] = ()) -> Ta
 
 
 def check_promise(predicted: Predicted, limits: PushLimits) -> None:
-    """Refuse what is not worth writing.
+    """Refuse tables that are not worth writing.
 
     Raises
     ------
     TableRefused
-        The model promises too little, by itself or beside its own uncertainty (`PushLimits`).
+        The promised improvement is too small, absolutely or against the uncertainty of the model (`PushLimits`).
     """
     no = promise_reason(predicted.before_mm, predicted.after_mm, predicted.u_model_mm, limits)
     if no:

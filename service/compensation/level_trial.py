@@ -1,6 +1,6 @@
-"""The bench of `commission_levels`: tries one thing on a controller and notes whether it was refused.
+"""One trial of `commission_levels`: attempt an operation on a controller and record whether it was refused.
 
-`while_moving` asks whether it refuses an activation while an axis moves: one slow move of a few millimetres, up if there is room, and back.
+`while_moving` checks that an activation is refused while an axis moves: one slow move of a few millimetres, up if there is room, and back.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FLAG = "interlocks"
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class Observation:
     """One observation, for or against a flag of `Capabilities`."""
 
     flag: str
@@ -43,12 +43,10 @@ class Trial:
     ----------
     controller : Controller
         Identified.
-    clock : Clock
-        For waiting.
     base : Base
-        The table in force when the test began; all copies are of it.
+        The table in force when the test began; every copy is one of it.
     owner, stranger : int
-        Two owners of the lease.
+        Owner ids of the lease: this test, and a second owner that must be shut out.
     """
 
     controller: Controller
@@ -56,64 +54,64 @@ class Trial:
     base: Base
     owner: int
     stranger: int
-    shown: list[Shown] = field(default_factory=list)
+    shown: list[Observation] = field(default_factory=list)
     boots: set[int] = field(default_factory=set)
 
     def note(self, flag: str, what: str) -> None:
-        """Something speaks for a flag."""
-        self.shown.append(Shown(flag, True, what))
+        """Record an observation for a flag."""
+        self.shown.append(Observation(flag, True, what))
 
     def fail(self, flag: str, what: str) -> None:
-        """Note a reason against a flag."""
-        self.shown.append(Shown(flag, False, what))
+        """Record an observation against a flag."""
+        self.shown.append(Observation(flag, False, what))
 
     def judge(self, flag: str, ok: bool, good: str, bad: str) -> None:
-        """Something speaks for or against a flag."""
-        self.shown.append(Shown(flag, ok, good if ok else bad))
+        """Record an observation for (``ok``) or against a flag."""
+        self.shown.append(Observation(flag, ok, good if ok else bad))
 
-    def refused(self, flag: str, why: str, what: str) -> None:
-        """Note whether what must not happen was refused (``why``, empty when it was accepted)."""
+    def expect_refusal(self, flag: str, why: str, what: str) -> None:
+        """Record whether a forbidden operation was refused; ``why``: the refusal, empty if it was accepted."""
         self.judge(flag, bool(why), f"refuses {what}", f"accepts {what}")
 
-    def counted(self, before: int, after: int, what: str) -> None:
-        """Note whether the generation counted one change."""
+    def check_counted(self, before: int, after: int, what: str) -> None:
+        """Record whether the generation counted exactly one change."""
         self.judge("generation", after == (before + 1) % 2**32, f"counts {what}", f"does not count {what} ({before} → {after})")
 
-    def proved(self, flag: str) -> bool:
-        """Whether something speaks for a flag and nothing against it."""
+    def is_proved(self, flag: str) -> bool:
+        """Whether there is an observation for a flag and none against it."""
         of_it = [s.ok for s in self.shown if s.flag == flag]
         return bool(of_it) and all(of_it)
 
     async def status(self) -> CompStatus:
-        """The banks now."""
+        """The present state of the banks; also collects the boot id."""
         now = await self.controller.comp_status()
         self.boots.add(now.boot_id)
         return now
 
-    async def accepts(self, call: Awaitable[None]) -> str:
-        """Do something; why it was refused, empty when it was not."""
+    async def refusal_of(self, call: Awaitable[None]) -> str:
+        """Attempt an operation; return the refusal, empty if it was accepted."""
         try:
             await call
         except Refused as error:
             return error.detail
         except DeviceFault:
-            return ""  # acknowledged, whatever became of it
+            return ""  # acknowledged, whatever followed
         return ""
 
-    async def write_again(self) -> None:
-        """Write into the bank at rest, in one request, what it holds."""
+    async def rewrite(self) -> None:
+        """Write one register pair of the inactive bank again with its own content."""
         other = 1 - (await self.status()).active_bank
         await self.controller.write_bank(other, self.base.image[2 * ID_WORD : 2 * ID_WORD + 4], first=ID_WORD)
 
-    async def hold(self) -> None:
-        """Have the lease, also where a controller let a second owner take it."""
-        if await self.accepts(self.controller.lease(self.owner, LEASE_MS)):
-            await self.accepts(self.controller.release(self.stranger))
+    async def take_lease(self) -> None:
+        """Take the lease, also from a second owner that the controller wrongly accepted."""
+        if await self.refusal_of(self.controller.lease(self.owner, LEASE_MS)):
+            await self.refusal_of(self.controller.release(self.stranger))
             await self.controller.lease(self.owner, LEASE_MS)
 
-    async def sealed(self) -> CompStatus:
-        """Have the lease, and the copy sealed in the bank at rest; the banks then."""
-        await self.hold()
+    async def seal_copy(self) -> CompStatus:
+        """Take the lease and seal the copy in the inactive bank; return the state of the banks."""
+        await self.take_lease()
         now = await self.status()
         other = 1 - now.active_bank
         if now.bank_state[other] is not BankState.SEALED or now.bank_crc[other] != self.base.crc:
@@ -122,29 +120,29 @@ class Trial:
             gen = (await self.status()).gen
             await self.controller.seal(other, self.owner)
             now = await self.status()
-            self.counted(gen, now.gen, "a seal")
+            self.check_counted(gen, now.gen, "a seal")
         return now
 
     async def activate(self, now: CompStatus, *, crc: int | None = None, gen: int | None = None, owner: int | None = None) -> str:
-        """Try to bring the copy into force, right or wrong; why it was refused, empty when it was not."""
+        """Attempt to activate the copy, with right or wrong arguments; return the refusal, empty if it was accepted."""
         call = self.controller.activate(
             1 - now.active_bank,
             expect_crc=self.base.crc if crc is None else crc,
             expect_gen=now.gen if gen is None else gen,
             owner=self.owner if owner is None else owner,
         )
-        return await self.accepts(call)
+        return await self.refusal_of(call)
 
 
 async def while_moving(t: Trial, site: Site) -> None:
-    """Try the right activation while an axis moves, there or back; in the end the axis stands where it was.
+    """Attempt a correct activation while an axis moves; afterwards the axis is back where it was.
 
-    An answer that comes when the axis has arrived shows nothing: then it is tried again on the way back, `TRIES` times in all.
+    An answer after the axis has arrived shows nothing: the attempt is repeated on the way back, at most `TRIES` times in all.
     """
     status = await t.controller.status()
     trouble = tripped(status)
     if trouble is not None:
-        t.fail(FLAG, f"it could not be tried, no axis may move: {trouble.detail}")
+        t.fail(FLAG, f"not tried, no axis may move: {trouble.detail}")
         return
     x, y, z = (round(v, 5) for v in status.position_mm)
     home, there, why_not = (x, y, z), away(site, (x, y, z)), ""
@@ -154,15 +152,15 @@ async def while_moving(t: Trial, site: Site) -> None:
             if not why_not:
                 break
         else:
-            t.fail(FLAG, f"it could not be tried: {why_not}")
+            t.fail(FLAG, f"not tried: {why_not}")
         await t.controller.move(home, feed_mm_min=10.0 * FEED_MM_MIN, timeout_s=MOVE_LIMIT_S)
     except (Refused, DeviceFault) as error:
-        t.fail(FLAG, f"the axis did not move as it was told: {error.detail}")
+        t.fail(FLAG, f"the axis did not move as commanded: {error.detail}")
 
 
 async def _on_the_way(t: Trial, target: Point) -> str:
-    """One slow move, and what happens to an activation meanwhile; why nothing was shown, empty when something was."""
-    now = await t.sealed()
+    """Move slowly and attempt an activation meanwhile; return why this showed nothing, empty if it did."""
+    now = await t.seal_copy()
     move = asyncio.ensure_future(t.controller.move(target, feed_mm_min=FEED_MM_MIN, timeout_s=MOVE_LIMIT_S))
     try:
         if not await _moves(t, move):
@@ -171,16 +169,16 @@ async def _on_the_way(t: Trial, target: Point) -> str:
         why = await t.activate(now)
         still = (await t.controller.status()).moving
         await move
-        if not still:  # taken or refused: whether it still moved then is not known
+        if not still:  # accepted or refused: it is unknown whether the axis still moved then
             return "the axis had arrived before the answer"
-        t.refused(FLAG, why, "an activation while an axis moves")
+        t.expect_refusal(FLAG, why, "an activation while an axis moves")
     finally:
         await run_to_end(_stop(t, move))
     return ""
 
 
 def away(site: Site, home: Point) -> Point:
-    """Where to move: along the upright axis in its positive sense, where the tool goes away from the table; down where it is at its top."""
+    """Target of the move: up along the vertical axis, away from the table; down if the axis is at its top."""
     axis = AXES.index(str(site.doc.get("vertical_axis", "Z")))
     target = list(home)
     room = float(site.machine.stroke_mm[axis, 1]) - home[axis]
@@ -198,10 +196,10 @@ async def _moves(t: Trial, move: asyncio.Future[ControllerStatus]) -> bool:
 
 
 async def _stop(t: Trial, move: asyncio.Future[ControllerStatus]) -> None:
-    """Broken off in the middle: nothing moves on, and nothing waits for a release of the feed."""
+    """Abort an interrupted move: no axis moves on, and no feed hold stays on."""
     if move.done():
         if not move.cancelled():
-            move.exception()  # the one who broke off says why
+            move.exception()  # the interrupting error is the one to raise
         return
     move.cancel()
     await asyncio.wait([move])

@@ -1,4 +1,4 @@
-"""A rollback that a person orders of the service: `rollback`, with the machine alone, and only of the table that he has seen in force."""
+"""A rollback that a person orders from the service. It locks the machine and touches only the table that the person saw in force."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from abbe.drivers.api import TableController
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
 from abbe.service.compensation.deferred_rollback import LIMIT_S, finish_when_safe
-from abbe.service.compensation.rollback import Ordered, rollback
+from abbe.service.compensation.rollback import RollbackRequest, rollback
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.job_state import JobOutcome
@@ -20,56 +20,56 @@ from abbe.service.tables.push_journal import STOPPED, JournalView
 
 
 @dataclass(frozen=True, slots=True)
-class BackOrder:
-    """What is ordered: the table of push ``push``, in force with ``crc``, goes; the one before comes."""
+class RollbackOrder:
+    """The order: replace the table of push ``push``, in force with ``crc``, by the table before it."""
 
     push: int
     crc: int
-    ordered: Ordered
+    request: RollbackRequest
 
 
-async def ordered_rollback(site: Site, store: Store, order: BackOrder, *, clock: Clock) -> JobOutcome:
-    """Take the table back. What is returned is what was heard; which table is in force says the journal (`JournalView.of_order`).
+async def ordered_rollback(site: Site, store: Store, order: RollbackOrder, *, clock: Clock) -> JobOutcome:
+    """Roll back. The outcome reports this attempt; the journal decides which table is in force (`JournalView.of_order`).
 
-    A refusal is an outcome, not an error: another process has the machine, the controller holds what the journal does not know, or the
-    journal moved on since the order was given.
+    A refusal is an outcome, not an error: another process has the machine, the controller holds a table unknown to the journal, or the
+    journal moved on after the order was given.
     """
     try:
         with lock_machine(site.urls.cnc):
             async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
-                return await _heard(session.controller, store, site, order, clock)
+                return await _attempt(session.controller, store, site, order, clock)
     except MachineInUse as busy:
         return JobOutcome("refused", f"{busy}; nothing was written")
     except (AbbeError, DriverError, OSError) as error:
-        return JobOutcome("failed", _told(error))
+        return JobOutcome("failed", _with_notes(error))
 
 
-async def _heard(controller: TableController, store: Store, site: Site, order: BackOrder, clock: Clock) -> JobOutcome:
-    control = order.ordered.control
+async def _attempt(controller: TableController, store: Store, site: Site, order: RollbackOrder, clock: Clock) -> JobOutcome:
+    control = order.request.control
     try:
         await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
-        back = await rollback(controller, store, site, ordered=order.ordered)
+        back = await rollback(controller, store, site, request=order.request)
     except (TableRefused, TableMismatch) as no:
-        return JobOutcome("refused", _told(no))
+        return JobOutcome("refused", _with_notes(no))
     except StillActive as open_:
-        return await _finished(controller, store, site, order, open_, clock)
+        return await _finish_when_safe(controller, store, site, order, open_, clock)
     except MachineInUse:
         raise
     except (AbbeError, DriverError, OSError) as error:
-        return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", _told(error))
+        return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", _with_notes(error))
     if back is None:
         return JobOutcome("refused", "the table from before is in force already; nothing was written")
     text = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
     return JobOutcome("kept", f"{text}; the machine is unverified now: run a quick check")
 
 
-def check_unchanged(store: Store, machine: str, order: BackOrder, control: str = "") -> None:
-    """Refuse an order that was given in view of another table than the one in force by the journal now.
+def check_unchanged(store: Store, machine: str, order: RollbackOrder, control: str = "") -> None:
+    """Refuse an order that was given for another table than the one that the journal has in force now.
 
     Raises
     ------
     TableRefused
-        It was, or nothing can be taken back any more.
+        The tables differ, or there is nothing left to roll back.
     """
     now = JournalView.read(store, machine, control).offer()
     if (now.push, now.crc) != (order.push, order.crc):
@@ -79,17 +79,17 @@ def check_unchanged(store: Store, machine: str, order: BackOrder, control: str =
         )
 
 
-async def _finished(
-    controller: TableController, store: Store, site: Site, order: BackOrder, error: StillActive, clock: Clock
+async def _finish_when_safe(
+    controller: TableController, store: Store, site: Site, order: RollbackOrder, error: StillActive, clock: Clock
 ) -> JobOutcome:
-    """The rollback broke off, and the way back from it is not open now: go it as soon as it is."""
-    finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, say=lambda _: None)
+    """The rollback broke off and the machine is not safe: finish it as soon as it is."""
+    finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, notify=lambda _: None)
     try:
-        done = await order.ordered.control.unless_stopped(finish)
+        done = await order.request.control.unless_stopped(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return JobOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back before the next check")
-    return JobOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+        return JobOutcome("failed", f"{_with_notes(error)}; {_with_notes(again)}; the rollback runs before the next check")
+    return JobOutcome("rolled back", f"{_with_notes(error)}; {done or 'nothing was left to roll back'}")
 
 
-def _told(error: BaseException) -> str:
+def _with_notes(error: BaseException) -> str:
     return "; ".join([str(error), *getattr(error, "__notes__", [])])

@@ -1,4 +1,4 @@
-"""What a person decides about a stored proposal: approve it or reject it. Both are possible only while it waits for a push."""
+"""A person approves or rejects a stored proposal. Both are possible only while it waits for a push."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def approve(store: Store, number: int, name: str, hours: float, clock: Clock, ac
     Parameters
     ----------
     account : str, optional
-        By which account; default: that of this command line.
+        The approver's account. Default: that of this command line.
 
     Raises
     ------
     TableRefused
-        All reasons against it: it does not wait for a push, there were reasons when it was proposed, its measurement is too old, or the
-        approver is the proposer where two people are needed.
+        With all reasons: it does not wait for a push, it was proposed with reasons against it, its measurement is too old, or the approver
+        is the proposer where two people are needed.
     StoreError
         There is no such proposal, or its row was changed.
     """
@@ -49,7 +49,7 @@ def approve(store: Store, number: int, name: str, hours: float, clock: Clock, ac
 
 
 def _against_approval(number: int, proposed: Proposed, name: str, now_s: float) -> Iterator[tuple[str, str]]:
-    """Each reason against an approval, with its remedy."""
+    """Yield each reason against an approval with its remedy."""
     if proposed.reasons:
         yield f"proposal {number} has reasons against it and cannot be approved: {proposed.reasons[0]}", "propose again"
     if now_s >= proposed.valid_until_s:
@@ -59,7 +59,7 @@ def _against_approval(number: int, proposed: Proposed, name: str, now_s: float) 
 
 
 def reject(store: Store, number: int, name: str, reason: str, clock: Clock, account: str | None = None) -> ProposalRejection:
-    """Reject a proposal for good: it cannot be approved or pushed any more, whatever approvals it has. Tables have to be proposed anew.
+    """Reject a proposal for good: whatever approvals it has, it can no longer be approved or pushed. New tables need a new proposal.
 
     Raises
     ------
@@ -76,12 +76,12 @@ def reject(store: Store, number: int, name: str, reason: str, clock: Clock, acco
 
 
 def check_waiting(store: Store, number: int, proposed: Proposed, now_s: float) -> None:
-    """Refuse a decision about a proposal that no push waits for.
+    """Refuse a decision on a proposal that does not wait for a push.
 
     Raises
     ------
     TableRefused
-        Where it stands instead.
+        Names its present status.
     """
     now = proposal_status(store, number, proposed, now_s)
     if now.word not in ("proposed", "approved", "refused"):  # `approve` names the reasons against a refused one

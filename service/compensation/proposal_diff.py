@@ -1,4 +1,4 @@
-"""How two sets of tables differ: nine curves on one grid, largest change and where, and the report that shows them."""
+"""How two sets of tables differ: nine curves on one grid, the largest change with its place, and a report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEADINGS = ("table", "old max (µm)", "new max (µm)", "largest change (µm)", "
 
 @dataclass(frozen=True, slots=True)
 class TableDifference:
-    """What is compared with what, and the nine tables."""
+    """The names of the two sets and their nine curves."""
 
     new: str
     old: str
@@ -33,7 +33,7 @@ def compare(store: Store, number: int, with_what: str) -> TableDifference:
     Raises
     ------
     TableRefused
-        There is nothing of that name, or it is another machine's.
+        There is no such table or proposal, or it belongs to another machine.
     """
     proposed = load(store, number)
     if with_what.upper() == ACTIVE:
@@ -50,7 +50,7 @@ def compare(store: Store, number: int, with_what: str) -> TableDifference:
 
 
 def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
-    """Nine tables against nine others; None: against no correction."""
+    """Compare nine tables with nine others on the new grid; ``old`` None: with no correction."""
     found = []
     for a, moved in enumerate(AXES):
         grid = new.position_mm[a]
@@ -63,13 +63,13 @@ def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
 
 
 def rows(found: TableDifference) -> list[tuple[str, ...]]:
-    """One line per table, for people; U is k = 2."""
+    """One row of text per table, µm; U is k = 2."""
     out: list[tuple[str, ...]] = []
     for c in found.curves:
         k, change = c.worst, c.change_mm
-        figures = (_um(np.abs(c.old_mm).max()), _um(np.abs(c.new_mm).max()), f"{change[k] * 1e3:+.2f}", _um(2.0 * c.u_mm[k]))
+        values = (_um(np.abs(c.old_mm).max()), _um(np.abs(c.new_mm).max()), f"{change[k] * 1e3:+.2f}", _um(2.0 * c.u_mm[k]))
         rms = float(np.sqrt(np.mean(change**2)))
-        out.append((f"{c.corrected} over {c.moved}", *figures, f"{c.position_mm[k]:g}", _um(rms)))
+        out.append((f"{c.corrected} over {c.moved}", *values, f"{c.position_mm[k]:g}", _um(rms)))
     return out
 
 
@@ -78,12 +78,12 @@ def largest(found: TableDifference) -> str:
     c = max(found.curves, key=lambda one: abs(one.change_mm[one.worst]))
     k = c.worst
     size, expanded = c.change_mm[k] * 1e3, 2e3 * c.u_mm[k]
-    where = f"in the table of {c.corrected} over {c.moved} at {c.position_mm[k]:g} mm"
-    return f"largest change: {size:+.2f} µm (U = {expanded:.2f} µm, k = 2) {where}"
+    place = f"in the table of {c.corrected} over {c.moved} at {c.position_mm[k]:g} mm"
+    return f"largest change: {size:+.2f} µm (U = {expanded:.2f} µm, k = 2) {place}"
 
 
 def diff_report(found: TableDifference, proposed: Proposed) -> Document:
-    """What a proposal changes: numbers and picture."""
+    """The report of what a proposal changes: numbers and curves."""
     p = proposed.predicted
     lead = (
         f"{proposed.candidate.machine}: {found.new}, made from campaign {proposed.campaign} by {proposed.by} at {proposed.utc}.",

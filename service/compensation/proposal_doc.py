@@ -1,4 +1,4 @@
-"""A proposal of tables as a plain document, and back: everything that is needed to judge it and to push it, and nothing else."""
+"""A proposal of tables as a JSON document: everything that is needed to judge it and to push it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FORMAT = "abbe-proposal/1"
 
 @dataclass(frozen=True, slots=True)
 class BaseMark:
-    """The table in force when it was proposed, and the controller's generation and boot id then."""
+    """The table in force when the proposal was made, with the controller's generation and boot id."""
 
     image: Annotated[bytes, BeforeValidator(bytes.fromhex)]
     bank: int
@@ -40,32 +40,30 @@ def _arrays(lists: object) -> tuple[F2, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Proposed:
-    """Tables that somebody proposed.
+    """Proposed tables.
 
     Parameters
     ----------
     machine : dict
         The machine object (run-format.md 1).
     campaign, solution_id : str, int
-        What the tables follow from.
+        Source of the tables.
     candidate : Candidate
-        The absolute tables in whole units of the controller (mm), what they change, evidence, digest.
+        The absolute tables in whole units of the controller (mm), their change, evidence, digest.
     u_mm : tuple of three arrays
         Standard uncertainty of every entry, as in `NineTables`.
-    base : BaseMark
-        On which table, in which state of the controller.
     image_id : int
         Number inside the image: an approval binds its bytes.
     limits : PushLimits
-        Under which it was checked.
+        Limits of the check that gave ``reasons``.
     two_people : bool
-        Somebody else has to approve it.
+        A second person has to approve it.
     by, utc : str
-        Who proposed it (account), when.
+        Account of the proposer, and time.
     reasons : tuple of str
-        The reasons against it then.
+        Reasons against it when it was proposed.
     not_for_tables : tuple of str
-        Known effects that no table takes out.
+        Known effects that no table corrects.
     """
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
@@ -93,7 +91,7 @@ class Proposed:
 
     @property
     def base_tables(self) -> NineTables | None:
-        """The tables in force when it was proposed; None for no correction."""
+        """The tables in force when the proposal was made; None for no correction."""
         return tables_from_image(self.base.image)
 
     @property
@@ -104,16 +102,16 @@ class Proposed:
 
     @property
     def image(self) -> bytes:
-        """The bytes that are to be pushed."""
+        """The bytes to be pushed."""
         return encode(table_image(self.tables, self.candidate.lsb_nm, self.image_id))
 
     @property
     def valid_until_s(self) -> float:
-        """When the measurement becomes too old, UTC."""
+        """When the measurement becomes too old, seconds UTC."""
         return self.candidate.evidence.ended_s + self.limits.age_h * 3600.0
 
     def binding(self, expiry: str) -> str:
-        """What an approval until ``expiry`` binds: exactly this table on exactly this base, for this machine, under these limits."""
+        """Digest that an approval until ``expiry`` binds: this table on this base, for this machine, under these limits."""
         machine, limits = self.candidate.machine, self.limits.digest()
         return approval_digest(self.image, base_image=self.base.image, machine=machine, limits=limits, expiry=expiry)
 
@@ -124,7 +122,7 @@ def digest_of_doc(doc: Doc) -> str:
 
 
 def doc_of(proposed: Proposed) -> Doc:
-    """The document; what is no finite number is written as text."""
+    """The document of a proposal; non-finite numbers are written as text."""
     doc = {
         "format": FORMAT,
         "machine": proposed.machine,
@@ -155,7 +153,7 @@ def _plain(value: Any) -> Any:
 
 
 def proposed_from(doc: Doc) -> Proposed:
-    """Read a document that `doc_of` wrote; ValueError where it is none."""
+    """Read a document that `doc_of` wrote; raises ValueError if it is none."""
     return _PROPOSED.validate_python(doc)
 
 
@@ -168,7 +166,7 @@ def load(store: Store, number: int) -> Proposed:
     Raises
     ------
     StoreError
-        There is none of this number, or its row is not what was stored.
+        There is none of this number, or its row was changed.
     """
     record = store.proposals.get(number)
     try:

@@ -1,4 +1,4 @@
-"""Where a proposal stands, from what is written down: its row, its approvals, and the push journal. Nothing of it is kept twice."""
+"""The status of a proposal, derived from its row, its approvals and the push journal. It is stored nowhere else."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from abbe.service.tables.push_journal import KIND, JournalView
 
 @dataclass(frozen=True, slots=True)
 class ProposalStatus:
-    """One word and one sentence. Words: refused, rejected, proposed, approved, expired, superseded, pushed, kept, rolled back."""
+    """A status word and one sentence. Words: refused, rejected, proposed, approved, expired, superseded, pushed, kept, rolled back."""
 
     word: str
     text: str
 
 
 def proposal_status(store: Store, number: int, proposed: Proposed, now_s: float, journal: JournalView | None = None) -> ProposalStatus:
-    """Where a stored proposal stands; ``journal``: of its machine, where it was read before."""
+    """The status of a stored proposal. ``journal``: that of its machine, if the caller has read it already."""
     journal = journal or JournalView.read(store, proposed.candidate.machine)
     return status_of_proposal(number, proposed, store.proposals.approvals(number), store.proposals.rejections(number), journal, now_s)
 
@@ -36,7 +36,7 @@ def status_of_proposal(
     journal: JournalView,
     now_s: float,
 ) -> ProposalStatus:
-    """The same from plain values."""
+    """The status of a proposal from plain values; reads no store."""
     own = [push for push in journal.pushes.values() if journal.origin(push).proposal == number]
     if own:
         found = _pushed(own[-1], journal)
@@ -58,7 +58,7 @@ def status_of_proposal(
 
 
 def _pushed(own: Journal, journal: JournalView) -> ProposalStatus | None:
-    """How its last push ended; None if it came to nothing before the new table was in force."""
+    """How the proposal's last push ended; None if that push ended before the new table was in force."""
     last, f = own[-1], facts(own)
     if last.state in (PushState.REJECTED, PushState.ABORTED):
         return None

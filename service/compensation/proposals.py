@@ -1,7 +1,8 @@
-"""From an identification campaign to a stored proposal: what was measured with the table in force, solved, with the reasons against it.
+"""From an identification campaign to a stored proposal: solve the runs, add the tables in force, collect the reasons against it.
 
-A machine that is measured while a table is active shows what that table has left. So the table that was active is read from the controller,
-must be the one all runs were measured with, and the new table is the old one plus what the runs still show. Nothing is written to it.
+A machine that is measured with a table active shows the errors that this table leaves. The active table is therefore read from the
+controller, must be the one of all runs, and the new table is the old one plus what the runs still show. Nothing is written to the
+controller.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from abbe.drivers.api import TableController, TableFormat
 from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.candidates import Promise, candidate_of, scene_of
+from abbe.service.compensation.candidates import Promise, candidate_context, candidate_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
@@ -41,7 +42,7 @@ GRID = (25, 21, 19)
 
 @dataclass(frozen=True)
 class Proposal:
-    """Tables that a campaign proposes, absolute and quantised, and what they promise."""
+    """Tables that follow from a campaign, absolute and quantised, and the model's prediction."""
 
     solved: Solved
     tables: NineTables
@@ -50,8 +51,8 @@ class Proposal:
 
 
 @dataclass(frozen=True)
-class Gathered:
-    """A campaign's complete runs, and the table in force, which all of them were measured with."""
+class GatheredCampaign:
+    """A campaign's complete runs and the table in force, with which all of them were measured."""
 
     campaign: CampaignRecord
     records: list[RunRecord]
@@ -61,15 +62,15 @@ class Gathered:
 
 
 @dataclass(frozen=True)
-class Made:
-    """A stored proposal and the solution that it follows from."""
+class StoredProposal:
+    """A stored proposal, its number and its solution."""
 
     number: int
     proposed: Proposed
     solved: Solved
 
 
-async def gather(controller: TableController, store: Store, site: Site, campaign: str | int) -> Gathered:
+async def gather(controller: TableController, store: Store, site: Site, campaign: str | int) -> GatheredCampaign:
     """Read a campaign and the table in force.
 
     Raises
@@ -77,7 +78,7 @@ async def gather(controller: TableController, store: Store, site: Site, campaign
     TableMismatch
         A run was measured with another table.
     TableRefused
-        The campaign is another machine's.
+        The campaign belongs to another machine.
     """
     record = await asyncio.to_thread(store.campaigns.find, campaign)
     measured_on = (await asyncio.to_thread(store.machines.get, record.machine_id)).name
@@ -89,47 +90,47 @@ async def gather(controller: TableController, store: Store, site: Site, campaign
     runs = await load_runs(store, [r.id for r in records])
     base = await read_base(controller)
     check_same_table(base, [r for r in runs if r["role"] == "identify"])
-    return Gathered(record, records, runs, base, await controller.table_format())
+    return GatheredCampaign(record, records, runs, base, await controller.table_format())
 
 
 async def make(
     store: Store,
     site: Site,
-    gathered: Gathered,
+    gathered: GatheredCampaign,
     *,
     clock: Clock | None = None,
     progress: ProgressSink,
     agree: Callable[[Predicted], None] = lambda _: None,
     by: str = "",
-) -> Made:
-    """Solve, and store what follows as a proposal, with every reason against it now.
+) -> StoredProposal:
+    """Solve, and store the tables as a proposal together with every present reason against it.
 
-    ``agree``: sees what is promised; what it raises is raised, and nothing is stored. ``by``: who proposes; default: whose process it is.
+    ``agree`` receives the prediction; if it raises, nothing is stored. ``by``: the proposer; default: the account of this process.
     """
     clock = clock or SystemClock()
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
     name, base, form = gathered.campaign.name, gathered.base, gathered.form
-    known = await asyncio.to_thread(_without, store, name, base.tables)
+    known = await asyncio.to_thread(_campaign_without_known_effects, store, name, base.tables)
     proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm)
     agree(proposal.predicted)
     doc = solution_doc(proposal.solved) | known.doc | {"machine": site.doc}
     solution_id = await store.write(store.solutions.add, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
     promise = Promise(proposal.tables, proposal.change, proposal.predicted, None, *_ends_s(gathered.records))
     candidate = candidate_of(site, promise, base, known.campaign.runs, form)
-    scene = await scene_of(site, store, base, form, proposal.tables, clock)
+    context = await candidate_context(site, store, base, form, proposal.tables, clock)
     status = base.status
     proposed = Proposed(
         site.doc, name, solution_id, candidate, proposal.tables.u_mm,
         BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
-        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, scene, site.limits)), known.lines,
+        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)), known.lines,
     )  # fmt: skip
     plain = doc_of(proposed)
     number = await store.write(store.proposals.add, site.name, solution_id, plain, digest_of_doc(plain))
-    return Made(number, proposed, proposal.solved)
+    return StoredProposal(number, proposed, proposal.solved)
 
 
 def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
-    """When the oldest and the newest of the runs that identify ended, UTC; 0 if one does not say so."""
+    """End of the oldest and of the newest identifying run, seconds UTC; 0 if a run does not state it."""
     used = [datetime.fromisoformat(r.ended_utc).timestamp() if r.ended_utc else 0.0 for r in records if r.role == "identify"]
     return min(used, default=0.0), max(used, default=0.0)
 
@@ -142,28 +143,28 @@ def propose(site: Site, runs: list[dict[str, Any]], base: Base, lsb_nm: int) -> 
     return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted)
 
 
-async def solved_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:
-    """The solution that a stored proposal follows from: needed to ask what a newer run says of it. ``table``: in force when measured."""
-    known = await asyncio.to_thread(_without, store, campaign, table)
+async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:
+    """Solve the campaign of a stored proposal again, to compare it with a newer run. ``table``: the one in force when measured."""
+    known = await asyncio.to_thread(_campaign_without_known_effects, store, campaign, table)
     return await asyncio.to_thread(solve_runs, site, known.campaign.runs)
 
 
-def _without(store: Store, name: str, table: NineTables | None) -> TakenOut:
+def _campaign_without_known_effects(store: Store, name: str, table: NineTables | None) -> TakenOut:
     return taken_out(store, from_store(store, name), TableThen(table))
 
 
 def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
-    """Every run must have been measured with the table that is active now.
+    """Check that every run was measured with the table that is active now.
 
     Raises
     ------
     TableMismatch
-        Which run was not, or does not say so.
+        Names a run that was not, or that does not state its table.
     """
     for run in runs:
-        seen = run.get("table", {}).get("crc")
-        if seen != base.crc:
-            with_what = "does not say with which table it was measured" if seen is None else f"was measured with table {seen:08X}"
+        crc = run.get("table", {}).get("crc")
+        if crc != base.crc:
+            with_what = "does not say with which table it was measured" if crc is None else f"was measured with table {crc:08X}"
             raise TableMismatch(f"run {run['run_id']} {with_what}; active is {base.crc:08X}", "measure again with the present table")
         if base.tables is not None and run["table"].get("acting") is False:
             why = f"run {run['run_id']} was measured while table {base.crc:08X} did not act: the compensation was switched off"
@@ -171,12 +172,12 @@ def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
 
 
 def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
-    """Tables hold at the temperature they were measured at: outside of the allowed window none is pushed.
+    """Check that every run was measured inside the allowed air temperatures: tables hold only near their own.
 
     Raises
     ------
     TableRefused
-        Which run, which temperature.
+        Names the run and its temperature.
     """
     low, high = site.temperature_c
     for run in runs:
@@ -189,7 +190,7 @@ def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
 
 
 def check_certificates(site: Site) -> None:
-    """Without a certificate of any instrument nothing will be pushed: said before an hour is measured for it.
+    """Check that an instrument has a certificate, before an hour is spent on measuring: without any, nothing can be pushed.
 
     Raises
     ------
@@ -203,7 +204,7 @@ def check_certificates(site: Site) -> None:
 
 
 def login() -> str:
-    """The account of the user of this command line."""
+    """The account that runs this command line."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a service account without a name
@@ -211,27 +212,24 @@ def login() -> str:
 
 
 def by_whom() -> str:
-    """Who ordered a table from this command line."""
+    """The account that orders a table from this command line, as the journal names it."""
     return f"{login()}, by the command line"
 
 
 async def load_runs(store: Store, run_ids: list[int]) -> list[dict[str, Any]]:
-    """Runs of the store as ``abbe-run/1`` objects, read off the event loop; ``stored`` says when each ended."""
+    """Load runs as ``abbe-run/1`` objects off the event loop; key ``stored`` holds the end of each."""
     return await asyncio.to_thread(lambda: [load_run(store, k) | {"stored": {"ended_utc": store.runs.find(k).ended_utc}} for k in run_ids])
 
 
 def check_before_runs(site: Site, base: Base, runs: list[dict[str, Any]], since_s: float, now_s: float) -> None:
-    """A verification to compare with has to be of this machine as it is now: after the identification, and since the last start.
+    """Check that verification runs describe this machine as it is now: after identification, and since the control's last start.
 
-    Parameters
-    ----------
-    since_s, now_s : float
-        End of the newest run that identifies, and now, UTC.
+    ``since_s``, ``now_s``: end of the newest identifying run, and now, seconds UTC.
 
     Raises
     ------
     TableRefused
-        Which run is not, and why.
+        Names a run that does not, and why.
     """
     low, high = site.temperature_c
     for run in runs:

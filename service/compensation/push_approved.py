@@ -1,7 +1,7 @@
-"""A proposal that a person approved, pushed by the service where the machine file says so: through the same gate, unattended.
+"""The service pushes an approved proposal unattended, where the machine file allows it, through the same gate as any push.
 
-Nobody attends means: the control was proved to level 3, the approval of a person holds (also where no second one is demanded), the last
-push is long enough ago, and the table has not walked away. The verification before is measured now.
+An unattended push needs a control proved to level 3, a valid approval (even where two people are not demanded), enough time since the
+last push, and tables that have not drifted too far in 30 days. The verification before the push is measured now.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from abbe.service.tables.push_journal import STOPPED
 from abbe.service.verification.alarm_states import NO_ALARM, AlarmKind
 
 WAIT_S = 600.0
-"""How long to watch a machine that does not let the old table back at once; then the service retries, and reports it."""
+"""How long to wait for a machine on which the rollback is blocked; then the service reports it and retries."""
 
 Begun = Callable[[], Awaitable[None]]
-"""Called, at least once, when the machine is ours and the try counts."""
+"""Called at least once when this process has locked the machine: from then on the attempt counts."""
 
 
 @dataclass(frozen=True, slots=True)
-class Approved:
-    """A proposal that waits for the service: its number, the approval that holds, and the alarm that asked for it (0: none)."""
+class ApprovedProposal:
+    """A proposal that waits for the service: its number, its valid approval, and the alarm that caused it (0: none)."""
 
     proposal: int
     approval: int
@@ -51,7 +51,7 @@ class Approved:
 
 @dataclass(frozen=True, slots=True)
 class PushOrder:
-    """One try: which proposal, what to call when it has begun, who hears of its progress, and who may stop it."""
+    """One attempt: proposal number, callbacks for its begin and its progress, and the control that may stop it."""
 
     proposal: int
     begun: Begun
@@ -59,10 +59,10 @@ class PushOrder:
     control: Control
 
 
-def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord], now_s: float) -> Approved | None:
-    """The proposal that was approved last, if the service has not tried it yet with this approval; None: nothing waits.
+def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord], now_s: float) -> ApprovedProposal | None:
+    """The proposal that was approved last, if the service has not tried it with this approval; None: nothing waits.
 
-    Older approved ones are not tried in its place: the last approval is the one that is meant.
+    Older approved proposals are not tried in its place: the last approval supersedes them.
     """
     tried = {e.doc.get("approval") for e in entries if e.kind == AlarmKind.PUSHING}
     asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
@@ -72,57 +72,57 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
     approval, number = max(given)
     try:
         word = proposal_status(store, number, load(store, number), now_s).word
-    except StoreError:  # a row that was changed: its screen says so, and it is never pushed
+    except StoreError:  # a changed row: its page reports it, and it is never pushed
         return None
     if word == "approved" and approval not in tried:
-        return Approved(number, approval, asked.get(number, NO_ALARM))
+        return ApprovedProposal(number, approval, asked.get(number, NO_ALARM))
     return None
 
 
 async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Clock, rate_hz: int = 100) -> JobOutcome:
-    """Verify with the table in force, push, prove, verify again; keep or go back. A refusal is an outcome, not an error.
+    """Verify with the table in force, push, probe, verify again; keep or roll back. A refusal is an outcome, not an error.
 
-    What is returned is what was heard; which table is in force says the journal (`JournalView.of_proposal`).
+    The outcome reports this attempt; the journal decides which table is in force (`JournalView.of_proposal`).
 
     Raises
     ------
     MachineInUse
-        Another process has the machine: nothing was begun, and the try does not count.
+        Another process has the machine: nothing was begun, and the attempt does not count.
     """
     with lock_machine(site.urls.cnc):
         try:
             async with recovered_session(store, site) as session:
                 await order.begun()
                 context = PushContext(session, store, site, order.progress, clock, rate_hz, attended=False, control=order.control)
-                return await _heard(context, order)
+                return await _attempt(context, order)
         except MachineInUse:
             raise
-        except (AbbeError, DriverError, OSError) as error:  # the devices, before anything of it was begun
+        except (AbbeError, DriverError, OSError) as error:  # the devices failed before the push began
             await order.begun()
-            return JobOutcome("failed", _told(error))
+            return JobOutcome("failed", _with_notes(error))
 
 
-async def _heard(context: PushContext, order: PushOrder) -> JobOutcome:
+async def _attempt(context: PushContext, order: PushOrder) -> JobOutcome:
     try:
         return await _pushed(context, order)
     except TakenBack as back:
-        return JobOutcome("rolled back", _told(back))
+        return JobOutcome("rolled back", _with_notes(back))
     except TableRefused as no:
-        return JobOutcome("refused", _told(no))
+        return JobOutcome("refused", _with_notes(no))
     except StillActive as open_:
-        return await _back(context, order, open_)
+        return await _finish_when_safe(context, order, open_)
     except (AbbeError, DriverError, OSError) as error:
-        return JobOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _told(error))
+        return JobOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _with_notes(error))
 
 
 async def _pushed(context: PushContext, order: PushOrder) -> JobOutcome:
     context.control.now(State.RUNNING)
     admission = await admit(context, order.proposal)  # before anything is measured for it
-    done = await push(context, admission, await _before(context, order))
+    done = await push(context, admission, await _verify_before(context, order))
     return JobOutcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
 
 
-async def _before(context: PushContext, order: PushOrder) -> list[dict[str, Any]]:
+async def _verify_before(context: PushContext, order: PushOrder) -> list[dict[str, Any]]:
     site = context.site
     name = f"verify-before proposal {order.proposal} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
     plan = paced(verification(site.machine, rate_hz=context.rate_hz, name=name), site.max_feed_mm_min)
@@ -131,16 +131,18 @@ async def _before(context: PushContext, order: PushOrder) -> list[dict[str, Any]
     return await load_runs(context.store, ids)
 
 
-async def _back(context: PushContext, order: PushOrder, error: StillActive) -> JobOutcome:
-    """Watch the machine until the old table is back. A stop does not end that; after an abort the service goes back to it."""
-    said: list[str] = []
-    finish = finish_when_safe(context.session.controller, context.store, context.site, limit_s=WAIT_S, clock=context.clock, say=said.append)
+async def _finish_when_safe(context: PushContext, order: PushOrder, error: StillActive) -> JobOutcome:
+    """Wait until the old table is in force again. A stop does not end the wait; after an abort the service resumes it later."""
+    messages: list[str] = []
+    finish = finish_when_safe(
+        context.session.controller, context.store, context.site, limit_s=WAIT_S, clock=context.clock, notify=messages.append
+    )
     try:
         done = await order.control.unless_aborted(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return JobOutcome("failed", f"{_told(error)}; {_told(again)}; it is taken back as soon as it can be")
-    return JobOutcome("rolled back", f"{_told(error)}; {done or 'nothing was left to take back'}")
+        return JobOutcome("failed", f"{_with_notes(error)}; {_with_notes(again)}; it is taken back as soon as it can be")
+    return JobOutcome("rolled back", f"{_with_notes(error)}; {done or 'nothing was left to roll back'}")
 
 
-def _told(error: BaseException) -> str:
+def _with_notes(error: BaseException) -> str:
     return "; ".join([str(error), *getattr(error, "__notes__", [])])

@@ -1,6 +1,6 @@
-"""One table's way into a controller, as a job asks for it: the push machine (`abbe.service.push`) with this job's questions and errors.
+"""Push one table for a job: run the push machine (`abbe.service.push`) with the job's questions, and translate its end into errors.
 
-The machine runs in a task of its own: a job that is cancelled meanwhile waits until nothing unverified is in force, and ends then.
+The machine runs in a task of its own: a cancelled job ends only when no unverified table is in force.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from abbe.service.tables.nine_tables import table_image
 from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed, push_log
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
-NOT_TO_BE_TRUSTED = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"
-PERHAPS = f"a new table that was not verified may be in force; {MAKE_READY}"
+UNTRUSTED_CONTROL = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"
+MAY_BE_ACTIVE = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
-AGAIN_S = 2.0
-"""How long after a push that was given up after its activation was sent the controller is asked again what is in force."""
+RECHECK_S = 2.0
+"""Pause before the second look at the controller after a push that was given up with its activation sent."""
 STILL_S, STILL_POLL_S, STILL_LIMIT_S = 1.2, 0.05, 15.0
-"""How long the axes have to stand before a table may change; how often that is asked, and for how long."""
+"""How long the axes have to stand before a table may change; interval and limit of waiting for it."""
 
 _under_way: set[tuple[str, str]] = set()
-"""Controls into which this process pushes now, by database and control (or name, where no address is given)."""
+"""Controls into which this process is pushing, by database and control (by name if no address is given)."""
 
 
 @dataclass(frozen=True, slots=True)
 class WantedTable:
-    """A table that shall come into force: absolute corrections in the controller's unit, on which base, and what is kept about it.
+    """A new table to push: absolute corrections in the controller's unit, its base, and its document for the store.
 
-    ``image_id``: number inside the image, drawn by lot if None; given where the image was approved before.
+    ``image_id``: number inside the image; None draws a random one. An approved image needs the approved number.
     """
 
     tables: NineTables
@@ -66,11 +66,11 @@ class WantedTable:
 
 
 @dataclass(frozen=True, slots=True)
-class WantedAgain:
-    """A table that was in force before, byte for byte: ``image``, and what it meant when it was read or written (``meaning``)."""
+class RestoredTable:
+    """A table to restore, byte for byte. ``semantic_digest``: of its meaning when it was read or written."""
 
     image: bytes
-    meaning: str
+    semantic_digest: str
     base: Base
     doc: Doc
     solution_id: int | None = None
@@ -78,11 +78,11 @@ class WantedAgain:
 
 @dataclass(frozen=True, slots=True)
 class Questions:
-    """What a job answers while its table is on the way.
+    """A job's answers to the questions of the push machine.
 
-    ``validate``: reasons against the table, without touching the controller; ``approved_by``: who agreed to it. ``probe`` and ``verify``
-    move the machine; what they raise leads back like a no, and is raised again afterwards. ``approval``: given before, for exactly this
-    image on exactly this base; None: the one who ordered the push approves it.
+    ``validate``: reasons against the table, without touching the controller; ``approved_by``: the approver. ``probe`` and ``verify`` move
+    the machine; an error in them rolls back like a no and is raised again afterwards. ``approval``: given earlier for exactly this image on
+    exactly this base; None: the person who ordered the push approves it.
     """
 
     validate: Callable[[], list[str]]
@@ -109,7 +109,7 @@ class PushResult:
 
 @dataclass
 class Pushing:
-    """Brings one table into a controller."""
+    """Pushes one table into a controller."""
 
     controller: TableController
     store: Store
@@ -119,47 +119,48 @@ class Pushing:
     """Capability level of the controller; None: what its commissioning has proved."""
     attended: bool = True
     control: Control = field(default_factory=Control)
-    """Who may stop it: what is active and not verified goes back then. A pause is waited for before anything is written, and not after."""
+    """Stops or pauses the push: a stop rolls an unverified table back; a pause takes effect only before anything is written."""
     crc: int | None = None
-    """Of the image on its way, from `bring` on."""
+    """CRC of the pushed image, from `bring` on."""
     _stop: str = ""
     _question: asyncio.Task[Verdict] | None = None
     _error: BaseException | None = None
     _notes: list[str] = field(default_factory=list)
 
-    async def bring(self, wanted: WantedTable | WantedAgain, questions: Questions) -> PushResult:
-        """Push, prove, verify; keep or go back.
+    async def bring(self, wanted: WantedTable | RestoredTable, questions: Questions) -> PushResult:
+        """Push, probe, verify; keep or roll back.
 
         Raises
         ------
         TableRefused
             There are reasons against the table; nothing was written.
         PushNotBegun
-            It came to nothing before it was in force; the old table is in force.
+            The push ended before the new table was in force; the old table is in force.
         StillActive
             The old table could not be made active again (yet).
         TableMismatch
-            The controller holds what the journal does not know, or activated what it had refused; or encoding is not what the tables mean.
+            The controller holds a table unknown to the journal, or activated one after refusing it; or the image does not mean what the
+            tables do.
         MachineInUse, UnsafeToMove
-            Another push on this machine is under way, or has not come to an end.
+            Another push on this machine is under way or unfinished.
         Stopped, Aborted
-            Asked for before anything was written.
+            A person asked for it before anything was written.
         StoreError
             The journal cannot be written. A note says whether the new table may be in force.
         asyncio.CancelledError
-            When nothing is on its way any more; a note says which table is in force.
+            Raised only after the push has ended; a note names the table in force.
         """
         order = await self._order(wanted)
-        key = _place(self.store, self.site)
+        key = _control_key(self.store, self.site)
         if key in _under_way:
             raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
         _under_way.add(key)
-        # First pauses are closed, then an earlier one is waited for: none can come between and hold an unverified table in force.
+        # Refuse new pauses first, then wait for a pending one: no pause can come between and hold an unverified table in force.
         self.control.no_pause_reason = "a table that nobody has verified may be in force: stop it, or let it end"
         try:
             await self.control.gate()
             book = await StoreBook.new(self.store, self.site.name, self.clock, self.site.control)
-            await self._stand_still()
+            await self._wait_for_standstill()
             ended = await self._drive(book, order, wanted, questions)
             await self._look_again(ended)
         finally:
@@ -167,7 +168,7 @@ class Pushing:
             self.control.no_pause_reason = ""
         return self._outcome(ended)
 
-    async def _order(self, wanted: WantedTable | WantedAgain) -> OperationOrder:
+    async def _order(self, wanted: WantedTable | RestoredTable) -> OperationOrder:
         form = await self.controller.table_format()
         image, meaning = _image(wanted)
         if len(image) > 2 * form.bank_registers:
@@ -182,8 +183,8 @@ class Pushing:
             process=asdict(this_process()), control=self.site.control,
         )  # fmt: skip
 
-    async def _stand_still(self) -> None:
-        """Wait until the axes have stood long enough; the machine of the push judges, this only keeps it from being asked too early."""
+    async def _wait_for_standstill(self) -> None:
+        """Wait until the axes have stood long enough; the push machine decides, this only avoids a premature refusal."""
         end_s = self.clock.monotonic_s() + STILL_LIMIT_S
         while self.clock.monotonic_s() < end_s:
             status = await self.controller.status()
@@ -191,10 +192,10 @@ class Pushing:
                 return
             await self.clock.sleep(STILL_POLL_S)
 
-    async def _drive(self, book: StoreBook, order: OperationOrder, wanted: WantedTable | WantedAgain, questions: Questions) -> Ended:
-        """Let the machine run in a task of its own; a cancellation is raised when it has come to its end, and says what is in force."""
-        port = ControllerPort(self.controller, self._people(wanted, questions), self.clock)
-        task = asyncio.ensure_future(execute.push(port, book, order, stop=self._told_to_stop))
+    async def _drive(self, book: StoreBook, order: OperationOrder, wanted: WantedTable | RestoredTable, questions: Questions) -> Ended:
+        """Run the machine in a task of its own; a cancellation is raised after its end, with a note on the table in force."""
+        port = ControllerPort(self.controller, self._actors(wanted, questions), self.clock)
+        task = asyncio.ensure_future(execute.push(port, book, order, stop=self._stop_reason))
         cancelled: asyncio.CancelledError | None = None
         while not task.done():
             try:
@@ -216,38 +217,38 @@ class Pushing:
         return task.result()
 
     async def _look_again(self, ended: Ended) -> None:
-        """A control that refused the activation, or was fenced off, must not do it all the same a moment later.
+        """Check that a control that refused the activation, or was fenced off, has not activated the table afterwards.
 
         Raises
         ------
         TableMismatch
-            It did.
+            It has.
         """
         if ended.state is not PushState.ABORTED or PushState.ACTIVATING not in {entry.state for entry in ended.journal}:
             return
         known = facts(ended.journal)
-        await self.clock.sleep(AGAIN_S)
-        with suppress(DriverError):  # nothing was activated as far as the controller said; the next command looks again
+        await self.clock.sleep(RECHECK_S)
+        with suppress(DriverError):  # the controller reported no activation; the next command looks again
             now = await self.controller.comp_status()
             if now.bank_crc[now.active_bank] == known.crc != known.base_crc:
-                said = f"push {ended.journal[-1].push} was given up ({known.why})"
-                why = f"{said}, and the control made its table active all the same"
-                raise TableMismatch(f"{why}: {STILL_ACTIVE} (CRC {known.crc:08X})", NOT_TO_BE_TRUSTED)
+                given_up = f"push {ended.journal[-1].push} was given up ({known.why})"
+                why = f"{given_up}, and the control made its table active all the same"
+                raise TableMismatch(f"{why}: {STILL_ACTIVE} (CRC {known.crc:08X})", UNTRUSTED_CONTROL)
 
-    def _told_to_stop(self) -> str:
+    def _stop_reason(self) -> str:
         return self._stop or ("stopped by a person" if self.control.stopping or self.control.aborting else "")
 
     async def _failed(self, port: ControllerPort, book: StoreBook, failed: BaseException) -> BaseException:
-        """The journal could not be written, or there is a defect: try the way back once, and say how that ended."""
+        """After a journal error or a defect: try recovery once and note on the error how that ended."""
         try:
             ended = await run_to_end(execute.recover(port, book))
-        except Exception as again:  # noqa: BLE001 - whatever it is, the first failure is the one to be heard, with what is known
-            failed.add_note(f"{PERHAPS} ({again})")
+        except Exception as again:  # noqa: BLE001 - the first failure is raised in any case, with what is known
+            failed.add_note(f"{MAY_BE_ACTIVE} ({again})")
             return failed
-        failed.add_note(PERHAPS if not ended.settled or ended.state is PushState.OPERATOR else "the old table is in force")
+        failed.add_note(MAY_BE_ACTIVE if not ended.settled or ended.state is PushState.OPERATOR else "the old table is in force")
         return failed
 
-    def _people(self, wanted: WantedTable | WantedAgain, questions: Questions) -> PushActors:
+    def _actors(self, wanted: WantedTable | RestoredTable, questions: Questions) -> PushActors:
         async def validate(journal: Journal) -> list[str]:
             known = facts(journal)
             if known.base_crc != wanted.base.crc or known.base_image != wanted.base.image:
@@ -264,20 +265,20 @@ class Pushing:
             return Approval(digest, questions.approved_by, expiry, self.clock.monotonic_s() + APPROVED_S)
 
         async def probe(journal: Journal) -> Verdict:
-            return await self._ask(questions.probe)
+            return await self._run_question(questions.probe)
 
         async def verify(journal: Journal) -> Verdict:
-            return await self._ask(questions.verify)
+            return await self._run_question(questions.verify)
 
         return PushActors(validate, approve, probe, verify)
 
-    async def _ask(self, question: Callable[[], Awaitable[Verdict]]) -> Verdict:
-        """Let the job measure; whatever stops it is an answer, and is raised again when the old table is in force."""
+    async def _run_question(self, question: Callable[[], Awaitable[Verdict]]) -> Verdict:
+        """Let the job measure. An error counts as a no and is raised again when the old table is in force."""
 
         async def ask() -> Verdict:
             return await question()
 
-        if stop := self._told_to_stop():  # heard before anything of this question has moved
+        if stop := self._stop_reason():  # before this question has moved anything
             return Verdict(False, stop)
         self._question = asyncio.ensure_future(ask())
         try:
@@ -298,14 +299,14 @@ class Pushing:
         return Verdict(False, str(error) or type(error).__name__)
 
     def _keep_notes(self, task: asyncio.Task[Verdict]) -> None:
-        """What a stopped measurement has to say, e.g. that the stop could not be delivered."""
+        """Keep the notes of a stopped measurement, e.g. that the stop could not be delivered."""
         try:
             task.result()
         except asyncio.CancelledError as error:
             self._notes += getattr(error, "__notes__", [])
 
     def _outcome(self, ended: Ended) -> PushResult:
-        """What a job hears, with all notes of its own error."""
+        """The result or error of the push, with all notes of the job's own error."""
         try:
             return self._pushed(ended)
         except AbbeError as error:
@@ -315,7 +316,7 @@ class Pushing:
             raise
 
     def _pushed(self, ended: Ended) -> PushResult:
-        """What a job hears."""
+        """The result of an ended push, or the error that it stands for."""
         known = facts(ended.journal)
         why = known.why or ended.why
         detail = str(self._error) if self._error is not None else why
@@ -339,16 +340,16 @@ class Pushing:
         raise PushNotBegun(f"the table was not brought into force: {why}", "the old table is in force; look at the cause, then push again")
 
 
-def _image(wanted: WantedTable | WantedAgain) -> tuple[bytes, str]:
-    """What the controller is to hold, and the digest of what it means, which does not come from it."""
-    if isinstance(wanted, WantedAgain):
-        return wanted.image, wanted.meaning
+def _image(wanted: WantedTable | RestoredTable) -> tuple[bytes, str]:
+    """The image to push and the semantic digest, which is computed independently of the image."""
+    if isinstance(wanted, RestoredTable):
+        return wanted.image, wanted.semantic_digest
     number = secrets.randbits(31) if wanted.image_id is None else wanted.image_id
     return encode(table_image(wanted.tables, wanted.lsb_nm, number)), semantic_digest_of_tables(wanted.tables)
 
 
 def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
-    """What the one who stopped it has to know."""
+    """The note for the person who cancelled: which table is in force."""
     if ended is None:
         return f"{failed}; {'; '.join(getattr(failed, '__notes__', []))}"
     if ended.state is PushState.KEEP:
@@ -363,8 +364,8 @@ def _after_cancel(ended: Ended | None, failed: BaseException | None) -> str:
 
 def pushes_here(store: Store, site: Site) -> bool:
     """Whether this process is pushing into a machine's control now."""
-    return _place(store, site) in _under_way
+    return _control_key(store, site) in _under_way
 
 
-def _place(store: Store, site: Site) -> tuple[str, str]:
+def _control_key(store: Store, site: Site) -> tuple[str, str]:
     return str(store.url), site.control or site.name

@@ -1,4 +1,4 @@
-"""Before anything moves: finish what an interrupted push left behind. An unverified table does not stay active (unconfirmed means back)."""
+"""Recovery before anything moves: finish an interrupted push. An unverified table does not stay active (unconfirmed means rollback)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMisma
 from abbe.service.push import execute
 from abbe.service.push.adapter import ControllerPort, no_actors
 from abbe.service.push.book import StoreBook
-from abbe.service.push.entries import WORD, Journal, facts
+from abbe.service.push.entries import NO_PUSH, Journal, facts
 from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -27,29 +27,29 @@ READY = "make the machine ready (interlocks, link), then start again"
 
 
 async def recover(controller: TableController, store: Store, site: Site, *, accept_by: str = "") -> str | None:
-    """Finish what the last push left open, and take over what interrupted runs left; returns what was done in a sentence or two, or None.
+    """Finish the last push and ingest what interrupted runs left; return what was done in a sentence or two, or None.
 
-    Everything that moves the machine, or builds on its table, calls this first (tests/service/devices/test_every_session.py).
+    Everything that moves the machine, or relies on its table, calls this first (tests/service/devices/test_every_session.py).
 
     Parameters
     ----------
     accept_by : str
-        Who vouches for a table in force that this database did not push; empty: no person does.
+        Person who vouches for a table in force that this database did not push; empty: nobody does.
 
     Raises
     ------
     MachineInUse
-        Another process is in the middle of a push on this machine.
+        Another process is pushing on this machine.
     StillActive
         The unverified table is still active, because the controller refuses or does not answer.
     TableMismatch
-        The controller holds a table that nothing has verified, under whatever name it was pushed, or that this database did not push: a
+        The controller holds an unverified table, whatever machine name it was pushed under, or one that this database did not push: a
         person must look (`abbe accept-table`).
     StoreError, CaptureFault
-        The database does not take what interrupted runs left, or their folder cannot be used. A single bad segment is only reported.
+        The database refuses the samples of interrupted runs, or their folder cannot be used. A single bad segment is only reported.
     """
-    await store.write(store.machines.add, site.name, site.doc)  # the machine as it is described now
-    # First: whatever is wrong with a segment, no unverified table stays active.
+    await store.write(store.machines.add, site.name, site.doc)  # the present description of the machine
+    # The push comes first: a damaged segment must not keep an unverified table active.
     pushed = await finish_push(controller, store, site, accept_by=accept_by)
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
     return "; ".join([*([pushed] if pushed else []), *(run.text for run in runs)]) or None
@@ -58,8 +58,8 @@ async def recover(controller: TableController, store: Store, site: Site, *, acce
 async def finish_push(
     controller: TableController, store: Store, site: Site, clock: Clock | None = None, *, accept_by: str = ""
 ) -> str | None:
-    """Bring the last push into this machine's control to its end, from its journal and from what the controller says; then look at the
-    table in force (`check_in_force`).
+    """Finish the last push into this machine's control, from its journal and the controller's state; then check the table in force
+    (`check_in_force`).
 
     Returns
     -------
@@ -69,9 +69,9 @@ async def finish_push(
     Raises
     ------
     MachineInUse, StillActive, TableMismatch
-        As of `recover`.
+        As for `recover`.
     """
-    done = await _ended(controller, store, site, clock or SystemClock())
+    done = await _finish_last(controller, store, site, clock or SystemClock())
     try:
         accepted = await accept_strange(controller, store, site, accept_by) if accept_by else None
         await check_in_force(controller, store, site)
@@ -82,11 +82,11 @@ async def finish_push(
     return "; ".join(filter(None, (done, accepted))) or None
 
 
-async def _ended(controller: TableController, store: Store, site: Site, clock: Clock) -> str | None:
-    """The same without the look at the table: what was done of the last push."""
+async def _finish_last(controller: TableController, store: Store, site: Site, clock: Clock) -> str | None:
+    """Finish the last push without checking the table in force; return what was done."""
     book = await StoreBook.last(store, site.name, clock, site.control)
     journal: Journal = () if book is None else await book.entries()
-    if book is None or journal[-1].push == WORD:
+    if book is None or journal[-1].push == NO_PUSH:
         return None
     before = journal[-1].state
     if before not in TERMINAL or before is PushState.OPERATOR:
@@ -95,10 +95,10 @@ async def _ended(controller: TableController, store: Store, site: Site, clock: C
         raise operator_needed(journal)
     _refuse_if_under_way(store, site, journal)
     ended = await run_to_end(execute.recover(ControllerPort(controller, no_actors(), clock), book))
-    return _told(ended, before)
+    return _summary(ended, before)
 
 
-def _told(ended: execute.Ended, before: PushState) -> str | None:
+def _summary(ended: execute.Ended, before: PushState) -> str | None:
     known, number = facts(ended.journal), ended.journal[-1].push
     why = known.why or "interrupted before verification"
     match ended.state:
@@ -114,24 +114,15 @@ def _told(ended: execute.Ended, before: PushState) -> str | None:
 
 
 async def accept(controller: TableController, store: Store, site: Site, by: str = "a person") -> str:
-    """A person vouches for the table that is active now: every push that is open with it is closed, under whatever name it was begun.
+    """Record that a person vouches for the active table, and close every open push of it, whatever machine name it was begun under.
 
-    An interrupted push that can be finished is finished instead, and nothing is accepted: the person has looked at another table then.
-
-    Parameters
-    ----------
-    by : str
-        Who; it is kept in the journal.
-
-    Returns
-    -------
-    str
-        What was done.
+    An interrupted push that can be finished is finished instead, and nothing is accepted: the person has looked at another table. ``by`` is
+    kept in the journal. Returns what was done.
 
     Raises
     ------
     MachineInUse
-        Another process is in the middle of a push on this machine.
+        Another process is pushing on this machine.
     """
     clock = SystemClock()
     await store.write(store.machines.add, site.name, site.doc)
@@ -161,9 +152,9 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
         )
     known = await asyncio.to_thread(known_tables, store)
     chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
-    await _given_to_a_person(store, site, chain)
+    await _hand_to_person(store, site, chain)
     for other_chain in _open_with(crc, known) - {chain}:
-        book = await _given_to_a_person(store, site, other_chain)
+        book = await _hand_to_person(store, site, other_chain)
         await book.append(await book.entries(), PushState.ACCEPTED, acceptance_doc(now, by))
     await vouch(store, site, now, by)
     text = f"the active table (bank {now.active_bank}, CRC {crc:08X}) is accepted by {by}"
@@ -175,14 +166,16 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
 
 
 def _open_with(crc: int, known: KnownTables) -> set[str]:
-    """Journal of the last push that brought this table, if it is still open: under another name or address it would be taken back."""
+    """Journal of the last push of this table, if that push is still open: recovery under another name or address would roll it back."""
     push = known.pushed.get(crc)
     return {push.chain} if push is not None and push.may_be_active else set()
 
 
-async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:
-    """The last push of a journal, with the decision left to a person if it was open."""
-    book = await StoreBook.of_chain(store, chain, SystemClock()) or await StoreBook.word(store, site.name, SystemClock(), site.control)
+async def _hand_to_person(store: Store, site: Site, chain: str) -> StoreBook:
+    """Close the last push of a journal, if it is open, so that a person can decide; return the journal."""
+    book = await StoreBook.of_chain(store, chain, SystemClock()) or await StoreBook.for_acceptance(
+        store, site.name, SystemClock(), site.control
+    )
     journal = await book.entries()
     if journal and journal[-1].state not in TERMINAL:
         _refuse_if_under_way(store, site, journal)
@@ -192,7 +185,7 @@ async def _given_to_a_person(store: Store, site: Site, chain: str) -> StoreBook:
 
 
 def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
-    """A push that another process, or another task of this one, is driving is not recovered by us."""
+    """Raise MachineInUse if another process, or another task of this process, is driving the push."""
     last = journal[-1]
     if last.state in TERMINAL or last.state is PushState.ROLLBACK_PENDING:
         return
@@ -204,19 +197,10 @@ def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
 
 
 async def is_own(controller: Identity, site: Site, journal: Journal) -> bool:
-    """Whether a push was begun on this control, by what proves it: address and name, address and start of the control, or its table.
+    """Whether a push was begun on this control. Proofs: address and name, address and boot id, or the pushed table in force.
 
-    A table carries a number drawn by lot, so the table of the push in force is the proof that this is its control. The table from before
-    the push proves nothing: two controls as they came have the same one.
-
-    Parameters
-    ----------
-    controller : Identity
-        Only read, and only where address and name do not match.
-    site : Site
-        The machine as its file names it now.
-    journal : tuple of Entry
-        The push.
+    A table carries a random number, so the pushed table in force proves the control. The base table proves nothing: two controls in factory
+    state hold the same one. The controller is read only where address and name do not match.
     """
     known = facts(journal)
     here = _address(journal) in ("", site.control)
@@ -227,12 +211,12 @@ async def is_own(controller: Identity, site: Site, journal: Journal) -> bool:
 
 
 async def check_own(controller: Identity, site: Site, journal: Journal) -> None:
-    """Refuse to end a push of which nothing proves that it was begun on this control. Nothing is written.
+    """Refuse to finish a push if nothing proves that it was begun on this control (`is_own`). Nothing is written.
 
     Raises
     ------
     TableMismatch
-        Which push, where it was begun, and what a person can do.
+        Names the push, where it was begun, and what a person can do.
     """
     if await is_own(controller, site, journal):
         return

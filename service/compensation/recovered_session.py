@@ -1,6 +1,6 @@
-"""The one way to devices that are worked with: controller, then what an interrupted push left in it, and only then the instruments.
+"""Open a machine's devices: the controller first, then recovery of an interrupted push, and only then the instruments.
 
-An instrument that is missing or silent must not keep an unverified table in force (tests/service/devices/test_every_session.py).
+A missing or silent instrument must not keep an unverified table in force (tests/service/devices/test_every_session.py).
 """
 
 from __future__ import annotations
@@ -24,31 +24,29 @@ async def recovered_session(
     ask: Ask = no_console,
     *,
     accept_by: str = "",
-    told: Callable[[str], object] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> AsyncIterator[Session]:
-    """Open a machine's devices with `recover` between the controller and all others.
+    """Open a machine's devices; `recover` runs after the controller is open and before any other device.
 
     Parameters
     ----------
     urls : DeviceUrls, optional
         Default: all devices of the machine file.
-    ask : callable
-        As of `open_session`.
-    accept_by : str
-        As of `recover`.
-    told : callable, optional
-        Gets what was done, before the other devices are opened.
+    ask, accept_by
+        Passed to `open_session` and `recover`.
+    report : callable, optional
+        Receives what recovery did, before the other devices are opened.
 
     Raises
     ------
     AbbeError, DriverError
-        As of `recover`: no other device was opened. As of `open_session`: what was left open is finished already.
+        From `recover`: no other device was opened. From `open_session`: the interrupted push is finished already.
     """
 
     async def first(controller: Controller) -> None:
         done = await recover(controller, store, site, accept_by=accept_by)
-        if done is not None and told is not None:
-            told(done)
+        if done is not None and report is not None:
+            report(done)
 
     async with open_session(urls or site.urls, ask, first=first) as session:
         yield replace(session, recovered=True)

@@ -1,8 +1,7 @@
-"""A person orders the table back that was in force before: a push of its own, through the same machine, into the same journal.
+"""A person orders the previous table back: a push of its own, through the same machine and into the same journal.
 
-No probe and no verification is measured, because there is nothing to find out: the image is byte for byte one that the journal knows to
-have been in force, verified or put there by a person. Everything else is as for any push: interlocks, lease, read-back twice,
-compare-and-swap, and the way back if it breaks off.
+No probe and no verification is measured: the journal knows the image, byte for byte, as one that was in force, verified or put there by
+a person. Everything else is as for any push: interlocks, lease, two read-backs, compare-and-swap, and rollback if the push breaks off.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from abbe.drivers.api import TableController
 from abbe.drivers.tables import crc32
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposals import by_whom
-from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedAgain
+from abbe.service.compensation.pushing import Pushing, PushResult, Questions, RestoredTable
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.entries import Journal, facts
@@ -29,25 +28,25 @@ from abbe.service.tables.unverified import unverified_crcs
 
 
 @dataclass(frozen=True, slots=True)
-class KnownTables:
-    """A table that was in force, as the journal holds it in full, and how the journal knows it."""
+class KnownTable:
+    """A table that was in force, in full from the journal, and how the journal knows it."""
 
     image: bytes
-    meaning: str
+    semantic_digest: str
     how: str
 
 
 @dataclass(frozen=True, slots=True)
-class Back:
-    """The push that brought a table back, and which table that is."""
+class RollbackResult:
+    """The push that restored a table, and which table that is."""
 
     pushed: PushResult
     how: str
 
 
 @dataclass(frozen=True, slots=True)
-class Ordered:
-    """Who orders a table back, why, under which number of the order, and who may stop it. Kept with the table and in its journal."""
+class RollbackRequest:
+    """Who orders a rollback, why, under which order number, and what may stop it. Stored with the table and in its journal."""
 
     who: str
     reason: str
@@ -56,44 +55,44 @@ class Ordered:
 
 
 async def rollback(
-    controller: TableController, store: Store, site: Site, to: int | None = None, ordered: Ordered | None = None
-) -> Back | None:
-    """Make a table active again that was in force before.
+    controller: TableController, store: Store, site: Site, to: int | None = None, request: RollbackRequest | None = None
+) -> RollbackResult | None:
+    """Restore a table that was in force before.
 
     Parameters
     ----------
     to : int, optional
-        The table that was in force when this push had ended; 0: before the first push. Default: before the last kept push, which must have
-        brought the table that is in force now.
-    ordered : Ordered, optional
-        Who orders it. Default: the account on this computer.
+        Restore the table that was in force after this push; 0: before the first push. Default: before the last kept push, whose table
+        must be in force now.
+    request : RollbackRequest, optional
+        Default: the account on this computer orders it.
 
     Returns
     -------
-    Back or None
-        None: that table is in force already, nothing was written.
+    RollbackResult or None
+        None: that table is in force already; nothing was written.
 
     Raises
     ------
     TableRefused
         The journal knows no such table.
     TableMismatch
-        The table in force is not one that the journal knows: a person must look first.
+        The journal does not know the table in force: a person must look first.
     StoreError
-        The journal is not what was written.
+        The journal was changed after it was written.
     PushNotBegun, StillActive
-        As of any push.
+        From `Pushing.bring`.
     """
     await recover(controller, store, site)
     journal = await asyncio.to_thread(JournalView.read, store, site.name, site.control)
     if not journal.entries:
-        raise TableRefused("no push of this machine is in the journal: there is nothing to take back", "nothing was written")
+        raise TableRefused("no push of this machine is in the journal: there is nothing to roll back", "nothing was written")
     base = await read_base(controller)
     check_known(journal, base)
     wanted = table_after(journal, to) if to is not None else table_before_last_kept(journal, base)
     if wanted.image == base.image:
         return None
-    await check_commissioned(controller, store, site)  # "was in force" was true of a control: what another one makes of it is not known
+    await check_commissioned(controller, store, site)  # the image was proved on one control: what another one does with it is unknown
     why = f"not measured: byte for byte {wanted.how}; ordered back by a person"
 
     def reasons() -> list[str]:
@@ -102,37 +101,35 @@ async def rollback(
     async def in_force_before() -> Verdict:
         return Verdict(not reasons(), why)
 
-    by = by_whom() if ordered is None else ordered.who
+    by = by_whom() if request is None else request.who
     questions = Questions(reasons, f"{by}: rollback", in_force_before, in_force_before)
     doc = {"kind": KIND, "to": to, "how": wanted.how, "by": by}
-    if ordered is not None:
-        doc |= {"reason": ordered.reason, "order": ordered.number}
-    pushing = Pushing(controller, store, site, control=Control() if ordered is None else ordered.control)
-    pushed = await pushing.bring(WantedAgain(wanted.image, wanted.meaning, base, doc), questions)
+    if request is not None:
+        doc |= {"reason": request.reason, "order": request.number}
+    pushing = Pushing(controller, store, site, control=Control() if request is None else request.control)
+    pushed = await pushing.bring(RestoredTable(wanted.image, wanted.semantic_digest, base, doc), questions)
     if not pushed.kept:
-        raise TableRefused(
-            f"the table was not brought back: {pushed.why}", "the table from before is in force; look at the cause, then try again"
-        )
-    return Back(pushed, wanted.how)
+        raise TableRefused(f"the rollback failed: {pushed.why}", "the table from before it is in force; look at the cause, then try again")
+    return RollbackResult(pushed, wanted.how)
 
 
-def _base(journal: Journal, how: str) -> KnownTables:
+def _base(journal: Journal, how: str) -> KnownTable:
     f = facts(journal)
-    return KnownTables(f.base_image, f.base_meaning, how)
+    return KnownTable(f.base_image, f.base_meaning, how)
 
 
-def _left(journal: Journal) -> KnownTables:
-    """What was in force when a push had ended."""
+def _left(journal: Journal) -> KnownTable:
+    """The table that was in force after a push."""
     state, number, f = ended_as(journal), journal[-1].push, facts(journal)
     if state is PushState.KEEP:
-        return KnownTables(f.image, f.meaning, f"the table that push {number} brought and kept")
+        return KnownTable(f.image, f.meaning, f"the table that push {number} brought and kept")
     if state in TERMINAL - {PushState.OPERATOR, PushState.ACCEPTED}:
         return _base(journal, f"the table that was in force before and after push {number}")
     raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another")
 
 
 def known_images(journal: JournalView) -> set[bytes]:
-    """All tables that were in force, verified or put there by a person: bases, and what was kept."""
+    """Images of all tables that were in force, verified or put there by a person: bases and kept tables."""
     found, refuted = set(), unverified_crcs(journal.entries)
     for push in journal.pushes.values():
         f = facts(push)
@@ -144,12 +141,12 @@ def known_images(journal: JournalView) -> set[bytes]:
 
 
 def check_known(journal: JournalView, base: Base) -> None:
-    """What a person or another program put there is never overwritten without a look at it.
+    """Refuse to overwrite a table that a person or another program put there before somebody has looked at it.
 
     Raises
     ------
     TableMismatch
-        The table in force is neither known as one that was in force nor as one that a person accepted.
+        The table in force is neither a known one nor one that a person accepted.
     """
     accepted = {facts((e,)).accepted_crc for e in journal.entries if e.state is PushState.ACCEPTED}
     if base.image not in known_images(journal) and crc32(base.image) not in accepted:
@@ -159,8 +156,8 @@ def check_known(journal: JournalView, base: Base) -> None:
         )
 
 
-def table_after(journal: JournalView, push: int) -> KnownTables:
-    """The table that was in force when a push had ended; 0: before the first."""
+def table_after(journal: JournalView, push: int) -> KnownTable:
+    """The table that was in force after a push; 0: before the first push. Raises TableRefused."""
     journals = journal.pushes
     if push == 0 and journals:
         return _base(next(iter(journals.values())), "the table that was in force before the first push")
@@ -169,8 +166,8 @@ def table_after(journal: JournalView, push: int) -> KnownTables:
     return _left(journals[push])
 
 
-def table_before_last_kept(journal: JournalView, base: Base) -> KnownTables:
-    """The table before the last kept push, if that one is in force and was no rollback itself."""
+def table_before_last_kept(journal: JournalView, base: Base) -> KnownTable:
+    """The table before the last kept push, which was no rollback and whose table is in force. Raises TableRefused."""
     last = journal.last_kept()
     f, number = facts(last), last[-1].push
     if f.image != base.image:

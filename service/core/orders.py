@@ -18,11 +18,11 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, PushNow, RollBack
 from abbe.service.channel.messages import Outcome as Word
 from abbe.service.clock import Clock
-from abbe.service.compensation.ordered_rollback import BackOrder
+from abbe.service.compensation.ordered_rollback import RollbackOrder
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.push_approved import PushOrder
-from abbe.service.compensation.rollback import Ordered
+from abbe.service.compensation.rollback import RollbackRequest
 from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand
 from abbe.service.core.rights import person
 from abbe.service.domain.audit_event import AuditEvent
@@ -44,7 +44,7 @@ ROLLBACK: Final = "rollback"
 PUSH: Final = "push"
 NO_PAUSE = "a table is being changed: stop it, or let it end"
 
-OrderedRollback = Callable[[BackOrder], Awaitable[JobOutcome]]
+OrderedRollback = Callable[[RollbackOrder], Awaitable[JobOutcome]]
 """``await rollback(order)``: restores the table before; returns what it learned of the end."""
 Push = Callable[[PushOrder], Awaitable[JobOutcome]]
 """``await push(order)``: pushes what is approved; returns what it learned of the end."""
@@ -228,7 +228,7 @@ class Orders(RetryingStore):
         assert ordered_rollback is not None
 
         async def act(progress: ProgressSink, control: Control) -> JobOutcome:
-            return await ordered_rollback(BackOrder(asked.push, asked.crc, Ordered(asked.who, asked.reason, number, control)))
+            return await ordered_rollback(RollbackOrder(asked.push, asked.crc, RollbackRequest(asked.who, asked.reason, number, control)))
 
         doc = {"reason": asked.reason, "order": number, "push": asked.push, "crc": f"{asked.crc:08X}"}
         target = f"{self._context.machine}, table of push {asked.push} ({asked.crc:08X})"

@@ -1,1 +1,1 @@
-"""What the service speaks of: one record for each idea, from the core over the channel to page, JSON, OPC UA and MTConnect."""
+"""Domain records of the service: one for each idea, used from the core over the channel to page, JSON, OPC UA and MTConnect."""

@@ -1,4 +1,4 @@
-"""An event of the audit: who did what, when, on what, and how it ended."""
+"""An audit event: who did what to which target, when, and with what outcome."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from abbe.service.domain.document import Doc
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditEntry:
-    """What people with the right to read the audit see of an event.
+    """The part of an event that people with the permission to read the audit see.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class AuditEntry:
     outcome : str
         ``done``, ``no``, ``refused 403``, a code of an error.
     id, utc, digest
-        Its number, from 1 without a gap, its time, and the SHA-256 of its content and of the digest before it. Given when it is written.
+        Number, from 1 without a gap; time; SHA-256 of the content and of the digest before it. Set when the event is written.
     """
 
     id: int = 0
@@ -36,16 +36,10 @@ class AuditEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AuditEvent(AuditEntry):
-    """An event with everything that is stored of it.
+    """A complete event as it is stored.
 
-    Parameters
-    ----------
-    doc : dict
-        More of it: options, reasons. No secrets.
-    prev : str
-        Digest of the event before it.
-    key, mac : str
-        Name of the key, and the seal over the digest that it makes.
+    ``doc``: options and reasons, no secrets; ``prev``: digest of the event before it; ``key``, ``mac``: name of the key, and its seal over
+    the digest.
     """
 
     doc: Doc = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""How long texts and how large numbers of a record may be; the channel refuses what is beyond."""
+"""Largest lengths of texts and size of numbers in a record; the channel refuses longer and larger ones."""
 
 from __future__ import annotations
 

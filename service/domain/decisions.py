@@ -1,4 +1,4 @@
-"""What is decided on tables: proposals, approvals and rejections, and the journal of pushes, as they are stored. One record is one row."""
+"""Stored decisions on tables: proposals, approvals, rejections, and the push journal. One record is one row."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from abbe.service.domain.document import Doc
 
 @dataclass(frozen=True, slots=True)
 class ProposalRecord:
-    """Proposed tables with everything they were made from. Never changed; ``digest``: SHA-256 of ``doc``."""
+    """Proposed tables with all their sources. Never changed; ``digest``: SHA-256 of ``doc``."""
 
     id: int
     machine: str
@@ -35,7 +35,7 @@ class ProposalDecision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalApproval(ProposalDecision):
-    """A yes until ``expiry`` (UTC) to tables of this ``digest``."""
+    """An approval of the tables of this ``digest`` until ``expiry`` (UTC)."""
 
     digest: str
     expiry: str
@@ -43,7 +43,7 @@ class ProposalApproval(ProposalDecision):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalRejection(ProposalDecision):
-    """A no, and why."""
+    """A rejection with its reason."""
 
     reason: str
 

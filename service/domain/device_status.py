@@ -11,7 +11,7 @@ from abbe.service.domain.bounds import Text, Word
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceStatus:
-    """A device of the machine file, and when it was last heard of. It is not polled between checks."""
+    """State of a device of the machine file, and when it last answered. It is not polled between checks."""
 
     role: Word
     url: Text

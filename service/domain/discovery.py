@@ -1,4 +1,4 @@
-"""A search for what a campaign's model lacks: where it started from, and the states that it reached."""
+"""A discovery, the search for what a campaign's model lacks: its start and the states that it reached."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ PROGRAM = "abbe discover"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SearchBase:
-    """What a stored search goes out from.
+    """Start of a stored search.
 
-    ``model_version``: of the model whose effects were taken out of the readings; ``after``: the version that was the current one when the
-    search was opened; ``continues``: number of the ended search that this one continues after more was measured.
+    ``model_version``: of the model whose effects were removed from the readings; ``after``: the current version when the search was opened;
+    ``continues``: id of the ended search that this one continues with more measurements.
     """
 
     model_version: int | None = None
@@ -27,7 +27,7 @@ class SearchBase:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FindingSource:
-    """Where a finding comes from: campaign, machine and runs by their digests, versions of the programs."""
+    """Source of a finding: campaign, digests of machine and runs, versions of the programs."""
 
     campaign: str
     machine_digest: str
@@ -37,7 +37,7 @@ class FindingSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SearchStart:
-    """The runs that are searched, the present model, and what is odd about single runs."""
+    """The searched runs, the present model, and remarks on single runs."""
 
     source: FindingSource
     present_model: tuple[str, ...] = ()
@@ -48,9 +48,9 @@ class SearchStart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """What the runs say that only judge.
+    """Verdict of the runs that only judge.
 
-    ``proved``: None where they cannot judge; ``closed``: how much of their ``gap`` closes; ``against``: why the names are not believed.
+    ``proved``: None if they cannot judge; ``closed``: closed share of their ``gap``; ``against``: why the names are not confirmed.
     """
 
     rule: str
@@ -62,10 +62,10 @@ class Judgement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoveryStep:
-    """A state that a discovery reached, who decided so, and why.
+    """A state that a discovery reached, who decided it, and why.
 
-    ``start``: of the first state; ``finding``: of the one that follows it; ``judged``: of the test by runs that only judge and of what
-    follows from it; ``not_added``: why what was explained does not enter the model book.
+    ``start``: in the first state; ``finding``: in the second; ``judged``: in the test by runs that only judge and the states after it;
+    ``not_added``: why an explained effect does not enter the model book.
     """
 
     state: State

@@ -38,14 +38,14 @@ class FoundEffect(FileObject):
 
 
 class FoundBeside(FileObject):
-    """A structure without a name beside named effects, ``unnamed_step:Z``."""
+    """An unnamed structure beside named effects, ``unnamed_step:Z``."""
 
     label: str
     evidence: float
 
 
 class FoundWhere(FileObject):
-    """Where what is missing lives; what was not located is left out."""
+    """Location of what is missing; what was not located is left out."""
 
     tests: list[str] = Field(default_factory=list)
     axes: list[str] = Field(default_factory=list)
@@ -71,7 +71,7 @@ class FoundTest(FileObject):
 
 
 class FoundAgreement(FileObject):
-    """How a run that was never fitted agrees where nothing is missing: rms over what is allowed, and how often chance gives as much."""
+    """Agreement of a run that was never fitted, if nothing is missing: rms over the allowed one, and probability of as much by chance."""
 
     run: str
     times: float = Field(ge=0)
@@ -79,7 +79,7 @@ class FoundAgreement(FileObject):
 
 
 class FoundUnseen(FileObject):
-    """What the campaign could not have shown where nothing is missing, because of what, and what would show it."""
+    """An effect that the campaign could not have shown, if nothing is missing: the reason, and what would show it."""
 
     what: str
     because: str
@@ -97,7 +97,7 @@ class FoundFitted(FileObject):
 
 
 class FoundThinning(FileObject):
-    """Long ball-bar runs were searched with fewer values than they have readings; what that hides is not known to be absent."""
+    """Decimation: long ball-bar runs were searched with fewer values than they have readings; what that hides may be present."""
 
     readings: int
     kept: int

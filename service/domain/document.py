@@ -1,4 +1,4 @@
-"""A document: what is stored or sent as JSON. It is parsed into a record once, where it is read."""
+"""Documents: JSON as it is stored or sent, parsed into a record once, where it is read."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
 
 
 def document(record: Any) -> Doc:
-    """A record (a dataclass) as a JSON object."""
+    """Turn a record (a dataclass) into a JSON object."""
     doc: Doc = _adapter(type(record)).dump_python(record, mode="json", by_alias=True)
     return doc
 
 
 def record(kind: type[T], doc: object, what: str) -> T:
-    """A stored JSON object as a record; ``what`` it is, for the message.
+    """Parse a stored JSON object into a record; ``what`` names it in the error.
 
     Raises
     ------
@@ -38,6 +38,6 @@ def record(kind: type[T], doc: object, what: str) -> T:
         found: T = _adapter(kind).validate_python(doc)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise Unusable(f"{what} has another form than expected: {where}: {first['msg']}", "make it again with this version") from None
+        path = ".".join(str(part) for part in first["loc"])
+        raise Unusable(f"{what} has another form than expected: {path}: {first['msg']}", "make it again with this version") from None
     return found

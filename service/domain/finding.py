@@ -1,4 +1,4 @@
-"""What a discovery has found, as it is stored, reported and drawn. Gaps in µm, predictions in mm."""
+"""Findings of a discovery, as they are stored, reported and drawn. Gaps in µm, predictions in mm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Kind = Literal["mean", "variance"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GapUm:
-    """Rms of measured minus predicted before and after what was found, and the noise that no model takes out, µm."""
+    """Rms of measured minus predicted without and with the finding, and the noise that no model removes, µm."""
 
     before_um: float
     after_um: float
@@ -24,7 +24,7 @@ class GapUm:
 
     @property
     def closed(self) -> float | None:
-        """Share of the gap above the noise that is gone: 1 to the noise, 0 nothing, below 0 worse; None where there was no gap."""
+        """Closed share of the gap above the noise: 1 all, 0 nothing, below 0 worse; None if there was no gap."""
         if self.before_um <= self.floor_um:
             return None
         left = max(self.after_um - self.floor_um, 0.0) / (self.before_um - self.floor_um)
@@ -45,7 +45,7 @@ class RunFit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterFound:
-    """A further parameter of an effect, with its standard uncertainty where one is known."""
+    """A further parameter of an effect, with its standard uncertainty if known."""
 
     value: float
     u: float | None
@@ -54,7 +54,7 @@ class ParameterFound:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RivalEffect:
-    """Another effect that the runs cannot exclude, and by how much less evidence (natural logarithm) it explains them."""
+    """Another effect that the runs cannot exclude, and the evidence (natural logarithm) by which it explains them less."""
 
     label: str
     title: str
@@ -63,10 +63,10 @@ class RivalEffect:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffectSize:
-    """An effect with its size, and what its catalogue entry says of it; findings and model books hold the same.
+    """An effect with its size and its catalogue entry; findings and model books share it.
 
-    ``coefficients`` and ``covariance``: linear ones, in the units of the effect's columns. ``forms``: freedoms of form that it needed.
-    ``needed``: rms of the judging runs without this effect over that with it, None where nothing judges. ``evidence``: gain in log
+    ``coefficients`` and ``covariance``: linear ones, in the units of the effect's columns. ``forms``: degrees of freedom of form that it
+    needed. ``needed``: rms of the judging runs without this effect over that with it, None if no run judges. ``evidence``: gain in log
     evidence after its price.
     """
 
@@ -92,13 +92,13 @@ class EffectSize:
 
     @property
     def words(self) -> str:
-        """Title and where it sits."""
+        """Title and place (axis or motion)."""
         return f"{self.title} {self.key}".strip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffectFound(EffectSize):
-    """An effect of a finding. ``proved``: runs that were never fitted confirm it; None while nobody has asked them."""
+    """An effect of a finding. ``proved``: runs that were never fitted confirm it; None before they are asked."""
 
     alternatives: tuple[RivalEffect, ...] = ()
     signature: str = ""
@@ -107,7 +107,7 @@ class EffectFound(EffectSize):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unnamed:
-    """A structure without a name that was found beside named effects."""
+    """An unnamed structure found beside named effects."""
 
     label: str
     evidence: float
@@ -115,7 +115,7 @@ class Unnamed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSeries:
-    """Of one run, mm: the prediction with what was found, and the residuals before and after (None: sealed)."""
+    """Series of one run, mm: the prediction with the finding, and the residuals without and with it (None: sealed)."""
 
     predicted: PackedReadings | None = None
     before: PackedReadings | None = None
@@ -124,7 +124,7 @@ class RunSeries:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefittedModel:
-    """Parameters of the present model, refitted together with what was found."""
+    """Parameters of the present model, refitted together with the finding."""
 
     names: tuple[str, ...]
     values: tuple[float, ...]
@@ -133,7 +133,7 @@ class RefittedModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeRival:
-    """Another change that explains nearly as much: natural logarithm of how much less likely it is."""
+    """Another change that explains nearly as much. ``less_evidence``: natural logarithm of how much less likely it is."""
 
     name: str
     less_evidence: float
@@ -143,8 +143,8 @@ class ChangeRival:
 class MotionChange:
     """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
 
-    ``u``: standard uncertainty; ``rivals``: what these runs cannot tell it from; ``halves``: by how many of two halves of the runs it was
-    chosen without the other.
+    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: how many of two halves of the
+    runs chose it on their own.
     """
 
     motion: str
@@ -159,11 +159,11 @@ class MotionChange:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangedSince:
-    """What has changed since an earlier solution.
+    """Changes of the machine since an earlier solution.
 
-    ``gap``, ``judged``: None where too few set-ups judge; ``judged``: log of how much more likely runs are with what they did not choose;
-    ``hidden_um_m``: how much each scale and squareness may have changed all the same; ``beside``: effects that were found in the same runs
-    and may be the same thing; ``proved``: runs that did not choose the changes bear them out; ``trouble``: why nothing could be compared.
+    ``gap``, ``judged``: None if too few set-ups judge; ``judged``: log of how much more likely runs are with changes that they did not
+    choose; ``hidden_um_m``: possible undetected change of each scale and squareness; ``beside``: effects found in the same runs that may be
+    the same thing; ``proved``: runs that did not choose the changes confirm them; ``trouble``: why nothing could be compared.
     """
 
     since: int
@@ -178,23 +178,23 @@ class ChangedSince:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Everything that is kept of a discovery.
+    """The stored result of a discovery.
 
     Attributes
     ----------
     case : name of the campaign.
     gaps : by role of the runs.
-    effects : what is stood by. suspects : names that fit the fitted runs and that the judging runs do not confirm; then the verdict is
-        "unknown".
+    effects : confirmed or unjudged. suspects : names that fit the fitted runs but are not confirmed by the judging runs; then the verdict
+        is "unknown".
     proved, proof : whether runs that were never fitted confirm the names, and by which rule.
-    where : where the gap of the present model lives.
-    rejected : labels that were tried, and why not.
+    where : location of the gap of the present model.
+    rejected : labels that were tried, and the reason against each.
     confounded_with : rivals of the names that the price rule does not exclude. beside : structures without a name beside them.
-    agreement, unjudged, unseen : of runs that were never fitted, where nothing is missing.
+    agreement, unjudged, unseen : of runs that were never fitted, if nothing is missing.
     fitted : values of the present simulation that these runs show.
-    thinning : what became of long runs before the search; None: they were searched as they were read.
+    thinning : decimation of long runs before the search; None: they were searched as they were read.
     predictions : of sealed runs, mm.
-    changed : what has changed since an earlier solution, where one could be compared.
+    changed : changes since an earlier solution, if one could be compared.
     """
 
     format: Literal["abbe-finding/1"] = "abbe-finding/1"

@@ -1,4 +1,4 @@
-"""A job of this run of the service."""
+"""Jobs of the running service."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ JobKind = Literal["check", "campaign", "investigation", "push", "rollback"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobState:
-    """A job since the service began: a check or full campaign, what follows from an alarm, or a rollback that a person ordered.
+    """A job since the service started: a check or full campaign, a consequence of an alarm, or a rollback ordered by a person.
 
     ``state``: running, asking, pausing, paused, …; once it has ended ``done: VERDICT`` of a check, ``done: kept``
     (``rolled back``, ``refused``, ``stopped``, ``failed``, ``open``) of a push, ``done: proposed`` (``ended``, ``failed``,
-    ``stopped``) of a campaign or an investigation, or ``interrupted``. A rollback is a push of the table from before: ``kept`` means that
-    this one is in force again. ``asking``: a person has to do what ``ask`` says and say so under the number ``prompt``. ``who``: empty for
-    what nobody ordered. ``solution`` and ``proposal``: what a campaign has left in the store.
+    ``stopped``) of a campaign or an investigation, or ``interrupted``. A rollback is a push of the previous table: ``kept`` means that
+    this table is in force again. ``asking``: a person has to do what ``ask`` says and confirm it under ``prompt``. ``who``: empty if no
+    person ordered it. ``solution``, ``proposal``: results of a campaign in the store.
     """
 
     id: Word
@@ -40,12 +40,12 @@ class JobState:
 
 @dataclass(frozen=True, slots=True)
 class JobOutcome:
-    """How work ended, the sentence to it, and what it has left in the store.
+    """How a job ended, with a sentence, and its results in the store.
 
-    ``word`` of a push or rollback: ``kept``: the new table is in force, and was verified; ``rolled back``: it was, and the old one
-    is again; ``refused``, ``failed``, ``stopped`` (by a person): the new one never was in force; ``open``: it may be in force, and
-    nothing has verified it. Of a campaign: ``proposed``, ``ended`` (there is no proposal that could be approved), ``failed``,
-    ``stopped``. ``waits``: another process has the machine, and nothing was begun.
+    ``word`` of a push or rollback: ``kept``: the new table is in force and verified; ``rolled back``: the old table is in force again;
+    ``refused``, ``failed``, ``stopped`` (by a person): the new table was never in force; ``open``: it may be in force, unverified. Of a
+    campaign: ``proposed``, ``ended`` (no proposal can be approved), ``failed``, ``stopped``. ``waits``: another process has the machine,
+    nothing was begun.
     """
 
     word: str

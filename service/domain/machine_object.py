@@ -1,4 +1,4 @@
-"""The ``machine`` object of the exchange format, and the types that it shares with the machine file."""
+"""The ``machine`` object of the exchange format, and its types, which the machine file shares."""
 
 from __future__ import annotations
 
@@ -8,22 +8,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 
 def check_chain(text: str) -> str:
-    """Check a kinematic chain.
-
-    Parameters
-    ----------
-    text : str
-        E.g. ``"w-X-Y-b-Z-t"``.
-
-    Returns
-    -------
-    str
-        The same text.
+    """Return a valid kinematic chain, e.g. ``"w-X-Y-b-Z-t"``.
 
     Raises
     ------
     ValueError
-        Unless it goes from w to t over b, with each of X, Y, Z once.
+        The chain does not go from w to t over b with each of X, Y, Z once.
     """
     parts = text.split("-")
     if parts[0] != "w" or parts[-1] != "t" or sorted(parts[1:-1]) != ["X", "Y", "Z", "b"]:
@@ -49,7 +39,7 @@ class FileObject(BaseModel):
 
     @classmethod
     def read(cls, doc: object) -> Self:
-        """A JSON object that was read already: there lists stand for tuples.
+        """Validate a parsed JSON object, in which lists stand for tuples.
 
         Raises
         ------

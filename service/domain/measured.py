@@ -1,4 +1,4 @@
-"""What is measured: machines, campaigns, runs and their samples, as they are stored. One record is one row."""
+"""Stored measurements: machines, campaigns, runs and their samples. One record is one row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FINISHED = ("complete", "stopped", "aborted", "failed", INTERRUPTED, DISK_FULL)
 
 @dataclass(frozen=True, slots=True)
 class MachineRecord:
-    """A machine as it was described at some time; another description is another record."""
+    """A description of a machine; another description is another record."""
 
     id: int
     name: str
@@ -38,7 +38,7 @@ class CampaignRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:
-    """What every record of a run says: a field that stands here and as a column is in the lists of every surface."""
+    """Fields of every run record: a field here that is also a column appears in the lists of page, API and command line."""
 
     campaign: str
     test: str
@@ -62,12 +62,12 @@ class RunRecord(RunFacts):
 
     @property
     def visible_status(self) -> str:
-        """``"incomplete"`` when the run was never finished and its process no longer runs, else ``status``."""
+        """``"incomplete"`` if the run was never finished and its process no longer runs, otherwise ``status``."""
         return visible_status(self.status, self.owner)
 
 
 def visible_status(status: str, owner: Owner) -> str:
-    """State of a run as people see it: one that was never finished is incomplete once its process no longer runs."""
+    """State of a run as people see it: an unfinished run is incomplete once its process no longer runs."""
     return INCOMPLETE if status == RUNNING and owner.is_gone() else status
 
 
@@ -94,7 +94,7 @@ class ChunkRecord:
 
 @dataclass(frozen=True, slots=True)
 class ChannelRecord:
-    """What a run holds in one channel, without the samples."""
+    """Summary of one channel of a run, without the samples."""
 
     channel: str
     codec: str
@@ -104,7 +104,7 @@ class ChannelRecord:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointRecord:
-    """One line of a campaign's journal. Never changed after writing; ``seq`` counts from 0."""
+    """One entry of a campaign's journal. Never changed after writing; ``seq`` counts from 0."""
 
     id: int
     campaign_id: int
@@ -116,7 +116,7 @@ class CheckpointRecord:
 
 @dataclass(frozen=True, slots=True)
 class ImportedRun:
-    """A run from an exchange file that is to be stored, with its channels packed."""
+    """A run from an exchange file, packed for the store."""
 
     label: str
     test: str

@@ -1,4 +1,4 @@
-"""The model book: versions of what is known of a machine beyond its 21 error motions."""
+"""The model book: versions of the known effects of a machine beyond its 21 error motions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from abbe.service.domain.finding import EffectSize, RefittedModel
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
-    """The campaign in which an effect was found, and the discovery that found it; None: of a campaign that is not stored."""
+    """The campaign and the discovery that found an effect; ``discovery`` None: the campaign is not stored."""
 
     campaign: str
     discovery: int | None = None
@@ -21,7 +21,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BookEffect(EffectSize):
-    """An effect that a model knows. ``rivals``: labels of what it could also have been; ``origin`` is ``from`` in JSON."""
+    """An effect in a model. ``rivals``: labels of effects that it could also be; ``origin`` is ``from`` in JSON."""
 
     origin: Annotated[Origin, Field(alias="from")]
     rivals: tuple[str, ...] = ()
@@ -29,7 +29,7 @@ class BookEffect(EffectSize):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance(Origin):
-    """What brought a version: digests of the runs, versions of the programs."""
+    """Source of a version: digests of the runs, versions of the programs."""
 
     runs: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -39,8 +39,8 @@ class Provenance(Origin):
 class ModelBook:
     """The document of one version (``abbe-model/1``).
 
-    ``parent``: the version that it was made on; ``machine_digest``: SHA-256 of the geometry that its effects are of; ``gone``: labels that
-    added up to nothing and left the book; ``model``: the refitted model that the last finding brought.
+    ``parent``: the version before it; ``machine_digest``: SHA-256 of the geometry of its effects; ``gone``: labels of effects that summed
+    to zero and left the book; ``model``: the refitted model of the last finding.
     """
 
     format: Literal["abbe-model/1"] = "abbe-model/1"
@@ -55,7 +55,7 @@ class ModelBook:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelVersion:
-    """One version of a machine's model. ``discovery_id``: what brought it, None for a person."""
+    """One version of a machine's model. ``discovery_id``: its discovery, None if a person made it."""
 
     machine: str
     version: int

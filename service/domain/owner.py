@@ -1,4 +1,4 @@
-"""The process that writes a run, named so that no other is mistaken for it, not even after a restart of process or computer.
+"""The identity of the process that writes a run, unique even across restarts of process and computer.
 
 The operating system reuses pids, hence the start time; start times count from boot, hence the boot id.
 """
@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 
 UNKNOWN = "?"
-"""Start time of a living process where the system does not show it. A process that has this start time is known by its pid alone."""
+"""Start time of a living process if the system does not show it; only its pid identifies such a process."""
 _START_TIME_FIELD = 22 - 3
 """Field 22 of /proc/PID/stat, counted after the command name (field 2), which may itself hold blanks."""
 
@@ -21,14 +21,7 @@ _START_TIME_FIELD = 22 - 3
 class Owner:
     """The process that writes a run.
 
-    Parameters
-    ----------
-    host : str
-        Network name of the computer.
-    pid : int
-        Process id.
-    start : str
-        Boot id and start time of the process; empty where the system does not show them.
+    ``host``: network name of the computer; ``start``: boot id and start time, empty if the system does not show them.
     """
 
     host: str
@@ -36,7 +29,7 @@ class Owner:
     start: str
 
     def is_gone(self) -> bool:
-        """Whether this process certainly no longer runs; False also when that cannot be known: on another computer."""
+        """Whether this process certainly no longer runs; False if that is unknown, as on another computer."""
         if self.host != platform.node():
             return False
         now = process_start(self.pid)
@@ -46,14 +39,14 @@ class Owner:
 def process_start(pid: int) -> str:
     """Boot id and start time of a process, ``"boot_id/ticks"``.
 
-    Empty if there is no such process; `UNKNOWN` if it lives and /proc does not show since when.
+    Empty if there is no such process; `UNKNOWN` if it lives and /proc does not show its start.
     """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:  # none such, no /proc, or one that hides the processes of other accounts
+    except OSError:  # no such process, no /proc, or a /proc that hides other accounts
         return _without_proc(pid)
     fields = stat.rpartition(")")[2].split()
-    if fields[0] in {"Z", "X"}:  # killed and not yet collected by its parent: it writes nothing any more
+    if fields[0] in {"Z", "X"}:  # a zombie writes nothing any more
         return ""
     return f"{_boot_id()}/{fields[_START_TIME_FIELD]}"
 

@@ -1,4 +1,4 @@
-"""Arrays inside stored documents: short, exact to what a reading holds, readable by anybody."""
+"""Arrays inside stored documents: compact, exact to the resolution of a reading, in an open encoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Users, their sessions and their tokens, as they are stored: secrets as digests or hashes only. One record is one row."""
+"""Stored users, sessions and tokens: secrets as digests or hashes only. One record is one row."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TokenRecord:
-    """A token of a program: it has the rights of its user that are in its scopes. The database gives ``id`` and ``created_utc``."""
+    """A token of a program, with those rights of its user that its scopes name. The database gives ``id`` and ``created_utc``."""
 
     id: int = 0
     user_id: int

@@ -1,4 +1,4 @@
-"""How far long work is: one record from the work itself to the page, JSON, OPC UA and MTConnect."""
+"""Progress of long work: one record from the work itself to page, JSON, OPC UA and MTConnect."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from abbe.service.domain.bounds import Number, Text, Word
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far work is.
+    """Progress of work.
 
-    ``done`` of ``total`` in the work's own unit (by default seconds of planned machine time); ``eta_s``: wall seconds left, None without a
-    basis for an estimate; time in which it waited is not counted. Of a measurement: ``state`` (of `abbe.service.sequences.control`) and
+    ``done`` of ``total`` in the work's own unit (default: seconds of planned machine time); ``eta_s``: wall seconds left without waiting
+    times, None without a basis for an estimate. Of a measurement: ``state`` (of `abbe.service.sequences.control`) and
     ``why`` it waits, ``step`` of ``steps`` and ``points`` read in the test in hand.
     """
 
@@ -34,12 +34,12 @@ ProgressSink = Callable[[Progress], None]
 
 
 def ignore_progress(_: Progress) -> None:
-    """Ignore it."""
+    """A sink that ignores progress."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunningCheck(Progress):
-    """The check that runs now, and how far it is. ``prompt``: number of what a person is asked to do, ``ask``: what that is; 0: nothing.
+    """The running check and its progress. ``prompt``: number of the request to a person, 0 for none; ``ask``: its text.
 
     ``state`` is that of its job.
     """
@@ -53,5 +53,5 @@ class RunningCheck(Progress):
 
     @property
     def percent(self) -> float | None:
-        """Share of the planned time that is over; None: it is not planned."""
+        """Elapsed share of the planned time, percent; None if there is no plan."""
         return 100.0 * self.done / self.total if self.total > 0 else None

@@ -1,4 +1,4 @@
-"""The path that is being recorded."""
+"""The path in recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from abbe.service.domain.bounds import Number, Word
 class RecordedPath:
     """A path that is being recorded. ``angle_deg``: about the axis of the test, at even parts of the path's length, not wrapped.
 
-    Number 0: none is.
+    ``number`` 0: no path is being recorded.
     """
 
     number: Number = 0

@@ -1,4 +1,4 @@
-"""What is computed from runs: solutions, tables, checks, discoveries, models, as they are stored. One record is one row."""
+"""Stored results of runs: solutions, tables, checks, discoveries, models. One record is one row."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from abbe.service.domain.document import Doc
 
 @dataclass(frozen=True, slots=True)
 class SolutionRecord:
-    """What a solver found from some runs."""
+    """The result of a solver from some runs."""
 
     id: int
     campaign_id: int
@@ -46,7 +46,7 @@ class VerificationRecord:
 
 @dataclass(frozen=True, slots=True)
 class DiscoveryRecord:
-    """One search for what a campaign's model lacks. ``digest``: of readings, model and program; the same search has the same."""
+    """One search for what a campaign's model lacks. ``digest``: of readings, model and program, equal for equal searches."""
 
     id: int
     campaign_id: int
@@ -57,7 +57,7 @@ class DiscoveryRecord:
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """One state that a discovery reached, with what was known then. Never changed after writing; ``seq`` counts from 0."""
+    """One state that a discovery reached, with its evidence. Never changed after writing; ``seq`` counts from 0."""
 
     id: int
     discovery_id: int
@@ -69,7 +69,7 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class ModelRecord:
-    """One version of a machine's model. Never changed; ``version`` counts from 1. ``discovery_id``: what brought it, None for a person."""
+    """One version of a machine's model. Never changed; ``version`` counts from 1; ``discovery_id`` None: a person made it."""
 
     id: int
     machine: str
@@ -81,7 +81,7 @@ class ModelRecord:
 
 @dataclass(frozen=True, slots=True)
 class NewVersion:
-    """A new version of a machine's model. ``after``: the version that has to be current when it is stored; None: there is none."""
+    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: no version yet."""
 
     machine: str
     after: int | None

@@ -15,9 +15,9 @@ ERRORS_FORMAT = "abbe-errors/1"
 Test = Literal["ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear"]
 Role = Literal["identify", "holdout", "sealed"]
 Known = Literal["rigid6", "rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"]
-"""What the present simulation of a machine may know (run-format.md 4)."""
+"""Effects that the present simulation of a machine may include (run-format.md 4)."""
 ASSUMED_MODEL: tuple[Known, ...] = ("rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt")
-"""What it is taken to know where a campaign does not say; an empty list does say: nothing beyond linear errors and squareness."""
+"""Assumed if a campaign states nothing. An empty list is a statement: nothing beyond linear errors and squareness."""
 Numbers = list[float]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]+\.json$")]
@@ -33,7 +33,7 @@ SETUP_KEYS: dict[str, tuple[str, ...]] = {
 
 
 class Setup(FileObject):
-    """How the instrument was mounted. The test decides which keys are needed."""
+    """Mounting of the instrument. The test determines which keys are needed."""
 
     setup_id: str
     t_set_s: float
@@ -103,7 +103,7 @@ class RunFile(FileObject):
 
 
 class CurrentModel(FileObject):
-    """What the present simulation of the machine knows."""
+    """Effects that the present simulation of the machine includes."""
 
     includes: list[Known]
     errors: FileName | None = None
@@ -172,7 +172,7 @@ class Tabulated(FileObject):
 
 
 class LegendreSeries(FileObject):
-    """value(x) = sum c_k P_k(u), u from -1 to 1 over the stroke, mm or rad; the end value outside. An addition of Abbe's to the format."""
+    """value(x) = sum c_k P_k(u), u from -1 to 1 over the stroke, mm or rad; the end value outside. An extension of the format by Abbe."""
 
     kind: Literal["legendre"]
     coefficients: Annotated[Numbers, Field(min_length=1)]
@@ -180,7 +180,7 @@ class LegendreSeries(FileObject):
 
 
 class Spline(FileObject):
-    """B-spline, mm or rad; the end value outside knots[degree] .. knots[number of coefficients]. An addition of Abbe's to the format."""
+    """B-spline, mm or rad; the end value outside knots[degree] .. knots[number of coefficients]. An extension of the format by Abbe."""
 
     kind: Literal["bspline"]
     knots_mm: Numbers

@@ -1,6 +1,6 @@
-"""The timetable: what runs when, under which conditions, when nothing may start, and what comes next.
+"""The timetable: schedules, their conditions, windows in which nothing may start, and the next slot.
 
-The machine file, the scheduler, the channel and the interfaces use these records; limits and descriptions of their fields stand here alone.
+The machine file, the scheduler, the channel and the interfaces share these records, with limits and descriptions of their fields.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Cron = Annotated[str, AfterValidator(_cron)]
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What has to be so before a check starts; it waits for it as long as the grace."""
+    """Conditions for the start of a check, which waits for them during its grace."""
 
     idle: Annotated[bool, Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
     warm_min: Annotated[
@@ -66,7 +66,7 @@ class Needs:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """One line of the timetable: by cron expression or by interval. Its name is part of the key that makes a slot run once."""
+    """One line of the timetable: by cron expression or by interval. Its name is part of the key by which each slot runs only once."""
 
     name: Name
     cron: Annotated[Cron, Field(description="minute hour day month weekday, e.g. 0 6 * * 1 (Monday); six fields: seconds first")] = ""
@@ -95,12 +95,12 @@ class Schedule:
 
 
 def one_way(schedule: Schedule) -> Schedule:
-    """Return a schedule of the machine file.
+    """Return a valid schedule of the machine file.
 
     Raises
     ------
     ValueError
-        It has neither a cron expression nor an interval, or both, or an instant to count from without an interval.
+        The schedule has neither a cron expression nor an interval, or both, or ``first`` without an interval.
     """
     if bool(schedule.cron) == bool(schedule.every_h):
         raise ValueError(f"expected either cron = ... or every_h = ..., got {'both' if schedule.cron else 'neither'}")
@@ -111,7 +111,7 @@ def one_way(schedule: Schedule) -> Schedule:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A window in time: so many hours from each time of a cron expression, or from start to end on some days of the week.
+    """A window in time: a number of hours from each time of a cron expression, or from start to end on some days of the week.
 
     Hours are real time, also where the clocks change in them; start and end are wall time.
     """
@@ -126,25 +126,25 @@ class Window:
 
 
 def complete(window: Window) -> Window:
-    """Return a window of the machine file.
+    """Return a valid window of the machine file.
 
     Raises
     ------
     ValueError
-        It is neither one of a cron expression nor a weekly one, or both; or its wall times carry an offset.
+        The window is neither by cron expression nor weekly, or both; or its wall times carry an offset.
     """
     weekly = (bool(window.days), window.start is not None, window.end is not None)
     by_cron = (bool(window.cron), bool(window.hours))
     if not ((all(by_cron) and not any(weekly)) or (all(weekly) and not any(by_cron))):
         raise ValueError("expected either cron and hours, or days, start and end")
-    if any(moment is not None and moment.tzinfo is not None for moment in (window.start, window.end)):
+    if any(wall is not None and wall.tzinfo is not None for wall in (window.start, window.end)):
         raise ValueError("expected start and end without an offset: timezone says it")
     return window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DueSlot:
-    """What comes next of one schedule."""
+    """The next slot of one schedule."""
 
     schedule: Schedule
     slot_utc: datetime

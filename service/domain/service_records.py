@@ -1,4 +1,4 @@
-"""What an unattended service keeps of itself: alarms, slots, heartbeats, messages, answers, as they are stored. One record is one row."""
+"""Stored state of an unattended service: alarms, slots, heartbeats, messages, replies. One record is one row."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class AlarmEntryRecord:
 
 @dataclass(frozen=True, slots=True)
 class SlotRecord:
-    """One slot of a schedule and its outcome. ``reason``: the sentence to ``state``; ``finished_utc``: None while it is open."""
+    """One slot of a schedule and its outcome. ``reason``: a sentence on ``state``; ``finished_utc``: None while it is open."""
 
     id: int
     schedule: str
@@ -56,7 +56,7 @@ class OutboxRecord:
 
 @dataclass(frozen=True, slots=True)
 class ReplyRecord:
-    """The answer to the request of an idempotency key; ``status`` None: the request is still being worked on."""
+    """The answer to the request of an idempotency key; ``status`` None: the request is still in progress."""
 
     digest: str
     status: int | None

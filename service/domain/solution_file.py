@@ -23,7 +23,7 @@ class Versions(FileObject):
 
 
 class TableInForce(FileObject):
-    """A compensation table that runs were measured with: CRC-32 of its image; whether the controller said that it corrects anything."""
+    """A compensation table that runs were measured with: CRC-32 of its image; whether the controller reported that it acts."""
 
     crc: int
     acting: bool | None = None
@@ -64,7 +64,7 @@ class MotionValue(FileObject):
 
 
 class Rank(FileObject):
-    """Singular values above 1e-9 and 1e-3 of the largest, of so many coefficients."""
+    """Number of singular values above 1e-9 and 1e-3 of the largest, and number of coefficients."""
 
     rank: int
     of: int
@@ -72,7 +72,7 @@ class Rank(FileObject):
 
 
 class ObservabilityNumber(FileObject):
-    """How many times smaller these runs can make the error of a typical machine: at the worst place, at the median."""
+    """Factor by which these runs can reduce the error of a typical machine: at the worst place, at the median."""
 
     number: float
     median: float
@@ -81,7 +81,7 @@ class ObservabilityNumber(FileObject):
 
 
 class CorrelationValue(FileObject):
-    """Two parameters whose errors go together."""
+    """Two parameters with correlated errors."""
 
     first: str
     second: str
@@ -89,7 +89,7 @@ class CorrelationValue(FileObject):
 
 
 class RunResult(FileObject):
-    """How one run was fitted, µm."""
+    """Fit of one run, µm."""
 
     readings: int
     rms_um: float
@@ -131,7 +131,7 @@ class ResidualTestResult(FileObject):
 
 
 class WorstPoint(FileObject):
-    """Where the deviation is known worst: components and their uncertainties, µm; half-axis of the 95 % region of the vector."""
+    """Point where the deviation is known worst: components and their uncertainties, µm; half-axis of the 95 % region of the vector."""
 
     at_mm: Point
     deviation_um: Point
@@ -166,7 +166,7 @@ class Uncertainty(FileObject):
 
 
 class VerdictValue(FileObject):
-    """What may be done with the solution, what holds it down, and what the layout of the campaign would allow."""
+    """Usability of the solution, what limits it, and what the layout of the campaign would allow."""
 
     word: Literal["good", "usable with care", "mostly assumption"]
     text: str
@@ -183,7 +183,7 @@ class PackedMatrix(FileObject):
 
 
 class StoredPrediction(FileObject):
-    """Coefficients with all their uncertainty: predictions can be made again from them.
+    """Coefficients with their full uncertainty, from which predictions can be repeated.
 
     ``terms``: motion, Legendre order, axis (0 to 2) and component (0 to 2 translation, 3 to 5 rotation) of each; ``coefficients`` in mm or
     rad; ``scatter_mm``: standard deviation that a single approach of a point adds per component.
@@ -222,7 +222,7 @@ class MonteCarloCheck(FileObject):
 
 
 class MachineModel(FileObject):
-    """Version of the machine's model, its effects that were taken out of the readings, and those that are no matter for tables."""
+    """Version of the machine's model, its effects that were removed from the readings, and those that no table corrects."""
 
     version: int
     taken_out: list[str]
@@ -237,7 +237,7 @@ class LostMotion(FileObject):
 
 
 class TableTakenOut(FileObject):
-    """The table that the runs were measured with; what it did beyond smooth corrections was taken out, with this lost motion by axis."""
+    """The table that the runs were measured with; its effect beyond smooth corrections was removed, with this lost motion by axis."""
 
     crc: int | None = None
     lost_motion_mm: dict[str, LostMotion]
@@ -296,7 +296,7 @@ def stored_solution(doc: object, number: int) -> SolutionFile:
     Raises
     ------
     Unusable
-        It has another form: a version before this one stored it.
+        Another version stored it in another form.
     """
     try:
         return SolutionFile.read(doc)

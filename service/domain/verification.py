@@ -1,4 +1,4 @@
-"""A check that has ended."""
+"""Results of a check."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CheckFailure:
 
 @dataclass(frozen=True, slots=True)
 class CheckFigure:
-    """One figure of a check, in the unit at the end of its name. ``expanded``: its uncertainty, k = 2; None: not known."""
+    """One figure of a check, in the unit at the end of its name. ``expanded``: its uncertainty, k = 2; None: unknown."""
 
     name: str
     value: float | None
@@ -31,7 +31,7 @@ class CheckFigure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verification:
-    """One check. Figures end in their unit; uncertainties are expanded, k = 2. ``push``: the one that it decided on, 0 for none."""
+    """One check. Figures end in their unit; uncertainties are expanded, k = 2. ``push``: the push that it decided, 0 for none."""
 
     id: int
     machine: str
@@ -71,4 +71,4 @@ class CheckResult:
     duration_s: float
     text: str
     comparable: bool = True
-    """Whether the figures can be put beside those of other checks: the air was within its limits, no certificate had ended."""
+    """Whether the figures can be compared with other checks: the air was within its limits, and every certificate valid."""

@@ -30,7 +30,7 @@ async def recover_at_start(store: Store, site: Site) -> str | None:
     told = [run.text for run in runs]
     if await push_is_open(store, site.name, site.control):
         with lock_machine(site.urls.cnc):
-            async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), told=told.append):
+            async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), report=told.append):
                 pass
     return "; ".join(told) or None
 

@@ -19,7 +19,7 @@ from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposal_diff import compare, largest
-from abbe.service.compensation.proposals import Made, check_temperature, gather, make
+from abbe.service.compensation.proposals import StoredProposal, check_temperature, gather, make
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
@@ -167,7 +167,7 @@ async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> 
     return await note(AlarmKind.PROPOSED, doc | {"beside": known.doc["against"]})
 
 
-async def made_of(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> Made:
+async def made_of(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
     """Solve a measured campaign and store what follows as a proposal, on the table that the controller has in force.
 
     ``agree`` and ``by`` as in `proposals.make`, whose errors are raised as well as those of a device.
@@ -193,7 +193,7 @@ def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
         raise TableRefused(f"{rms_um:.1f} µm rms of the readings are no matter for tables, which promise {gain_um:.1f} µm", against)
 
 
-def promise_words(store: Store, made: Made) -> str:
+def promise_words(store: Store, made: StoredProposal) -> str:
     """A proposal that waits, as a sentence: what it promises with U (k = 2), its largest change, and what is not in the tables."""
     p = made.proposed.predicted
     gain, expanded = (p.before_mm - p.after_mm) * 1e3, 2e3 * p.u_model_mm

@@ -1,1 +1,1 @@
-"""The way of a compensation table into a controller, and back: a pure state machine, its journal, and the adapter that acts for it."""
+"""Push of a compensation table into a controller, and rollback: a pure state machine, its journal, and the adapter to a controller."""

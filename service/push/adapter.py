@@ -1,6 +1,6 @@
 """The port of the push machine to a real controller: one operation becomes one call of the driver, and its errors become outcomes.
 
-What a driver says decides nothing here: Refused means that nothing changed, Doubt that it is unknown. The machine decides.
+This module decides nothing: Refused means that nothing changed, Doubt that the result is unknown. The machine decides.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from abbe.service.push.semantic_digest import semantic_digest_of_image
 from abbe.service.sequences.interlocks import tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0
-"""How long a lease is taken for, and how often it is renewed while the machine is measured."""
+"""Length of a lease, and interval of its renewal while the machine is measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class PushActors:
-    """Who answers the machine's questions: the check of the table, the approval, the probe and the verification."""
+    """Answers to the machine's questions: check of the table, approval, probe, verification."""
 
     validate: Callable[[Journal], Awaitable[list[str]]]
     approve: Callable[[Journal], Awaitable[o.Approval | None]]
@@ -33,7 +33,7 @@ class PushActors:
 
 
 def no_actors() -> PushActors:
-    """For recoveries: they ask nothing, and what they were asked would be no."""
+    """Actors for a recovery, which asks no question: every answer is no."""
 
     async def no_reason(journal: Journal) -> list[str]:
         return ["nobody is there to check it"]
@@ -54,18 +54,16 @@ class ControllerPort:
     ----------
     controller : TableController
         Identified.
-    people : PushActors
-        Whom to ask.
     clock : Clock
-        Monotonic time of the approval.
+        Monotonic time, in which approvals expire.
     """
 
-    def __init__(self, controller: TableController, people: PushActors, clock: Clock) -> None:
-        self._c, self._people, self._clock = controller, people, clock
+    def __init__(self, controller: TableController, actors: PushActors, clock: Clock) -> None:
+        self._c, self._actors, self._clock = controller, actors, clock
         self._map = ""
 
     async def execute(self, op: Operation, journal: Journal) -> Outcome:
-        """Do one operation; never raises for what the controller or the link does."""
+        """Do one operation; raises nothing for what the controller or the link does."""
         try:
             return await self._execute(op, journal)
         except Refused as error:
@@ -106,14 +104,14 @@ class ControllerPort:
 
     async def _ask(self, kind: OperationKind, journal: Journal) -> Outcome:
         if kind is OperationKind.VALIDATE:
-            return o.Done(await self._people.validate(journal))
+            return o.Done(await self._actors.validate(journal))
         if kind is OperationKind.APPROVE:
-            approval = await self._people.approve(journal)
+            approval = await self._actors.approve(journal)
             return o.Refused("nobody approved it") if approval is None else o.Done(approval)
-        return o.Done(await self._while_leased(self._people.probe if kind is OperationKind.PROBE else self._people.verify, journal))
+        return o.Done(await self._while_leased(self._actors.probe if kind is OperationKind.PROBE else self._actors.verify, journal))
 
     async def _while_leased(self, question: Callable[[Journal], Awaitable[o.Verdict]], journal: Journal) -> o.Verdict:
-        """Measuring takes longer than a lease: it is renewed meanwhile. Where another has it, nothing of the measurement counts."""
+        """Measure while renewing the lease. If another owner takes it, the measurement does not count."""
         over, lost = asyncio.Event(), asyncio.Event()
         asked = asyncio.ensure_future(question(journal))
         beat = asyncio.ensure_future(self._beat(facts(journal).owner, over, lost))
@@ -123,16 +121,16 @@ class ControllerPort:
                 asked.cancel()
             await asyncio.wait([asked])
         finally:
-            over.set()  # not cancelled: a command on its way would leave the link in doubt
+            over.set()  # not cancelled: a command under way would leave the link in doubt
             await asyncio.wait([beat])
         if lost.is_set() and asked.cancelled():
             return o.Verdict(False, "another owner took the lease meanwhile")
         if not beat.cancelled():
-            beat.exception()  # a defect of the renewal is seen where the lease is looked at; what was measured counts
+            beat.exception()  # a failed renewal shows at the next look at the lease; the measurement counts
         return asked.result()
 
     async def _beat(self, owner: int, over: asyncio.Event, lost: asyncio.Event) -> None:
-        """Renew the lease until it is over; `lost` when another has it."""
+        """Renew the lease until ``over`` is set; set ``lost`` when another owner has it."""
         ended = asyncio.ensure_future(over.wait())
         try:
             while True:
@@ -147,12 +145,12 @@ class ControllerPort:
                     lost.set()
                     return
                 except (DriverError, TimeoutError):
-                    continue  # the measurement meets the same trouble, and decides
+                    continue  # the measurement meets the same fault, and decides
         finally:
             ended.cancel()
 
     async def _look(self) -> Truth:
-        """One look. A restart is accepted here, and nowhere else: the new boot id is what tells the machine."""
+        """One look. Only a look accepts a restart: the new boot id reports it to the machine."""
         if not self._map:
             self._map = (await self._c.identify()).firmware
         try:

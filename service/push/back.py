@@ -1,6 +1,6 @@
-"""The way back to the table that was in force before, and what a crash during it leaves: a pure function of journal and truth.
+"""Rollback to the table that was in force before, also after a crash during it: a pure function of journal and truth.
 
-It is taken by the process that began the push and by any later one; it may be broken off anywhere and begun again.
+The process that began the push runs it, or any later one; it may be interrupted anywhere and run again.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from abbe.service.push.operations import Knowledge, Operation, OperationKind, Re
 from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
 from abbe.service.push.states import PushState
 
-DOUBTS = 3
+MAX_UNANSWERED = 3
 BACKS = 3
 LEASES = 6
-"""Commands about the lease since the last entry: on a controller that answers and does nothing, this is no way to wait."""
+"""Limit of lease commands since the last entry: a controller that answers and does nothing must not be asked for ever."""
 OWNERS = 0xFFFF
-"""Owner ids of one push: the first for the way forward, a higher one for every lease on the way back."""
+"""Owner ids of one push: the first for the push itself, a higher one for every lease of the rollback."""
 
 
 def record(state: PushState, **doc: object) -> Operation:
@@ -33,29 +33,21 @@ def in_force(f: PushFacts, truth: Truth) -> str:
     return "neither"
 
 
-def seen(f: PushFacts, truth: Truth) -> Doc:
-    """What a person needs to compare: what the journal knows and what the controller says."""
-    says = {"boot": truth.boot, "gen": truth.gen, "active": truth.active, "crc": list(truth.crc), "states": list(truth.states)}
-    return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": says}
+def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
+    """For a person to compare: what the journal expects and what the controller reports."""
+    reported = {"boot": truth.boot, "gen": truth.gen, "active": truth.active, "crc": list(truth.crc), "states": list(truth.states)}
+    return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": reported}
 
 
 def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
-    """Next operation on the way back.
+    """Next operation of a rollback.
 
-    Parameters
-    ----------
-    f : PushFacts
-        What the journal says.
-    known : Knowledge
-        What this process knows.
-    state : PushState
-        Last state: ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING.
-    seq : int
-        Number of the last entry; every lease on the way back has a higher owner id than those before.
+    ``state``: the last one, ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry; every lease of a
+    rollback gets a higher owner id than those before.
     """
     if known.rested:
-        return Operation(OperationKind.END, text="the way back is not open now")
-    if known.doubts >= DOUBTS:
+        return Operation(OperationKind.END, text="the rollback is blocked now")
+    if known.unanswered >= MAX_UNANSWERED:
         return _pending(state, "the controller does not answer")
     if state is PushState.ACTIVATING_BACK and known.wrote_last and not known.asked:
         return Operation(OperationKind.ACTIVATE, bank=f.back_bank, crc=f.base_crc, gen=f.back_gen, owner=known.lease, text=BACK)
@@ -65,7 +57,7 @@ def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Opera
     if which == "base":
         return _arrived(f, known)
     if which == "neither":
-        return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.start))
+        return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **mismatch_doc(f, known.start))
     return _switch(f, known, state, seq)
 
 
@@ -78,23 +70,23 @@ def _arrived(f: PushFacts, known: Knowledge) -> Operation:
         return record(PushState.ROLLED_BACK, bank=step.truth.active)
     if known.brackets < BRACKETS:
         return Operation(OperationKind.LOOK, mark=True)
-    return record(PushState.OPERATOR, why="the active bank has the old table's CRC and another content", **seen(f, known.start))
+    return record(PushState.OPERATOR, why="the active bank has the old table's CRC and another content", **mismatch_doc(f, known.start))
 
 
 def _switch(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
-    """The new table is active and has to go."""
+    """The new table is active: replace it by the old one."""
     truth = known.start
     assert truth is not None
     if truth.unsafe:
         return _pending(state, f"not safe now: {truth.unsafe}")
     if truth.states[1 - truth.active] is BankState.LAID_ASIDE and truth.crc[1 - truth.active] == f.base_crc:
-        return _pending(state, "the old table acts after the control's next start: start it anew, and move nothing before")
+        return _pending(state, "the old table acts after the control's next start: restart it, and move nothing before")
     if state is PushState.ACTIVATING_BACK:
         text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation of the old table did not happen"
         return _pending(state, text) if known.backs >= BACKS else record(PushState.ROLLBACK, again=text)
     if state is PushState.ROLLBACK_PENDING:
         return (
-            record(PushState.ROLLBACK, again="the way back is open again")
+            record(PushState.ROLLBACK, again="the rollback is no longer blocked")
             if _lease_open(f, truth)
             else _pending(state, "leased by another")
         )
@@ -114,13 +106,13 @@ def _lease(f: PushFacts, known: Knowledge, truth: Truth, state: PushState, seq: 
         return _pending(state, "another owner has the lease")
     if known.leases + known.releases >= LEASES:
         return _pending(state, "the controller answers, but does not give or take the lease")
-    if truth.owner:  # of this push, from before: it is shut out first, also where another process holds it
+    if truth.owner:  # an earlier lease of this push: release it first, even if another process holds it
         return Operation(OperationKind.RELEASE, owner=truth.owner)
     return Operation(OperationKind.LEASE, owner=f.owner + 1 + seq)
 
 
 def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
-    """Use the old table where it still stands, restore it from the journal where the controller lost it, never over a person's work."""
+    """Activate the old table from its bank, or restore it from the journal if the controller lost it; never overwrite a person's work."""
     other, base = 1 - truth.active, f.base_image
     if truth.states[other] is BankState.SEALED and truth.crc[other] == f.base_crc:
         step = bracket(known, other, len(base) // 2, again=False)
@@ -132,7 +124,7 @@ def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
             return Operation(OperationKind.LOOK, mark=True)
     if truth.states[other] is BankState.EMPTY:  # the controller forgot it
         return _begin_restaging(truth, other)
-    if f.restaged:  # by this push, which was interrupted: what stands there may be ours
+    if f.restaged:  # by this push, which was interrupted: the bank may hold our chunks
         step = bracket(known, other, len(base) // 2, again=False)
         if isinstance(step, Operation):
             return step
@@ -140,7 +132,11 @@ def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
             return Operation(OperationKind.LOOK, mark=True)
         if step is not None and _ours(known.image or b"", base, 2 * f.chunk_words):
             return _begin_restaging(step.truth, other)
-    return record(PushState.OPERATOR, why="the old table is no longer in its bank, and somebody else put there what is", **seen(f, truth))
+    return record(
+        PushState.OPERATOR,
+        why="the old table is no longer in its bank, and somebody else wrote another one there",
+        **mismatch_doc(f, truth),
+    )
 
 
 def _armed(truth: Truth, bank: int, state: PushState) -> Operation:
@@ -153,14 +149,14 @@ def _begin_restaging(truth: Truth, bank: int) -> Operation:
     return record(PushState.RESTAGING, restaged=True, back_bank=bank, restage_gen=truth.gen, restage_boot=truth.boot)
 
 
-def _ours(held: bytes, base: bytes, size: int) -> bool:
+def _ours(content: bytes, base: bytes, size: int) -> bool:
     """Whether a bank holds nothing but chunks of the old table, and nothing where they are missing."""
-    chunks = [(held[at : at + size], base[at : at + size]) for at in range(0, len(base), size)]
-    return len(held) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
+    chunks = [(content[at : at + size], base[at : at + size]) for at in range(0, len(base), size)]
+    return len(content) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 
 
 def _restage(f: PushFacts, known: Knowledge, truth: Truth, state: PushState) -> Operation:
-    if not known.wrote_last:  # how far an earlier process came is not known: again from the beginning, with the generation of now
+    if not known.wrote_last:  # the progress of an earlier process is unknown: restart with the present generation
         return record(PushState.ROLLBACK, again="restoring the old table was interrupted")
     image = Image(
         f.back_bank, f.base_image, f.base_crc, f.base_meaning, known.lease,
@@ -170,7 +166,7 @@ def _restage(f: PushFacts, known: Knowledge, truth: Truth, state: PushState) -> 
     if isinstance(step, Coherent):
         return _armed(step.truth, image.bank, state)
     if isinstance(step, Failed):
-        return record(PushState.OPERATOR, why=step.why, **seen(f, truth)) if step.foreign else _pending(state, step.why)
+        return record(PushState.OPERATOR, why=step.why, **mismatch_doc(f, truth)) if step.foreign else _pending(state, step.why)
     return step
 
 

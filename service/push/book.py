@@ -1,4 +1,4 @@
-"""The durable journal of a push, in the database. An entry is on disk before what it permits; a second writer is shut out by the chain."""
+"""The durable journal of a push, in the database. An entry is on disk before what it permits; the chain shuts out a second writer."""
 
 from __future__ import annotations
 
@@ -8,28 +8,16 @@ from abbe.service.clock import Clock
 from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import UnsafeToMove
-from abbe.service.push.entries import GENESIS, WORD, Doc, Journal, JournalEntry, follow
+from abbe.service.push.entries import GENESIS, NO_PUSH, Doc, Journal, JournalEntry, follow
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.storage.store import Store
 
 
 class StoreBook:
-    """Journal of the last push into one control, or of its next one. Open it with `last`, `new` or `word`.
+    """Journal of the last push into one control, or of its next one. Open it with `last`, `new` or `for_acceptance`.
 
-    Parameters
-    ----------
-    store : Store
-        The database.
-    machine : str
-        Name of the journal (`Store.push_chain`): all pushes into one control share a chain, whatever the machine is called now.
-    clock : Clock
-        For the time of an entry.
-    push : int
-        Number of the push.
-    head : str
-        Digest of the last entry of the machine.
-    journal : tuple of JournalEntry
-        The push so far.
+    ``machine``: name of the journal (`Store.pushes.chain`): all pushes into one control share it, whatever the machine is called now.
+    ``head``: digest of the last entry in it; ``journal``: entries of this push so far.
     """
 
     def __init__(self, store: Store, machine: str, clock: Clock, push: int, head: str, journal: Journal) -> None:
@@ -38,13 +26,13 @@ class StoreBook:
 
     @classmethod
     async def last(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook | None:
-        """Journal of the last push of a machine's control, or of the word before the first (`WORD`); None if there was none."""
+        """Journal of the last push of a machine's control, or of acceptances before the first push (`NO_PUSH`); None if there is none."""
         chain = await asyncio.to_thread(store.pushes.chain, machine, control)
         return await cls.of_chain(store, chain, clock)
 
     @classmethod
     async def of_chain(cls, store: Store, chain: str, clock: Clock) -> StoreBook | None:
-        """The same of a journal by its own name."""
+        """Journal of the last push in the journal of this name; None if it is empty."""
         entries = await asyncio.to_thread(_entries_of, store, chain)
         if not entries:
             return None
@@ -52,10 +40,10 @@ class StoreBook:
         return cls(store, chain, clock, push, entries[-1].digest, tuple(entry for entry in entries if entry.push == push))
 
     @classmethod
-    async def word(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
-        """Where a person's word about the table in force is written: with the last push, or under `WORD` where there was none."""
+    async def for_acceptance(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
+        """Journal for a person's acceptance of the table in force: that of the last push, or `NO_PUSH` before the first."""
         chain = await asyncio.to_thread(store.pushes.chain, machine, control)
-        return await cls.of_chain(store, chain, clock) or cls(store, chain, clock, WORD, GENESIS, ())
+        return await cls.of_chain(store, chain, clock) or cls(store, chain, clock, NO_PUSH, GENESIS, ())
 
     @classmethod
     async def new(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
@@ -64,7 +52,7 @@ class StoreBook:
         Raises
         ------
         UnsafeToMove
-            The last push has not come to an end: it is finished first.
+            The last push is unfinished: finish it first.
         """
         chain = await asyncio.to_thread(store.pushes.chain, machine, control)
         book = await cls.of_chain(store, chain, clock)
@@ -87,7 +75,7 @@ class StoreBook:
         JournalBroken
             This state cannot follow.
         StoreError
-            Somebody else has written meanwhile, or the database does not take it.
+            Somebody else has written an entry meanwhile, or the database refuses it.
         """
         entry = follow(journal, self._push, state, doc, utc_text(self._clock.utc()), self._head)
         row = PushEntryRecord(
@@ -106,7 +94,7 @@ class StoreBook:
 
 
 def read_entries(store: Store, machine: str, control: str = "") -> list[JournalEntry]:
-    """All entries of a machine's control, of all its pushes, whatever the machine was called; ``control`` empty: by the name alone."""
+    """All entries of all pushes into a machine's control, whatever the machine was called; ``control`` empty: by the name alone."""
     return [_entry(r) for r in store.pushes.entries(machine, control)]
 
 

@@ -1,4 +1,4 @@
-"""A table as somebody proposes it, with everything that it was made from: plain values that may be wrong in any way."""
+"""A proposed table with its evidence: plain values, not yet checked."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 class Column:
     """Correction of one axis over the travel of one axis.
 
-    ``left_mm``: the machine's error in this column with the table in force, as it was measured: a correction against it makes it smaller.
-    ``reverse_mm``: corrections when coming from the other side, empty without; ``reversal_mm``: measured mean difference, reverse
-    minus forward.
+    ``left_mm``: the machine's measured error in this column with the table in force; a correction of opposite sign reduces it.
+    ``reverse_mm``: corrections for the reverse approach, or empty; ``reversal_mm``: measured mean difference, reverse minus forward.
     """
 
     moved: str
@@ -25,9 +24,9 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class TableEvidence:
-    """What the table was computed from. Lengths mm, ``machine_mark``: see `CandidateContext`.
+    """What the table was computed from. Lengths mm; ``machine_mark``: see `CandidateContext`.
 
-    ``ended_s``, ``last_s``: end of the oldest and of the newest run, seconds of the service's UTC; without the second there is one end.
+    ``ended_s``, ``last_s``: end of the oldest and of the newest run, seconds UTC by the service's clock; ``last_s`` None: the same.
     """
 
     run_count: int
@@ -44,7 +43,7 @@ class TableEvidence:
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSeal:
-    """Who vouches for the table: role and SHA-256 of what was signed; empty without a signature."""
+    """Who vouches for the table: role, and SHA-256 of the signed content; empty without a signature."""
 
     role: str = ""
     digest: str = ""
@@ -52,7 +51,7 @@ class EvidenceSeal:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A proposed table. ``base_crc``: of the table that was in force while it was measured, which is the one it may replace."""
+    """A proposed table. ``base_crc``: CRC of the table in force during the measurement, the only one that it may replace."""
 
     machine: str
     map_version: int
@@ -67,12 +66,12 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class CandidateContext:
-    """What the candidate is held against: this machine, its controller, the table in force, and now.
+    """What a candidate is checked against: this machine, its controller, the table in force, the time.
 
     Parameters
     ----------
     machine, machine_mark : str
-        Name; and a mark that changes with every reboot, crash alarm and maintenance, after which old measurements do not count.
+        Name; mark that changes with every reboot, crash alarm and maintenance, which invalidate older measurements.
     map_version, lsb_nm, bank_registers : int
         Of the controller.
     travel_mm : dict
@@ -84,11 +83,11 @@ class CandidateContext:
     month_ago : dict
         The same for the table of 30 days ago.
     now_s : float
-        UTC.
+        Seconds UTC.
     attended : bool
         A person who may approve is at the machine.
     last_push_s : float
-        When something was pushed last without a person; minus infinity for never.
+        Time of the last unattended push; minus infinity for never.
     """
 
     machine: str

@@ -16,32 +16,20 @@ from abbe.service.push.states import FOLLOWS, PushState
 
 Doc = dict[str, Any]
 GENESIS = "0" * 64
-WORD = 0
-"""Number under which a person's word about a table stands in a journal that has no push yet."""
+NO_PUSH = 0
+"""Push number of a person's acceptance in a journal that has no push yet."""
 
 
 class JournalBroken(ValueError):  # noqa: N818 - reads as what it is
-    """An entry does not follow from the one before it: the chain, the order or the transition is wrong."""
+    """An entry does not follow from the one before it: chain, order or transition are wrong."""
 
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
     """One transition of one push. Never changed after writing.
 
-    Parameters
-    ----------
-    push : int
-        Number of the push.
-    seq : int
-        Number of the entry in its push, from 0.
-    state : PushState
-        State that was reached.
-    doc : dict
-        What became known with it.
-    utc : str
-        When, for people.
-    prev, digest : str
-        SHA-256 of the entry before it (of any push of the machine), and of this one.
+    ``seq``: number of the entry in its push, from 0; ``doc``: what became known with the state; ``utc``: for people; ``prev``, ``digest``:
+    SHA-256 of the entry before it (of any push of the machine), and of this one.
     """
 
     push: int
@@ -57,7 +45,7 @@ Journal = tuple[JournalEntry, ...]
 
 
 def canonical(value: object) -> bytes:
-    """Write a JSON value in the one way in which it is hashed: keys sorted, no blanks, no NaN."""
+    """Canonical JSON for hashing: sorted keys, no blanks. Raises ValueError for NaN and Inf."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False).encode()
 
 
@@ -67,22 +55,7 @@ def digest_of(push: int, seq: int, state: PushState, doc: Doc, utc: str, prev: s
 
 
 def follow(journal: Journal, push: int, state: PushState, doc: Doc, utc: str, head: str) -> JournalEntry:
-    """Make the next entry of a push.
-
-    Parameters
-    ----------
-    journal : tuple of JournalEntry
-        The push so far; empty for its first entry.
-    push : int
-        Its number.
-    state : PushState
-        State that was reached.
-    doc : dict
-        What became known with it.
-    utc : str
-        When.
-    head : str
-        Digest of the last entry of the machine, `GENESIS` if there is none.
+    """Make the next entry of a push. ``head``: digest of the last entry of the machine, `GENESIS` if there is none.
 
     Raises
     ------
@@ -96,7 +69,7 @@ def follow(journal: Journal, push: int, state: PushState, doc: Doc, utc: str, he
 
 
 def _may_follow(push: int, last: PushState | None, state: PushState) -> bool:
-    return state in FOLLOWS[last] or (push == WORD and last is None and state is PushState.ACCEPTED)
+    return state in FOLLOWS[last] or (push == NO_PUSH and last is None and state is PushState.ACCEPTED)
 
 
 def check_chain(entries: Sequence[JournalEntry], head: str = GENESIS) -> None:
@@ -105,7 +78,7 @@ def check_chain(entries: Sequence[JournalEntry], head: str = GENESIS) -> None:
     Raises
     ------
     JournalBroken
-        Which entry does not follow, or was changed.
+        Names the entry that does not follow, or was changed.
     """
     last: dict[int, JournalEntry] = {}
     for entry in entries:
@@ -121,31 +94,31 @@ def check_chain(entries: Sequence[JournalEntry], head: str = GENESIS) -> None:
 
 
 NOT_YET = -1
-"""A figure that no entry of a push has given yet: no controller states it, so nothing is ever equal to it."""
+"""A number that no entry has stated yet: no controller reports it, so no comparison with it succeeds."""
 
 
 @dataclass(frozen=True, slots=True)
-class ControllerSays:
-    """What a controller said of its banks when a person was called: the active one, and the CRC of each."""
+class ReportedBanks:
+    """Banks as the controller reported them when a person was called: the active one, and the CRC of each."""
 
     active: int = NOT_YET
     crc: tuple[int, ...] = ()
 
     @property
     def in_force(self) -> int:
-        """CRC of the active bank; `NOT_YET` where nothing was noted."""
+        """CRC of the active bank; `NOT_YET` if nothing was noted."""
         return self.crc[self.active] if self.crc else NOT_YET
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushFacts(OperationOrder):
-    """Everything that a push's journal says, later entries over earlier ones, by the state whose entry brings it.
+    """Everything that a push's journal states; later entries override earlier ones. By the state whose entry brings it:
 
-    SNAPSHOT: the order, and what was read: boot id, generation and register map of the
-    controller, bank, CRC, bytes and meaning of the table in force, and the bank ``target`` to which the new one goes. REJECTED: reasons.
-    APPROVED: digest, who, until when. STAGED, ACTIVATING, PROBATION: generations, and the CRC that the activation expects. PROBED and
-    VERIFIED: what was found. RESTAGING and ACTIVATING_BACK: bank, generation and boot id for the way back. ROLLBACK_PENDING: what it waits
-    for. OPERATOR: why, and what the controller said. ACCEPTED: for which table a person vouches.
+    SNAPSHOT: the order; boot id, generation and register map of the controller; bank, CRC, bytes and semantic digest of the table in
+    force; the bank ``target`` for the new table. REJECTED: reasons. APPROVED: digest, approver, expiry. STAGED, ACTIVATING, PROBATION:
+    generations, and the CRC that the activation expects. PROBED, VERIFIED: the findings. RESTAGING, ACTIVATING_BACK: bank, generation and
+    boot id of the rollback. ROLLBACK_PENDING: what blocks it. OPERATOR: the reason, and the controller's report. ACCEPTED: the table that a
+    person vouches for.
     """
 
     boot: int = NOT_YET
@@ -174,7 +147,7 @@ class PushFacts(OperationOrder):
     why: str = ""
     again: str = ""
     pending: str = ""
-    controller: ControllerSays = field(default_factory=ControllerSays)
+    controller: ReportedBanks = field(default_factory=ReportedBanks)
     accepted_bank: int = NOT_YET
     accepted_crc: int = NOT_YET
     by: str = ""
@@ -185,7 +158,7 @@ class PushFacts(OperationOrder):
 
 
 def _bytes(text: str) -> bytes:
-    """Bytes of a hexadecimal text; none where somebody changed it into another."""
+    """Bytes of a hexadecimal text; empty if the text was tampered with."""
     try:
         return bytes.fromhex(text)
     except ValueError:
@@ -196,7 +169,7 @@ _CONVERTED: dict[str, Callable[[Any], Any]] = {
     "image": _bytes,
     "base_image": _bytes,
     "reasons": tuple,
-    "controller": lambda doc: ControllerSays(doc["active"], tuple(doc["crc"])),
+    "controller": lambda doc: ReportedBanks(doc["active"], tuple(doc["crc"])),
 }
 _NO_ORDER: Doc = {
     "machine": "",
@@ -216,17 +189,17 @@ _SNAPSHOT = frozenset({
 
 
 def facts(journal: Journal) -> PushFacts:
-    """Everything that a push's journal says, later entries over earlier ones."""
+    """Facts of a push from its journal; later entries override earlier ones."""
     return _parsed(_merged(journal))
 
 
 def facts_to_act_on(journal: Journal) -> PushFacts:
-    """The same, complete enough to act on a controller.
+    """Facts that are complete enough to act on a controller.
 
     Raises
     ------
     JournalBroken
-        The SNAPSHOT does not say all that the way back needs.
+        The SNAPSHOT lacks something that a rollback needs.
     """
     doc = _merged(journal)
     found = _parsed(doc)
@@ -243,22 +216,13 @@ def _merged(journal: Journal) -> Doc:
 
 
 def _parsed(doc: Doc) -> PushFacts:
-    said = {name: doc[name] if convert is None else convert(doc[name]) for name, convert in _FIELDS if name in doc}
-    return PushFacts(**(_NO_ORDER | said))
+    known = {name: doc[name] if convert is None else convert(doc[name]) for name, convert in _FIELDS if name in doc}
+    return PushFacts(**(_NO_ORDER | known))
 
 
 def approval_digest(image: bytes, *, base_image: bytes, machine: str, limits: str, expiry: str) -> str:
-    """SHA-256 that a person agrees to: exactly this table, on exactly this base, for this machine, under these limits, until then.
+    """SHA-256 that an approval binds: exactly this table on exactly this base, for this machine, under these limits, until ``expiry``.
 
-    Parameters
-    ----------
-    image, base_image : bytes
-        The new table and the one in force.
-    machine : str
-        Name of the machine.
-    limits : str
-        Digest of the limits (`abbe.service.push.limits.PushLimits.digest`).
-    expiry : str
-        When the approval ends.
+    ``limits``: their digest (`abbe.service.push.limits.PushLimits.digest`).
     """
     return hashlib.sha256(canonical([image.hex(), base_image.hex(), machine, limits, expiry])).hexdigest()

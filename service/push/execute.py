@@ -1,4 +1,4 @@
-"""Drive the push machine: ask what is next, do it through a port, learn from it. The only loop, for models and for machines alike."""
+"""Run the push machine: get the next operation, do it through a port, learn from its outcome. One loop for models and machines."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from abbe.service.push.states import TERMINAL, PushState
 
 
 class Port(Protocol):
-    """Does one operation on a controller, or asks the one who has to answer. Raises nothing for what a controller or a link does."""
+    """Does one operation on a controller, or asks an actor. Raises nothing for what a controller or a link does."""
 
     async def execute(self, op: Operation, journal: Journal) -> Outcome:
-        """Do it; `journal` is the push so far."""
+        """Do the operation; ``journal`` is the push so far."""
         ...
 
 
@@ -30,13 +30,13 @@ class Book(Protocol):
         ...
 
     async def append(self, journal: Journal, state: PushState, doc: Doc) -> JournalEntry:
-        """Write the next entry; on return it is on disk. Raises if it is not, or if somebody else wrote one meanwhile."""
+        """Write the next entry; on return it is on disk. Raises otherwise, or if somebody else wrote an entry meanwhile."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """Where a push, or its recovery, stands now. ``state`` None: nothing was begun. Not ``settled``: it has to be continued."""
+    """State of a push after this run. ``state`` None: nothing was begun. Not ``settled``: recovery has to continue it."""
 
     state: PushState | None
     journal: Journal
@@ -44,28 +44,25 @@ class Ended:
 
     @property
     def settled(self) -> bool:
-        """Nothing is left to do (or only a person can)."""
+        """Nothing is left to do, or only a person can do it."""
         return self.state is None or self.state in TERMINAL
 
 
-def _nobody() -> str:
+def _never_stop() -> str:
     return ""
 
 
-async def push(port: Port, book: Book, order: OperationOrder, *, stop: Callable[[], str] = _nobody) -> Ended:
-    """Bring a table into a controller, from the snapshot to KEEP, or back.
+async def push(port: Port, book: Book, order: OperationOrder, *, stop: Callable[[], str] = _never_stop) -> Ended:
+    """Push a table into a controller, from SNAPSHOT to KEEP, or roll back.
 
-    Parameters
-    ----------
-    stop : callable
-        Asked before every operation: a reason to end, or an empty text. What is active and not verified goes back.
+    ``stop`` is called before every operation: a reason to stop, or an empty text. A stop rolls an unverified table back.
     """
     return await _drive(port, book, (), Knowledge(mine=True), order, stop)
 
 
 async def recover(port: Port, book: Book) -> Ended:
-    """Finish what an interrupted push left, from its journal and from what the controller says. May be repeated at will."""
-    return await _drive(port, book, await book.entries(), Knowledge(), None, _nobody)
+    """Finish an interrupted push from its journal and the controller's state. May be repeated at will."""
+    return await _drive(port, book, await book.entries(), Knowledge(), None, _never_stop)
 
 
 async def _drive(

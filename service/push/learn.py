@@ -1,4 +1,4 @@
-"""What an outcome adds to what a process knows. Pure."""
+"""How an outcome changes the knowledge of a process. Pure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _QUESTIONS = frozenset({OperationKind.VALIDATE, OperationKind.APPROVE, Operation
 
 
 def after_record(known: Knowledge, state: PushState) -> Knowledge:
-    """After a journal entry everything about the controller is asked anew; what belongs to the process stays."""
+    """Knowledge after a journal entry: what concerns the controller is forgotten, what concerns the process stays."""
     return Knowledge(
         mine=known.mine,
         lease=known.lease,
@@ -22,18 +22,8 @@ def after_record(known: Knowledge, state: PushState) -> Knowledge:
 
 
 def learn(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
-    """Take an outcome into account.
-
-    Parameters
-    ----------
-    known : Knowledge
-        Before.
-    op : Operation
-        What was asked; neither RECORD nor END.
-    outcome : Done, Refused or Doubt
-        What came of it.
-    """
-    known = known._replace(doubts=known.doubts + 1 if isinstance(outcome, Doubt) else 0)
+    """Knowledge after the ``outcome`` of ``op``, which is neither RECORD nor END."""
+    known = known._replace(unanswered=known.unanswered + 1 if isinstance(outcome, Doubt) else 0)
     if op.kind is OperationKind.LOOK:
         return _looked(known, op, outcome)
     if op.kind in (OperationKind.READ, OperationKind.READ_AGAIN):
@@ -50,7 +40,7 @@ def _looked(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     if not isinstance(outcome, Done) or not isinstance(outcome.value, Truth):
         return known
     if op.mark:
-        return known._replace(start=outcome.value, truth=None, image=None, meaning=None, brackets=known.brackets + 1)
+        return known._replace(start=outcome.value, truth=None, image=None, decoded_digest=None, brackets=known.brackets + 1)
     return known._replace(truth=outcome.value)
 
 
@@ -60,7 +50,7 @@ def _read(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     done = isinstance(outcome, Done)
     if op.kind is OperationKind.READ:
         return known._replace(image=outcome.value if isinstance(outcome, Done) else b"", truth=None)
-    return known._replace(meaning=str(outcome.value) if done and isinstance(outcome, Done) else "unreadable", truth=None)
+    return known._replace(decoded_digest=str(outcome.value) if done and isinstance(outcome, Done) else "unreadable", truth=None)
 
 
 def _chunk(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
@@ -82,11 +72,11 @@ def _chunk(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
 
 
 def _commanded(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
-    known = known._replace(truth=None, start=None, image=None, meaning=None)
+    known = known._replace(truth=None, start=None, image=None, decoded_digest=None)
     if op.kind is OperationKind.LEASE:
         lease = known.lease if isinstance(outcome, Refused) else op.owner
         return known._replace(verdict=outcome, lease=lease, leases=known.leases + 1)
-    if op.kind is OperationKind.RELEASE:  # refused: somebody else has it, and the old owner is shut out all the same
+    if op.kind is OperationKind.RELEASE:  # a refusal means that another owner has it: the old owner is shut out either way
         known = known._replace(releases=known.releases + 1, stop=known.stop or op.text)
         return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)
     if op.kind is OperationKind.SEAL:
@@ -95,6 +85,6 @@ def _commanded(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
 
 
 FORGET = "forget"
-"""Text of a write that is to make a control forget what it laid aside."""
+"""Text of a write that makes a control discard a table that it laid aside."""
 BACK = "back"
-"""Text of an activation that leads back to the old table."""
+"""Text of an activation of the old table."""

@@ -1,4 +1,4 @@
-"""What a controller can do for a safe push, and what is allowed with it (reliability.md 3.1): declared by the adapter, then proved."""
+"""Capabilities of a controller for a safe push, and the pushes that they allow (reliability.md 3.1)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """Flags of one controller. Each is proved by its own commissioning test; one that was not proved is False."""
+    """Flags of one controller. Each is proved by its own commissioning test; an unproved one is False."""
 
     two_banks: bool = False
     swap_compares: bool = False
@@ -31,7 +31,7 @@ class Capabilities:
         return 1 if self.can_disable else 0
 
 
-NOT_ALONE = (
+NEEDS_ATTENDANCE = (
     "this controller was not proved to compare and swap, keep a lease and watch its axes: a person who approves has to be at the machine"
 )
 
@@ -41,7 +41,7 @@ def objection(level: int, *, attended: bool) -> str:
     if level >= 3:
         return ""
     if level == 2:
-        return "" if attended else NOT_ALONE
+        return "" if attended else NEEDS_ATTENDANCE
     if level == 1:
         return "this controller has one bank: pushes with drives off are not built yet; export the table as a file"
     return "this controller can only be read: export the table as a file"

@@ -1,4 +1,4 @@
-"""Limits of a table that is to be pushed (reliability.md 3.3). Exceeding one rejects the table; nothing is ever clamped to a limit."""
+"""Limits of a table to be pushed (reliability.md 3.3). Exceeding one rejects the table; nothing is ever clamped to a limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from abbe.service.push.entries import canonical
 
 @dataclass(frozen=True, slots=True)
 class PushLimits:
-    """Every figure that can reject a table. Lengths mm, times h, temperatures °C. Defaults are those of reliability.md 3.3.
+    """Every limit that can reject a table. Lengths mm, times h, temperatures °C. Defaults are those of reliability.md 3.3.
 
     Parameters
     ----------
@@ -46,5 +46,5 @@ class PushLimits:
     walk_mm: float = 0.05
 
     def digest(self) -> str:
-        """SHA-256 that an approval binds: under other limits it is another approval."""
+        """SHA-256 that an approval binds: it does not hold under other limits."""
         return hashlib.sha256(canonical(asdict(self))).hexdigest()

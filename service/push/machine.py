@@ -1,7 +1,7 @@
-"""The push protocol: what to do next, as a pure function of the journal and of what this process knows of the controller.
+"""The push protocol: the next operation as a pure function of the journal and of what this process knows of the controller.
 
-The same function is the crash recovery: a process that did not begin a push knows nothing, and from that alone nothing is activated any
-more, and what was activated without being verified goes back (reliability.md 3.2). Operations never follow from anything else.
+The same function is the crash recovery: a process that did not begin a push knows nothing; therefore it activates nothing new and rolls
+back what was activated without being verified (reliability.md 3.2). Operations depend on nothing else.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable
 
 from abbe.drivers.api import BankState
-from abbe.service.push.back import DOUBTS, OWNERS, go_back, in_force, record, seen
+from abbe.service.push.back import MAX_UNANSWERED, OWNERS, go_back, in_force, mismatch_doc, record
 from abbe.service.push.entries import Journal, PushFacts, facts_to_act_on
 from abbe.service.push.learn import FORGET
 from abbe.service.push.levels import objection
@@ -22,25 +22,15 @@ from abbe.service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, Pu
 STILL_S = 1.0
 """The axes must have stood for this long before anything is staged."""
 LEASE_LEFT_MS = 5000
-"""Less than this left of the lease: it may end between the last look and the activation."""
+"""With less than this left, the lease may end between the last look and the activation."""
 
 
 def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | None = None) -> Operation:
     """Decide what to do next.
 
-    Parameters
-    ----------
-    journal : tuple of Entry
-        All entries of one push; empty before its first.
-    known : Knowledge
-        What this process learned since its start, or since the last entry.
-    order : OperationOrder, optional
-        What is to be pushed; only needed while the journal is empty.
-
-    Returns
-    -------
-    Op
-        One operation. After it: `abbe.service.push.learn`, or for RECORD the entry and `after_record`.
+    ``journal``: all entries of one push, empty before its first; ``known``: what this process learned since its start, or since the last
+    entry; ``order``: needed only while the journal is empty. After the operation: `abbe.service.push.learn`, or for RECORD the entry and
+    `after_record`.
     """
     if not journal:
         return _begin(known, order) if order is not None else Operation(OperationKind.END, text="nothing was begun")
@@ -51,14 +41,14 @@ def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | N
         return go_back(f, known, state, journal[-1].seq)
     if state in BEFORE_ACTIVATION:
         why = known.stop if known.mine else "interrupted before activation"
-        why = why or ("the controller does not answer" if known.doubts >= DOUBTS else "")
+        why = why or ("the controller does not answer" if known.unanswered >= MAX_UNANSWERED else "")
         return _abandon(f, known, state, why) if why else _FORWARD[state](f, known)
     return _AFTER[state](f, known)
 
 
 def _leave(f: PushFacts, known: Knowledge) -> Operation:
-    """The push is over: its lease goes back, also one that a process left which died after the last entry."""
-    if known.doubts >= DOUBTS or known.fenced:
+    """The push has ended: release its lease, also one left by a process that died after the last entry."""
+    if known.unanswered >= MAX_UNANSWERED or known.fenced:
         return Operation(OperationKind.END)
     if known.lease:
         return Operation(OperationKind.RELEASE, owner=known.lease)
@@ -74,8 +64,8 @@ def _leave(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _begin(known: Knowledge, order: OperationOrder) -> Operation:
-    """Read the table in force, twice, between two looks."""
-    if known.stop or known.doubts >= DOUBTS:
+    """Read the table in force twice between two looks."""
+    if known.stop or known.unanswered >= MAX_UNANSWERED:
         return Operation(OperationKind.END, text=known.stop or "the controller does not answer")
     active = known.start.active if known.start else 0
     step = bracket(known, active, 0, again=True)
@@ -88,13 +78,13 @@ def _begin(known: Knowledge, order: OperationOrder) -> Operation:
         return Operation(OperationKind.END, text="the table in force does not have the CRC that the controller states, or keeps changing")
     truth = step.truth
     base = {"boot": truth.boot, "gen": truth.gen, "map": truth.map, "base_bank": active, "base_crc": truth.crc[active]}
-    base |= {"base_image": image.hex(), "base_meaning": known.meaning, "target": 1 - active}
+    base |= {"base_image": image.hex(), "base_meaning": known.decoded_digest, "target": 1 - active}
     return record(PushState.SNAPSHOT, **base, **order.doc())
 
 
 def _abandon(f: PushFacts, known: Knowledge, state: PushState, why: str) -> Operation:
-    """Before activation: give the lease back, and end. The table in force was never touched."""
-    if state not in (PushState.SNAPSHOT, PushState.VALIDATED) and not known.fenced and known.doubts < 2 * DOUBTS:
+    """Before activation: release the lease and end. The table in force was never touched."""
+    if state not in (PushState.SNAPSHOT, PushState.VALIDATED) and not known.fenced and known.unanswered < 2 * MAX_UNANSWERED:
         return Operation(OperationKind.RELEASE, owner=f.owner, text=why)
     return record(PushState.ABORTED, why=why)
 
@@ -158,7 +148,7 @@ def _stage(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _arm(f: PushFacts, known: Knowledge) -> Operation:
-    """The last look before the activation: everything once more."""
+    """The last look before the activation: check everything again."""
     truth = known.truth
     if truth is None:
         return Operation(OperationKind.LOOK)
@@ -175,7 +165,7 @@ def _arm(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
-    """Why what was read in the snapshot does not hold any more; empty if it does."""
+    """Why the snapshot no longer holds; empty if it does."""
     if truth.boot != f.boot:
         return "the controller restarted"
     if truth.map != f.map:
@@ -190,7 +180,7 @@ def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
 
 
 def _activate(f: PushFacts, known: Knowledge) -> Operation:
-    """One command; whatever came of it is asked from the controller, never guessed, and never sent again."""
+    """Send one command, never twice; its result is read from the controller, never guessed."""
     if known.mine and known.wrote_last and not known.asked and not known.stop:
         return Operation(OperationKind.ACTIVATE, bank=f.target, crc=f.expect_crc, gen=f.expect_gen, owner=f.owner)
     if known.mine and known.asked and not known.fenced and not known.stop:
@@ -201,8 +191,8 @@ def _activate(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _confirm(f: PushFacts, known: Knowledge) -> Operation | None:
-    """The new table is active and is, byte for byte, the approved one. None: it is not, or that cannot be shown."""
-    if known.doubts >= DOUBTS:
+    """Confirm that the new table is active and byte for byte the approved one. None: it is not, or this cannot be shown."""
+    if known.unanswered >= MAX_UNANSWERED:
         return None
     if known.start is not None and (in_force(f, known.start) != "candidate" or known.start.boot != f.boot):
         return None
@@ -215,8 +205,8 @@ def _confirm(f: PushFacts, known: Knowledge) -> Operation | None:
 
 
 def _unconfirmed(f: PushFacts, known: Knowledge) -> Operation:
-    """Shut out a command that may still be on its way, then look which table is in force."""
-    if known.doubts >= 2 * DOUBTS:
+    """Shut out a command that may still be under way, then look which table is in force."""
+    if known.unanswered >= 2 * MAX_UNANSWERED:
         return Operation(OperationKind.END, text="the controller does not answer: whether the new table is active is not known")
     if not known.fenced:
         return Operation(OperationKind.RELEASE, owner=f.owner)
@@ -227,11 +217,11 @@ def _unconfirmed(f: PushFacts, known: Knowledge) -> Operation:
         return _not_in_force(f, known, known.truth)
     if which == "candidate":
         return record(PushState.ROLLBACK, why=known.stop or "activated, but not confirmed")
-    return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **seen(f, known.truth))
+    return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **mismatch_doc(f, known.truth))
 
 
 def _not_in_force(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
-    """The old table acts. A control that laid the new one aside for its next start has to forget it: nothing will have verified it."""
+    """The old table acts. A control that laid the new one aside for its next start has to discard it: it would act unverified."""
     if truth.states[f.target] is BankState.LAID_ASIDE and truth.crc[f.target] == f.crc:
         return _forget(f, known, truth)
     if known.forgets:
@@ -241,18 +231,18 @@ def _not_in_force(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
 
 
 def _forget(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
-    """A bank that is written to is no table any more; only the holder of the lease writes."""
-    if known.forgets >= DOUBTS:
+    """Make the control discard a laid-aside table by writing into its bank; only the holder of the lease may write."""
+    if known.forgets >= MAX_UNANSWERED:
         why = "the control has laid the new table aside, uses it after its next start, and does not forget it: do not start it anew"
-        return record(PushState.OPERATOR, why=why, **seen(f, truth))
+        return record(PushState.OPERATOR, why=why, **mismatch_doc(f, truth))
     if known.lease and truth.owner == known.lease:
         data = f.image[: 2 * f.chunk_words]
         return Operation(OperationKind.WRITE, bank=f.target, count=len(data) // 2, data=data, text=FORGET)
-    if truth.owner or known.leases >= DOUBTS:
+    if truth.owner or known.leases >= MAX_UNANSWERED:
         return Operation(
             OperationKind.END, text="the control would use the new table after its next start, and another owner has the lease"
         )
-    return Operation(OperationKind.LEASE, owner=f.owner + 1)  # fenced off, and less than any lease on the way back
+    return Operation(OperationKind.LEASE, owner=f.owner + 1)  # fenced off, and lower than any lease of a rollback
 
 
 def _probation(f: PushFacts, known: Knowledge) -> Operation:
@@ -264,7 +254,7 @@ def _verify(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
-    """Move the machine and ask; every answer but a clear yes leads back."""
+    """Move the machine and ask; every answer but a clear yes rolls back."""
     why = _why_back(known)
     if why:
         return record(PushState.ROLLBACK, why=why)
@@ -283,7 +273,7 @@ def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushS
 
 
 def _keep(f: PushFacts, known: Knowledge) -> Operation:
-    """Once more: what is in force is what was approved and verified, byte for byte."""
+    """Confirm again that the table in force is, byte for byte, the approved and verified one."""
     why = _why_back(known)
     if why:
         return record(PushState.ROLLBACK, why=why)
@@ -298,10 +288,10 @@ def _keep(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _why_back(known: Knowledge) -> str:
-    """Unconfirmed means back: after a crash, when somebody asks to stop, when nothing answers."""
+    """Why to roll back, or empty: after a crash, on a stop, when nothing answers."""
     if not known.mine:
         return "interrupted before it was verified"
-    return known.stop or ("the controller does not answer" if known.doubts >= DOUBTS else "")
+    return known.stop or ("the controller does not answer" if known.unanswered >= MAX_UNANSWERED else "")
 
 
 _FORWARD: dict[PushState, Callable[[PushFacts, Knowledge], Operation]] = {

@@ -1,4 +1,4 @@
-"""What the push machine can ask for, what can come back, and what it knows of the controller. Plain values, no I/O."""
+"""Operations of the push machine, their outcomes, and what a process knows of the controller. Plain values, no I/O."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class OperationKind(Enum):
     READ = "read"
     """Read a bank in full. Value: its bytes."""
     READ_AGAIN = "read again"
-    """Read a bank in full once more and let the independent decoder say what it means. Value: digest of the meaning."""
+    """Read a bank in full once more and decode it independently. Value: its semantic digest."""
     VALIDATE = "validate"
     """Check the table without touching the controller. Value: list of reasons against it."""
     APPROVE = "approve"
@@ -45,7 +45,7 @@ class OperationKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One operation. Fields that a kind does not need are left as they are.
+    """One operation. Fields that a kind does not need keep their defaults.
 
     ``first`` and ``count`` are registers; ``data`` is what is written or expected; ``mark`` begins a bracket of reads between two looks.
     """
@@ -66,7 +66,7 @@ class Operation:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What the controller says of itself in one coherent look.
+    """What the controller reports in one coherent look.
 
     ``crc`` is 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty when interlocks hold and nothing moves.
     ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
@@ -89,8 +89,8 @@ class Truth:
 class Approval:
     """A person's (or the policy's) yes to exactly one table on exactly one base.
 
-    ``digest``: what was agreed to (`abbe.service.push.entries.approval_digest`). ``expiry``: when it ends, as text, part of the digest.
-    ``until_s``: the same end as monotonic host time, because somebody may set the wall clock.
+    ``digest``: what was approved (`abbe.service.push.entries.approval_digest`). ``expiry``: when it ends, as text, part of the digest.
+    ``until_s``: the same end in monotonic host time, because the wall clock can be set.
     """
 
     digest: str
@@ -109,21 +109,21 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The controller (or the one who was asked) did it and said so."""
+    """The controller, or the actor who was asked, confirmed the operation."""
 
     value: Any = None
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """It was understood and refused: nothing changed."""
+    """The operation was understood and refused: nothing changed."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """No valid answer: it may have happened, not have happened, or still happen."""
+    """No valid answer: the operation may have happened, or not, or still happen."""
 
     text: str
 
@@ -134,55 +134,55 @@ Outcome = Done | Refused | Doubt
 class Knowledge(NamedTuple):
     """What a process has learned since its start or since the last journal entry; a crash loses all of it.
 
-    A plain tuple: a sweep over all faults makes millions. A process that did not begin the push (``mine`` false) knows nothing: from that
-    alone the machine follows the rules of recovery.
+    A plain tuple: a sweep over all faults makes millions. A process that did not begin the push (``mine`` false) knows nothing; this alone
+    makes the machine follow the rules of recovery.
 
     Parameters
     ----------
     mine : bool
-        This process began the push and has not lost it.
+        This process began the push.
     truth : Truth, optional
         The last look, if nothing has happened since that could have changed it.
     start : Truth, optional
         The look that opened the present bracket of reads.
-    image, meaning : bytes, str, optional
+    image, decoded_digest : bytes, str, optional
         What was read within the bracket.
     brackets : int
         Brackets opened since the last entry.
     chunk, wrote, differs, unsure : int, bool, bool, bool
-        Chunks that were written and read back; whether the present one was written, came back different, got no valid answer.
+        Number of chunks written and read back; whether the present one was written, read back different, got no valid answer.
     written, rewrites, rewrites_here : int
-        Writes that certainly happened since the entry that permitted them; repeats in all, and of the present chunk.
+        Writes that certainly happened since the entry that permitted them; repeats in total, and of the present chunk.
     sealed : int
-        How often sealing was asked for.
+        Number of SEAL commands.
     asked : bool
         The one activation that the last entry permits was sent.
     lease, leases, releases, fenced : int, int, int, bool
-        Owner id under which the lease was asked for (0: not at all), how often, and how often it was given back since the last entry;
-        whether the old owner was shut out since then.
+        Owner id of the requested lease (0: none); number of requests and of releases since the last entry; whether the old owner was
+        shut out since then.
     forgets : int
-        Writes that were to make a control forget a table that it laid aside, since the last entry.
+        Writes since the last entry that make a control discard a table that it laid aside.
     verdict : Done, Refused or Doubt, optional
         Answer to the last question (validate, approve, probe, verify).
-    doubts : int
-        Operations without a valid answer in a row.
+    unanswered : int
+        Consecutive operations without a valid answer.
     backs : int
-        Activations of the old table that were sent by this process.
+        Activations of the old table that this process has sent.
     approved_until_s : float
         Monotonic time at which the approval ends.
     wrote_last : bool
-        This process wrote the last journal entry: what it permits was not done yet by anybody.
+        This process wrote the last journal entry: nobody has done yet what it permits.
     rested : bool
-        This process has just written that the way back is not open: it does not try again by itself.
+        This process has just recorded that rollback is blocked: it does not retry by itself.
     stop : str
-        Why a person or the service wants the push to end, or why it is being given up; empty if it goes on.
+        Why a person or the service stops the push, or why it is given up; empty while it continues.
     """
 
     mine: bool = False
     truth: Truth | None = None
     start: Truth | None = None
     image: bytes | None = None
-    meaning: str | None = None
+    decoded_digest: str | None = None
     brackets: int = 0
     chunk: int = 0
     wrote: bool = False
@@ -199,7 +199,7 @@ class Knowledge(NamedTuple):
     forgets: int = 0
     fenced: bool = False
     verdict: Outcome | None = None
-    doubts: int = 0
+    unanswered: int = 0
     backs: int = 0
     approved_until_s: float = 0.0
     wrote_last: bool = False

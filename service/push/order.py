@@ -1,4 +1,4 @@
-"""What a push is asked to do: one image, its independent meaning, and under which rules. All of it goes into the first journal entry."""
+"""The order of a push: one image, its semantic digest, and the rules. All of it goes into the first journal entry."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from abbe.service.domain.document import Doc
 
 @dataclass(frozen=True, slots=True)
 class OperationOrder:
-    """A table that shall be brought into a controller.
+    """A table to be pushed into a controller.
 
     Parameters
     ----------
     machine : str
-        Which machine.
+        Name of the machine.
     image : bytes
         As the controller will hold it, with its CRC-32 ``crc``.
     meaning : str
-        Digest of what the table means, computed from the tables and not from the image (`abbe.service.push.semantic_digest`).
+        Semantic digest, computed from the tables and not from the image (`abbe.service.push.semantic_digest`).
     limits : str
         Digest of the limits that it was checked against.
     owner : int
-        Owner id of the lease, u32, low 16 bits 0: those count the takings.
+        Owner id of the lease, u32, low 16 bits 0: those count the leases of one push.
     level : int
         Capability level of the controller (`abbe.service.push.levels`).
     attended : bool
@@ -30,11 +30,11 @@ class OperationOrder:
     chunk_words : int
         Registers of one write, even.
     table : int
-        Number of the table in the store; 0 if it is not kept there.
+        Id of the table in the store; 0 if it is not stored.
     control : str
-        Identity of the control (`abbe.service.devices.urls.control_of`); empty: not known.
+        Identity of the control (`abbe.service.devices.urls.control_of`); empty: unknown.
     process : dict
-        Which process pushes (`abbe.service.domain.owner.Owner`): no other process recovers while it lives.
+        The pushing process (`abbe.service.domain.owner.Owner`): while it lives, no other process recovers.
     """
 
     machine: str
@@ -51,7 +51,7 @@ class OperationOrder:
     process: Doc = field(default_factory=dict)
 
     def doc(self) -> Doc:
-        """What the journal keeps of it."""
+        """The document that the journal keeps."""
         return {
             "machine": self.machine,
             "image": self.image.hex(),

@@ -1,6 +1,6 @@
-"""What a table means, as a digest, on two ways that share no code: from the tables that were computed, and from what a bank holds.
+"""Semantic digest of a table in two ways that share no code: from the computed tables, and from the content of a bank.
 
-A sign, an axis or a unit that the encoder gets wrong makes the two differ. What both get wrong only the physical probe shows.
+If the encoder gets a sign, an axis or a unit wrong, the two differ. Only the physical probe shows what both get wrong.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Rows = list[tuple[str, str, list[tuple[int, int]]]]
 
 
 def semantic_digest_of_tables(tables: NineTables) -> str:
-    """Digest of corrections that are added to the command, (position in 10 nm, correction in nm) for each input and each corrected axis."""
+    """Digest of corrections (added to the command): position in 10 nm and correction in nm, for each moved and each corrected axis."""
     rows: Rows = []
     for a, moved in enumerate("XYZ"):
         for i, corrected in enumerate("XYZ"):
@@ -28,7 +28,7 @@ def semantic_digest_of_tables(tables: NineTables) -> str:
 
 
 def semantic_digest_of_image(image: bytes) -> str:
-    """Digest of what the independent decoder makes of a bank; ``"unreadable"`` where it makes nothing of it."""
+    """Digest of a bank as the independent decoder reads it; ``"unreadable"`` if it cannot."""
     try:
         curves = read_axis_tables(image)
     except UnreadableImage:

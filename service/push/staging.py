@@ -1,4 +1,4 @@
-"""Writing an image into the inactive bank so that it can be believed: chunk by chunk, then sealed, then read back twice in full. Pure."""
+"""Staging of an image in the inactive bank: write it chunk by chunk, seal it, read it back twice in full. Pure."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SEALS = 2
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """An image on its way into a bank. ``gen``: generation when writing was permitted. ``in_force``: CRC of the table that stays active."""
+    """An image to stage. ``gen``: generation when writing was permitted. ``in_force``: CRC of the table that stays active."""
 
     bank: int
     data: bytes
     crc: int
-    meaning: str
+    semantic_digest: str
     owner: int
     gen: int
     boot: int
@@ -30,7 +30,7 @@ class Image:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """It cannot be staged, and why. ``foreign``: somebody else has written into the bank."""
+    """The reason why staging failed. ``foreign``: somebody else has written into the bank."""
 
     why: str
     foreign: bool = False
@@ -38,31 +38,21 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class Coherent:
-    """A bracket of reads is closed: nothing changed from its first look to its last, which is this."""
+    """A closed bracket of reads: nothing changed between its first look and its last, ``truth``."""
 
     truth: Truth
 
 
 def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
-    """Next operation of a full read between two looks.
+    """Next operation of a full read between two looks; None: the looks differ, so somebody changed something in between.
 
-    Parameters
-    ----------
-    bank, count : int
-        What to read; ``count`` 0: as long as the image's header says.
-    again : bool
-        Read a second time and decode independently.
-
-    Returns
-    -------
-    Op, Coherent or None
-        None: the two looks differ, somebody changed something meanwhile.
+    ``count``: registers to read, 0 for the length in the image's header. ``again``: read a second time and decode independently.
     """
     if known.start is None:
         return Operation(OperationKind.LOOK, mark=True)
     if known.image is None:
         return Operation(OperationKind.READ, bank=bank, count=count)
-    if again and known.meaning is None:
+    if again and known.decoded_digest is None:
         return Operation(OperationKind.READ_AGAIN, bank=bank, count=len(known.image) // 2)
     if known.truth is None:
         return Operation(OperationKind.LOOK)
@@ -73,10 +63,7 @@ def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operatio
 def stage(image: Image, known: Knowledge) -> Operation | Failed | Coherent:
     """Next operation of staging, or its end.
 
-    Returns
-    -------
-    Op, Failed or Coherent
-        Coherent: the bank is sealed, both read-backs within one generation agree in bytes and in meaning.
+    Coherent: the bank is sealed, and both read-backs within one generation agree in bytes and in meaning.
     """
     if isinstance(known.verdict, Refused):
         return Failed(f"the controller refused: {known.verdict.text}")
@@ -98,7 +85,7 @@ def _chunk(image: Image, known: Knowledge) -> Operation | Failed:
         return Operation(OperationKind.READ_CHUNK, bank=image.bank, first=first, count=len(data) // 2, data=data)
     if known.truth is None:
         return Operation(OperationKind.LOOK)
-    # Another content than ours is overwritten only while the generation says that only we have written.
+    # Overwrite foreign content only while the generation proves that nobody else has written.
     if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):
         return Failed("somebody else wrote into the bank, or the controller restarted; what it holds now was left alone", foreign=True)
     if known.rewrites_here >= REWRITES_PER_CHUNK or known.rewrites >= REWRITES:
@@ -119,7 +106,7 @@ def _read_back(image: Image, known: Knowledge, words: int) -> Operation | Failed
         return Failed("the table in force changed during staging")
     if truth.states[image.bank] is not BankState.SEALED and known.sealed < SEALS:
         return Operation(OperationKind.SEAL, bank=image.bank, owner=image.owner)
-    if known.image != image.data or known.meaning != image.meaning:
+    if known.image != image.data or known.decoded_digest != image.semantic_digest:
         what = "bytes" if known.image != image.data else "meaning (independent decoder)"
         return _again(known, f"the bank does not hold what was sent: {what}")
     if truth.states[image.bank] is not BankState.SEALED or truth.crc[image.bank] != image.crc:

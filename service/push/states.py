@@ -1,4 +1,4 @@
-"""States of a push and which may follow which (reliability.md 3.2). A state is an entry of the journal, on disk before what it permits."""
+"""States of a push and their transitions (reliability.md 3.2). A state is a journal entry, on disk before what it permits."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from enum import StrEnum
 
 
 class PushState(StrEnum):
-    """Where a push stands. The value is what stands in the journal."""
+    """State of a push; the value is the text in the journal."""
 
     SNAPSHOT = "SNAPSHOT"
-    """The table in force was read twice and is kept here in full."""
+    """The table in force was read twice; the entry holds it in full."""
     REJECTED = "REJECTED"
     """Validation or approval said no; nothing was written."""
     VALIDATED = "VALIDATED"
@@ -28,20 +28,20 @@ class PushState(StrEnum):
     VERIFIED = "VERIFIED"
     KEEP = "KEEP"
     ROLLBACK = "ROLLBACK"
-    """The new table goes; permits finding the way back."""
+    """The new table has to go; permits preparing the rollback."""
     RESTAGING = "RESTAGING"
     """Permits writing the old table into the inactive bank."""
     ACTIVATING_BACK = "ACTIVATING_BACK"
     """Permits exactly one activation of the old table."""
     ROLLBACK_PENDING = "ROLLBACK_PENDING"
-    """The way back is not open now (interlock, link, lease): it is gone when it is, before anything else."""
+    """Rollback is blocked (interlock, link, lease): it runs as soon as it can, before anything else."""
     ROLLED_BACK = "ROLLED_BACK"
     ABORTED = "ABORTED"
     """The new table was never in force."""
     OPERATOR = "OPERATOR"
-    """The controller holds what the journal does not know: everything is frozen until a person has looked."""
+    """The controller holds a table unknown to the journal: nothing happens until a person has looked."""
     ACCEPTED = "ACCEPTED"
-    """A person has looked and vouches for what is in force."""
+    """A person has looked and vouches for the table in force."""
 
 
 S = PushState

@@ -1,4 +1,4 @@
-"""Reasons against the numbers of a table: what no number may be, what is too large or too steep, what would not help. Pure."""
+"""Reasons against the numbers of a table: invalid, too large or too steep, or of no use. Pure."""
 
 from __future__ import annotations
 
@@ -12,49 +12,44 @@ from abbe.service.push.limits import PushLimits
 
 LARGEST = 32767
 WHOLE = 0.01
-"""How far from a whole unit of the table a value may be: float noise only, so that rounding it costs nothing more."""
+"""Allowed distance of a value from a whole unit of the table, in units: float noise only."""
 ZERO_MM = 0.5e-6
 """A table that is not zero at its reference moves the axis at once when it comes into force."""
 
 
-def number_reasons(candidate: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """All reasons against the numbers of a candidate whose form is right."""
+def number_reasons(candidate: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
+    """All reasons against the numbers of a candidate of correct form."""
     odd = [reason for column in candidate.columns if (reason := _odd(column))]
     if odd:
         yield from odd
         return
-    lsb_mm = scene.lsb_nm * 1e-6
+    lsb_mm = context.lsb_nm * 1e-6
     for column in candidate.columns:
         name = f"table of {column.corrected} over {column.moved}"
-        active = scene.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
+        active = context.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
         for reason in _size(column, active, limits, lsb_mm):
             yield f"{reason} ({name})"
     for axis in sorted({column.corrected for column in candidate.columns}):
         total_mm = sum(max(abs(v) for v in column.correction_mm) for column in candidate.columns if column.corrected == axis)
         yield from together_reasons(axis, total_mm, limits)
-    yield from _whole(candidate, scene, limits)
+    yield from _whole(candidate, context, limits)
 
 
 def _odd(column: Column) -> str:
     for value in (*column.correction_mm, *column.reverse_mm, *column.left_mm, *column.position_mm):
         if not math.isfinite(value):
-            return f"NUMBER: {value} is none (table of {column.corrected} over {column.moved})"
+            return f"NUMBER: {value} is not finite (table of {column.corrected} over {column.moved})"
         if value == 0.0 and math.copysign(1.0, value) < 0.0:
             return f"NUMBER: minus zero (table of {column.corrected} over {column.moved})"
         if value != 0.0 and abs(value) < sys.float_info.min:
-            return f"NUMBER: {value} is too small to be one (table of {column.corrected} over {column.moved})"
+            return f"NUMBER: {value} is denormal (table of {column.corrected} over {column.moved})"
     return ""
 
 
 def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float], limits: PushLimits) -> Iterator[str]:
-    """What is too large or changes too much in one table: where, by how much, and the key of the machine file that limits it.
+    """Values, changes, steps and bends of one table beyond the limits: each with its place, its size and the key of its limit.
 
-    Parameters
-    ----------
-    p, v, active : sequence of float
-        Positions; corrections there, new and in force. Millimetres.
-    limits : PushLimits
-        What is allowed.
+    ``p``, ``v``, ``active``: positions, new corrections and those in force, mm.
     """
     steps = [b - a for a, b in pairwise(v)]
     changes = [a - b for a, b in zip(v, active, strict=True)]
@@ -72,7 +67,7 @@ def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float]
 
 
 def together_reasons(axis: str, total_mm: float, limits: PushLimits) -> Iterator[str]:
-    """Whether the three tables of an axis, each at its largest, reach too far; ``total_mm``: the sum of those."""
+    """The reason if the largest values of an axis' three tables add up to too much; ``total_mm``: their sum."""
     if total_mm > limits.value_mm:
         allowed = f"allowed are {limits.value_mm * 1e3:.1f} µm ([limits] table_value_um)"
         yield f"VALUE: the tables of {axis} together reach {total_mm * 1e3:.1f} µm, {allowed}"
@@ -99,17 +94,17 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
 
 
 def _reverse(column: Column) -> Iterator[str]:
-    """The difference of the two directions has to take away what was measured, not to double it."""
+    """The difference of the two directions has to reduce the measured reversal, not to double it."""
     table = sum(b - a for a, b in zip(column.correction_mm, column.reverse_mm, strict=True)) / len(column.reverse_mm)
     if abs(column.reversal_mm + table) > abs(column.reversal_mm):
-        seen_um, made_um = column.reversal_mm * 1e3, table * 1e3
-        yield f"DIRECTIONS: the two columns are exchanged (measured {seen_um:.1f} µm, the table adds {made_um:.1f} µm)"
+        measured_um, table_um = column.reversal_mm * 1e3, table * 1e3
+        yield f"DIRECTIONS: the two columns are exchanged (measured {measured_um:.1f} µm, the table adds {table_um:.1f} µm)"
 
 
-def _whole(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """Shadow simulation: the residual with the new table, from what was measured with the one in force."""
+def _whole(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
+    """Shadow simulation: predict the residual with the new table from measurements with the one in force."""
     values = [x for column in c.columns for x in column.correction_mm]
-    active = [x for column in c.columns for x in _active(column, scene)]
+    active = [x for column in c.columns for x in _active(column, context)]
     if values == active:
         yield "SAME: this table is in force already"
         return
@@ -117,7 +112,7 @@ def _whole(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterato
         yield "ZERO: it would only take the table in force away; that is a rollback"
     left = [x for column in c.columns for x in column.left_mm]
     if len(left) != len(values) or len(active) != len(values):
-        yield "RESIDUAL: what the machine shows was not given, so nothing can be predicted"
+        yield "RESIDUAL: the machine's residuals are missing, so nothing can be predicted"
         return
     after = [e + (new - old) for e, new, old in zip(left, values, active, strict=True)]
     before_mm, after_mm = _rms(left), _rms(after)
@@ -127,8 +122,8 @@ def _whole(c: Candidate, scene: CandidateContext, limits: PushLimits) -> Iterato
         yield f"{word}: {before_mm * 1e3:.2f} to {after_mm * 1e3:.2f} µm rms in the shadow"
 
 
-def _active(column: Column, scene: CandidateContext) -> tuple[float, ...]:
-    return scene.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
+def _active(column: Column, context: CandidateContext) -> tuple[float, ...]:
+    return context.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
 
 
 def _rms(values: list[float]) -> float:

@@ -12,7 +12,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
-from abbe.service.push.entries import NOT_YET, WORD, JournalBroken, JournalEntry, PushFacts, check_chain, facts
+from abbe.service.push.entries import NO_PUSH, NOT_YET, JournalBroken, JournalEntry, PushFacts, check_chain, facts
 from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
@@ -118,9 +118,9 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     """
     history = JournalView.read(store, machine, origins=False)
     entries = history.entries
-    journal = tuple(e for e in entries if e.push == number != WORD)
+    journal = tuple(e for e in entries if e.push == number != NO_PUSH)
     if not journal:
-        raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {WORD})}, counted from 1")
+        raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {NO_PUSH})}, counted from 1")
     known = facts(journal)
     machine = known.machine or machine  # name of the machine at the time of the push
     doc = _machine_doc(store, machine)

@@ -12,7 +12,7 @@ import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.clock import Clock
-from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved
+from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder, next_approved
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
@@ -153,7 +153,7 @@ class AlarmManager(RetryingStore):
         await self.line(number, kind, doc)
         return await self._read(alarm_numbered, self._store, self._machine, number)
 
-    async def settled(self, found: Approved, after: int, reported: JobOutcome) -> JobOutcome:
+    async def settled(self, found: ApprovedProposal, after: int, reported: JobOutcome) -> JobOutcome:
         """Record how a push later than ``after`` ended, by the journal; return that."""
         done = reconciled(await self._read(self._of_proposal, found.proposal, after), reported)
         await self._record_pushed(found.alarm, found.proposal, after, done)
@@ -163,7 +163,7 @@ class AlarmManager(RetryingStore):
         """Return the number of the machine's last push."""
         return (await self._read(JournalView.read, self._store, self._machine)).last_push
 
-    async def interrupted(self, found: Approved, after: int) -> None:
+    async def interrupted(self, found: ApprovedProposal, after: int) -> None:
         """Record at once where a push stands that is interrupted by the end of the service."""
         done = await asyncio.to_thread(self._of_proposal, found.proposal, after) or NOTHING_YET
         log.warning("the push was interrupted by the end of the service", word=done.word, text=done.text)
@@ -204,7 +204,7 @@ class AlarmManager(RetryingStore):
         terms = Schedule(f"push of proposal {found.proposal}", "", "UTC", "push", needs=replace(needs, idle=True))
         return FollowUp(terms, self.push_job(found, terms))
 
-    def push_job(self, found: Approved, terms: Schedule) -> Job[JobOutcome]:
+    def push_job(self, found: ApprovedProposal, terms: Schedule) -> Job[JobOutcome]:
         """Return the push of an approved proposal as a job."""
         return _ApprovedPush(self, found, terms)
 
@@ -301,7 +301,7 @@ class _ApprovedPush(_AlarmJob):
 
     kind = "push"
 
-    def __init__(self, manager: AlarmManager, found: Approved, terms: Schedule) -> None:
+    def __init__(self, manager: AlarmManager, found: ApprovedProposal, terms: Schedule) -> None:
         super().__init__(manager, terms)
         self._found, self._after, self._is_begun = found, 0, False
 

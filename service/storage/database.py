@@ -24,14 +24,8 @@ T = TypeVar("T")
 class Database:
     """Engine and writer thread. Any thread may call; in coroutines use ``await database.write(...)``.
 
-    Parameters
-    ----------
-    engine : Engine
-        The database, at the current schema.
-    writer : ThreadPoolExecutor
-        With exactly one thread: every write goes through it, so writes have one order and never wait for each other inside the database.
-    utcnow : callable
-        The clock of the time columns.
+    ``engine``: at the current schema. ``writer``: with exactly one thread: every write goes through it, so writes have one order and never
+    wait for each other inside the database. ``utcnow``: the clock of the time columns.
     """
 
     def __init__(self, engine: Engine, writer: ThreadPoolExecutor, utcnow: Callable[[], datetime]) -> None:
@@ -56,7 +50,7 @@ class Database:
         Raises
         ------
         StoreError
-            It cannot be opened, is no database, or belongs to a newer version.
+            The file cannot be opened, is no database, or belongs to a newer version.
         """
         engine = make_engine(url)
         writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="abbe-store")
@@ -70,7 +64,7 @@ class Database:
             raise
 
     def close(self) -> None:
-        """Finish the writes under way and close every connection. May be called twice."""
+        """Finish pending writes and close every connection. May be called twice."""
         self._writer.shutdown(wait=True)
         self.engine.dispose()
 
@@ -82,7 +76,7 @@ class Database:
 
     @property
     def is_postgresql(self) -> bool:
-        """Whether a PostgreSQL server keeps the data; else it is SQLite."""
+        """Whether a PostgreSQL server stores the data; otherwise it is SQLite."""
         return self.engine.dialect.name == "postgresql"
 
     def now(self) -> str:
@@ -123,14 +117,14 @@ class Database:
             return work(connection)
 
     def check_writable(self) -> None:
-        """Make sure that a write would succeed now; writes nothing.
+        """Check that a write would succeed now; writes nothing.
 
         Raises
         ------
         StoreError
-            It would not: read-only, locked by another process, gone.
+            The database is read-only, locked by another process, or gone.
         """
-        # For SQLite BEGIN IMMEDIATE asks for all that a write needs; a server says itself whether it takes writes.
+        # On SQLite BEGIN IMMEDIATE takes every lock that a write needs; a server states whether it takes writes.
         read_only = text("SELECT current_setting('transaction_read_only')")
 
         def work(connection: Connection) -> None:

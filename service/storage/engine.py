@@ -1,4 +1,4 @@
-"""How the database is opened: URL, SQLite's safety settings, and database errors as errors of this product."""
+"""Open the database: URL, SQLite's safety settings, and translation of database errors."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _SQLITE_MAGIC = b"SQLite format 3\x00"
 
 
 def wal_is_safe(version: str = sqlite3.sqlite_version) -> bool:
-    """Whether a SQLite of this version has the fix of the WAL-reset bug, which loses committed data (sqlite.org/wal.html).
+    """Whether this SQLite version has the fix of the WAL-reset bug, which loses committed data (sqlite.org/wal.html).
 
-    It is in 3.51.3 and later, and in the repaired 3.44.6+ and 3.50.7+.
+    Fixed in 3.51.3 and later, and in 3.44.6+ and 3.50.7+ of their branches.
     """
     number = tuple(int(part) for part in version.split("."))
     return number >= (3, 51, 3) or (number[:2] == (3, 44) and number >= (3, 44, 6)) or (number[:2] == (3, 50) and number >= (3, 50, 7))
@@ -51,7 +51,7 @@ def parse_url(url: str) -> URL:
     Raises
     ------
     StoreError
-        It is not a URL of SQLite or PostgreSQL; the remedy shows what one looks like.
+        The URL is not one of SQLite or PostgreSQL; the remedy shows examples.
     """
     try:
         parsed = make_url(url)
@@ -99,13 +99,13 @@ def make_engine(url: str) -> Engine:
 @contextmanager
 def translated(url: str) -> Iterator[None]:
     """Turn any SQLAlchemy error into one StoreError that names the database and hides its password."""
-    where = mask_secrets(url)
+    name = mask_secrets(url)
     try:
         yield
     except exc.OperationalError as err:
-        raise StoreError(f"database {where}: {_first_line(err)}", _remedy(str(err.orig))) from err
+        raise StoreError(f"database {name}: {_first_line(err)}", _remedy(str(err.orig))) from err
     except exc.SQLAlchemyError as err:
-        raise StoreError(f"database {where}: {_first_line(err)}") from err
+        raise StoreError(f"database {name}: {_first_line(err)}") from err
 
 
 def _to_json(value: Any) -> str:
@@ -159,7 +159,7 @@ def _check_file(parsed: URL) -> None:
 
 
 def _make_private(path: Path) -> None:
-    """An empty file for its owner only, before SQLite makes one for everybody; its journals get the same rights."""
+    """Create an empty file for its owner only, before SQLite makes one for everybody; journals inherit its rights."""
     try:
         os.close(private_file(path))
     except FileExistsError:
@@ -169,7 +169,7 @@ def _make_private(path: Path) -> None:
 
 
 def _set_pragmas(connection: sqlite3.Connection, _record: object) -> None:
-    connection.isolation_level = None  # we say BEGIN ourselves: the module's own rule starts transactions too late
+    connection.isolation_level = None  # we issue BEGIN ourselves: the module starts transactions too late
     cursor = connection.cursor()
     try:
         cursor.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")

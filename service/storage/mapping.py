@@ -1,6 +1,6 @@
-"""How rows become records, and which table each record is made of.
+"""Mapping of rows to records.
 
-A field of a record is the column of its name, unless its mapping names another column or a record inside.
+A field of a record is the column of the same name, unless its mapping names another column or a nested record.
 """
 
 from __future__ import annotations
@@ -24,16 +24,8 @@ class RecordMapping(Generic[R]):
 
     SQLAlchemy's own mapper writes its state into the object and refuses frozen ones (decision 0037).
 
-    Parameters
-    ----------
-    record : type
-        A dataclass.
-    table : Table
-        Where its rows stand.
-    source : FromClause, optional
-        What is read, where that is more than the table.
-    **other : ColumnElement or RecordMapping
-        Fields that are not the column of their name: another expression, or a record of several columns.
+    ``source``: the FROM clause to read, if it is more than the table. ``**other``: fields that are not the column of their name, given as
+    another expression or as the mapping of a nested record.
     """
 
     def __init__(
@@ -50,7 +42,7 @@ class RecordMapping(Generic[R]):
 
     @property
     def columns(self) -> list[ColumnElement[Any]]:
-        """What has to be selected for `read`."""
+        """The columns to select for `read`."""
         found: list[ColumnElement[Any]] = []
         for name, column in self._fields.items():
             found += column.columns if isinstance(column, RecordMapping) else [column.label(self._prefix + name)]
@@ -61,11 +53,11 @@ class RecordMapping(Generic[R]):
         return select(*self.columns).select_from(self._source)
 
     def read(self, row: Row[*tuple[Any, ...]]) -> R:
-        """The record of a row that holds `columns`, and maybe others."""
+        """The record of a row that holds `columns` and possibly others."""
         return self.from_values(row._mapping)  # noqa: SLF001 - SQLAlchemy's public name
 
     def from_values(self, values: Mapping[Any, Any]) -> R:
-        """The record of values by the names of `columns`."""
+        """The record of values by names of `columns`."""
         return self._make(
             **{
                 name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
@@ -74,7 +66,7 @@ class RecordMapping(Generic[R]):
         )
 
     def values(self, record: R, *without: str) -> dict[str, Any]:
-        """The columns of a record that its table stores, by their names; ``without``: fields that are given elsewhere."""
+        """The columns of a record that its table stores, by name, except the fields ``without``."""
         found: dict[str, Any] = {}
         for name, column in self._fields.items():
             if isinstance(column, RecordMapping):
@@ -85,7 +77,7 @@ class RecordMapping(Generic[R]):
 
 
 def owner_of(table: Table) -> RecordMapping[Owner]:
-    """The process that a row belongs to."""
+    """Mapping of the process that owns a row."""
     return RecordMapping(Owner, table, host=table.c.owner_host, pid=table.c.owner_pid, start=table.c.owner_start)
 
 

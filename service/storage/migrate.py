@@ -1,4 +1,4 @@
-"""Bring a database to the schema of this version, under a lock, with a backup copy of a SQLite file first."""
+"""Migrate a database to the schema of this version, under a lock; a SQLite file is copied first."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after
 
 @cache
 def known_revisions() -> tuple[str, ...]:
-    """Every schema revision that this program can upgrade, oldest first. Each has a file, ``rNNNN_what.py``; they form one line.
+    """Every schema revision that this program can upgrade, oldest first, from the files ``rNNNN_what.py``.
 
-    Alembic knows them too, but takes a quarter of a second to import, and nearly every database is up to date.
+    Not from Alembic, which takes a quarter of a second to import: nearly every database is up to date.
     """
     names = sorted(entry.name for entry in files(_VERSIONS).iterdir() if entry.name.startswith("r") and entry.name.endswith(".py"))
     return tuple(name[1:5] for name in names)
@@ -45,7 +45,7 @@ def current_revision(engine: Engine) -> str | None:
 
 
 def revision_of(connection: Connection) -> str | None:
-    """The same on a connection."""
+    """The schema revision of the database of a connection; None for an empty one."""
     if not inspect(connection).has_table(_TABLE):
         return None
     found = connection.exec_driver_sql(f"SELECT version_num FROM {_TABLE}").scalar()  # noqa: S608 - a name of our own
@@ -53,12 +53,12 @@ def revision_of(connection: Connection) -> str | None:
 
 
 def upgrade(engine: Engine, target: str = "head") -> None:
-    """Upgrade the schema to a revision; nothing happens if it is up to date.
+    """Upgrade the schema to a revision; does nothing if it is up to date.
 
     Raises
     ------
     StoreError
-        The database was written by a newer version of Abbe, or by one from before the first release.
+        A newer version of Abbe wrote the database, or one from before the first release.
     """
     before = current_revision(engine)
     if before == head_revision() and target == "head":
@@ -74,7 +74,7 @@ def upgrade(engine: Engine, target: str = "head") -> None:
 
 
 def downgrade(engine: Engine, target: str = "base") -> None:
-    """Undo schema changes down to a revision; data of removed tables are lost. ``"base"`` removes every table."""
+    """Undo schema changes down to a revision; the data of removed tables are lost. ``"base"`` removes every table."""
     from alembic import command
 
     with engine.begin() as connection:
@@ -113,8 +113,8 @@ def _backup(engine: Engine, revision: str) -> None:
     copy = Path(f"{database}.before-{revision}")
     if copy.exists():
         return
-    os.close(private_file(copy))  # VACUUM INTO takes an empty file, and leaves it its rights
-    raw = engine.raw_connection()  # VACUUM must stand outside of any transaction, also of those that the engine begins
+    os.close(private_file(copy))  # VACUUM INTO accepts an empty file and keeps its rights
+    raw = engine.raw_connection()  # VACUUM must run outside of any transaction, also of those that the engine begins
     try:
         raw.cursor().execute("VACUUM INTO ?", (str(copy),))
     finally:

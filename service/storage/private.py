@@ -10,15 +10,15 @@ from sqlalchemy.engine import make_url
 
 
 def private_file(path: Path) -> int:
-    """Make a new file with rights 0600; return it open for writing.
+    """Create a file with rights 0600; return it open for writing.
 
-    Made by root it belongs to the owner of its folder: `sudo abbe user add` must not leave files that the service cannot read. SQLite does
-    the same with its journals.
+    If root creates it, it gets the owner of its folder: `sudo abbe user add` must not leave files that the service cannot read. SQLite
+    does the same with its journals.
 
     Raises
     ------
     OSError
-        It is there already, or cannot be made.
+        The file exists or cannot be created.
     """
     file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     if hasattr(os, "geteuid") and os.geteuid() == 0:
@@ -28,8 +28,8 @@ def private_file(path: Path) -> int:
     return file
 
 
-def seen_by_others(path: Path) -> str:
-    """A warning if others than its owner may read or write a file; empty: they may not, or there is no such file or no such rights."""
+def readable_by_others(path: Path) -> str:
+    """A warning if accounts other than its owner may use a file; empty if not, or if there is no file or no POSIX rights."""
     try:
         rights = stat.S_IMODE(path.stat().st_mode)
     except OSError:
@@ -39,7 +39,7 @@ def seen_by_others(path: Path) -> str:
     return f"{path} has rights {rights:04o}: others than its owner may use it - chmod 600 {path}"
 
 
-def database_seen_by_others(url: str) -> str:
-    """The same of a database: empty also for a server's, which guards its own files."""
+def database_readable_by_others(url: str) -> str:
+    """The same for a SQLite database; empty for a server, which guards its own files."""
     parsed = make_url(url)
-    return seen_by_others(Path(parsed.database)) if parsed.drivername == "sqlite" and parsed.database else ""
+    return readable_by_others(Path(parsed.database)) if parsed.drivername == "sqlite" and parsed.database else ""

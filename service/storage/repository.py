@@ -1,4 +1,4 @@
-"""What every repository does: read records by their mapping, and insert rows."""
+"""Base of the repositories: read records through their mapping, insert rows."""
 
 from __future__ import annotations
 
@@ -19,13 +19,7 @@ Order = ColumnElement[Any]
 
 
 class Repository:
-    """Base of the repositories, one for each aggregate.
-
-    Parameters
-    ----------
-    database : Database
-        Where its tables are.
-    """
+    """Base of the repositories, one for each aggregate."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
@@ -33,17 +27,17 @@ class Repository:
     def _all(
         self, of: RecordMapping[R], *where: ColumnElement[bool], order: Order | None = None, newest: bool = False, limit: int | None = None
     ) -> list[R]:
-        """All records that fit, by ``order`` (by id if not given); with ``newest`` the largest come first."""
+        """All records that match, by ``order`` (default: id); with ``newest`` in descending order."""
         by = of.table.c.id if order is None else order
         query = of.select().where(*where).order_by(by.desc() if newest else by).limit(limit)
         return [of.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]
 
     def _first(self, of: RecordMapping[R], *where: ColumnElement[bool]) -> R | None:
-        """The first record that fits, None if there is none."""
+        """The first record that matches, None if there is none."""
         return next(iter(self._all(of, *where, limit=1)), None)
 
     def _get(self, of: RecordMapping[R], number: int, what: str, remedy: str = "") -> R:
-        """The record of a number. Raises NotStored."""
+        """The record of an id. Raises NotStored."""
         found = self._first(of, of.table.c.id == number)
         if found is None:
             raise NotStored(f"no {what} {number} in {self._db.url}", remedy)
@@ -61,11 +55,11 @@ def insert_row(connection: Connection, table: Table, **values: object) -> int:
     return int(key[0])
 
 
-def given(column: Column[Any], value: object) -> list[ColumnElement[bool]]:
-    """The condition that a column has a value; no condition where there is no value."""
+def if_given(column: Column[Any], value: object) -> list[ColumnElement[bool]]:
+    """The condition that a column equals a value; no condition for None."""
     return [] if value is None else [column == value]
 
 
 def dialect_insert(connection: Connection, table: Table) -> PostgresInsert | SqliteInsert:
-    """An insert that can say what happens when the row is there: each database has its own."""
+    """An insert with ON CONFLICT clauses, whose syntax differs between databases."""
     return postgres_insert(table) if connection.dialect.name == "postgresql" else sqlite_insert(table)

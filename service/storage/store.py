@@ -32,7 +32,7 @@ from abbe.service.storage.tables import identity, machines, outbox
 
 
 class Store(Database):
-    """Everything that is stored. Any thread may call; writes happen one after the other in one thread.
+    """All repositories of one database. Any thread may call; writes run one after the other in one thread.
 
     Open it with ``Store.open(url)``; in coroutines use ``await store.write(store.runs.start, ...)``.
     """
@@ -50,11 +50,11 @@ class Store(Database):
         self.pages = Pages(self)
 
     def database_id(self) -> str:
-        """The database's own name since its tables were made, at whatever address it is reached; 32 hex digits."""
+        """Identifier of the database, 32 hex digits, given when its tables were created and independent of its address."""
         return str(self.read(lambda connection: connection.execute(select(identity.c.uid)).scalar_one()))
 
     def health(self) -> StoreHealth:
-        """State of the database itself, for the diagnostics: schema, size, age, and how many messages wait; nothing is written."""
+        """State of the database for diagnostics: schema, size, age, waiting messages; writes nothing."""
         name = self.engine.url.database
         file = str(name) if not self.is_postgresql and not self.in_memory and name else ""
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
 from abbe.service.push.book import read_entries
-from abbe.service.push.entries import NOT_YET, WORD, Journal, JournalBroken, JournalEntry, PushFacts, check_chain, facts
+from abbe.service.push.entries import NO_PUSH, NOT_YET, Journal, JournalBroken, JournalEntry, PushFacts, check_chain, facts
 from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.storage.store import Store
 from abbe.service.tables.unverified import PushedTable, known_tables
@@ -151,7 +151,7 @@ class JournalView:
             check_chain(self.entries)
         except JournalBroken as error:
             raise JournalChanged(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
-        numbers = sorted({e.push for e in self.entries} - {WORD})
+        numbers = sorted({e.push for e in self.entries} - {NO_PUSH})
         return {n: self._of(n) for n in numbers}
 
     def _of(self, push: int) -> Journal:
@@ -294,7 +294,7 @@ class JournalView:
         if crc is None or not settled:
             return CurrentTable(None, "", summaries[-1].push, summaries[-1].ended, summaries[-1].text)
         for entry in reversed(self.entries):
-            if entry.push == WORD:
+            if entry.push == NO_PUSH:
                 return CurrentTable(crc, "accepted", 0, entry.utc, "a person vouches for the table that was there before the first push")
             one = next(t for t in summaries if t.push == entry.push)
             if entry.state is PushState.ACCEPTED and facts((entry,)).accepted_crc == crc:

@@ -132,7 +132,7 @@ async def accept_strange(controller: TableController, store: Store, site: Site, 
 
 async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
     """Record in the journal of the control that a person accepts the table in force. The last push must have ended."""
-    book = await StoreBook.word(store, site.name, SystemClock(), site.control)
+    book = await StoreBook.for_acceptance(store, site.name, SystemClock(), site.control)
     journal = await book.entries()
     await book.append(
         journal, PushState.ACCEPTED, acceptance_doc(now, by) | ({} if journal else {"machine": site.name, "control": site.control})

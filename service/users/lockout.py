@@ -1,4 +1,4 @@
-"""How often a password may be tried. In memory, bounded, never for ever: who waits may try again, also the last admin."""
+"""Rate limits for passwords: in memory, bounded and always temporary, so that the last admin cannot be locked out."""
 
 from __future__ import annotations
 
@@ -11,34 +11,28 @@ FREE = 5
 FREE_OF_ADDRESS = 20
 FIRST_S, LONGEST_S = 2.0, 900.0
 LONGEST_OF_ACCOUNT_S = 60.0
-"""All strangers together wait no longer than this for one account: guesses from ever new addresses get one try a minute, and its
-owner in a new place is not kept out by the quarter of an hour."""
+"""Longest wait of all unknown places together for one account: guesses from ever new addresses get one attempt a minute, and the owner at
+a new place does not have to wait `LONGEST_S`."""
 FORGET_S = 3600.0
 MOST = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Came:
-    """Where a try comes from.
+class LoginOrigin:
+    """Origin of a login attempt.
 
-    Parameters
-    ----------
-    address : str
-        Of the visitor.
-    device : str
-        Name of the browser, if this account has logged in with it before; empty: a stranger.
-    here : bool
-        The login comes from the service's own computer.
+    ``address``: of the visitor; ``device``: id of a browser with which this account has logged in before, or empty; ``local``: the login
+    comes from the service's own computer.
     """
 
     address: str
     device: str = ""
-    here: bool = False
+    local: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """What is counted under which key, how many failures are free, and how long the wait grows."""
+    """The key of a count (account and place), its free failures and its longest wait."""
 
     key: tuple[str, str]
     free: int = FREE
@@ -51,15 +45,15 @@ class _Count:
     until_s: float = 0.0
     last_s: float = 0.0
     before: tuple[float, float] = (0.0, 0.0)
-    """Both before the last try."""
+    """``until_s`` and ``last_s`` before the last attempt."""
 
 
 class Lockout:
     """Counts failures by account and place, and by address.
 
-    A browser or an address from which the account has logged in before, and the service's own computer, are places of their own: guesses
-    from elsewhere do not delay logins there. All other places of an account also wait together, so that ever new addresses are no more
-    guesses. A known browser does not even wait for others at its own address: behind a proxy all may have the same.
+    Each known place of an account (a browser or address of an earlier login, the service's own computer) counts on its own: guesses from
+    elsewhere do not delay logins there. All other places of an account also share one count, so that new addresses give no additional
+    guesses. A known browser does not even wait for its own address, which all may share behind a proxy.
 
     Parameters
     ----------
@@ -72,15 +66,15 @@ class Lockout:
         self._counts: OrderedDict[tuple[str, str], _Count] = OrderedDict()
         self._known: OrderedDict[tuple[str, str], None] = OrderedDict()
 
-    def wait_s(self, account: str, came: Came) -> float:
-        """Seconds until this account may be tried again from there; 0: now."""
+    def wait_s(self, account: str, origin: LoginOrigin) -> float:
+        """Seconds until the next attempt on this account from this origin; 0: now."""
         now = self._now_s()
-        return max(0.0, *(self._counts[rule.key].until_s - now for rule in self._rules(account, came) if rule.key in self._counts), 0.0)
+        return max(0.0, *(self._counts[rule.key].until_s - now for rule in self._rules(account, origin) if rule.key in self._counts), 0.0)
 
-    def failed(self, account: str, came: Came) -> float:
-        """Count a failure; return the seconds that have to pass before the next try."""
+    def failed(self, account: str, origin: LoginOrigin) -> float:
+        """Count a failure; return the seconds until the next attempt."""
         now = self._now_s()
-        for rule in self._rules(account, came):
+        for rule in self._rules(account, origin):
             count = self._counts.setdefault(rule.key, _Count())
             count.before = (count.until_s, count.last_s)
             if now - count.last_s > FORGET_S:
@@ -91,39 +85,39 @@ class Lockout:
             self._counts.move_to_end(rule.key)
         while len(self._counts) > MOST:
             self._counts.popitem(last=False)
-        return self.wait_s(account, came)
+        return self.wait_s(account, origin)
 
-    def succeeded(self, account: str, came: Came) -> None:
-        """Forget the failures of this account here, and know the address. Each try was counted as a failure when it began."""
-        for rule in self._rules(account, came):
+    def succeeded(self, account: str, origin: LoginOrigin) -> None:
+        """Clear the failures of this account at this place and remember the address. Each attempt was counted as a failure at its begin."""
+        for rule in self._rules(account, origin):
             count = self._counts.get(rule.key)
             if rule.key[0]:
                 self._counts.pop(rule.key, None)
             elif count is not None:
-                # Of the address only this try is not counted: the owner of one account could guess at all others for ever.
+                # For the address undo this attempt only: otherwise the owner of one account could guess at all others without limit.
                 count.failures = max(count.failures - 1, 0)
                 count.until_s, count.last_s = count.before
-        self._known[(_fold(account), _net(came.address))] = None
+        self._known[(_fold(account), _net(origin.address))] = None
         while len(self._known) > MOST:
             self._known.popitem(last=False)
 
-    def _rules(self, account: str, came: Came) -> tuple[_Rule, ...]:
-        account, net = _fold(account), _net(came.address)
-        if came.device:
-            return (_Rule((account, f"device {came.device}")),)
+    def _rules(self, account: str, origin: LoginOrigin) -> tuple[_Rule, ...]:
+        account, net = _fold(account), _net(origin.address)
+        if origin.device:
+            return (_Rule((account, f"device {origin.device}")),)
         of_address = _Rule(("", net), FREE_OF_ADDRESS)
-        if came.here or (account, net) in self._known:
+        if origin.local or (account, net) in self._known:
             return (_Rule((account, net)), of_address)
         return (_Rule((account, net)), _Rule((account, ""), longest_s=LONGEST_OF_ACCOUNT_S), of_address)
 
 
 def _fold(account: str) -> str:
-    # An empty name has a count of its own, not that of the address.
+    # An empty name must not share the count of the address.
     return account.casefold()[:100] or "-"
 
 
 def _net(address: str) -> str:
-    """What one visitor has of addresses: one of IPv4, 2^64 of IPv6."""
+    """The network of one visitor: a single IPv4 address, a /64 of IPv6."""
     try:
         found = ipaddress.ip_address(address)
     except ValueError:
@@ -134,15 +128,7 @@ def _net(address: str) -> str:
 
 
 class Buckets:
-    """Token buckets: so many at once, so many a second after that, for each key.
-
-    Parameters
-    ----------
-    rate_hz, burst : float
-        Tokens a second; most at once.
-    now_s : callable
-        Monotonic seconds.
-    """
+    """Token buckets by key: ``burst`` tokens at once, then ``rate_hz`` a second. ``now_s``: monotonic seconds."""
 
     def __init__(self, rate_hz: float, burst: float, now_s: Callable[[], float]) -> None:
         self._rate, self._burst, self._now_s = rate_hz, burst, now_s

@@ -1,4 +1,4 @@
-"""Passwords: argon2id, two hashes at a time, the same time for a user that does not exist."""
+"""Passwords: argon2id, two hashes at a time; an unknown user takes the same time as a known one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from argon2.exceptions import InvalidHashError, VerifyMismatchError
 from abbe.service.errors import PasswordRefused
 
 AT_A_TIME = 2
-"""Each hash takes 19 MiB and a processor for tens of milliseconds: many requests for one must not starve the capture."""
+"""Concurrent hashes. Each takes 19 MiB and a processor for tens of milliseconds: many logins must not starve the capture."""
 SHORTEST, LONGEST = 12, 256
 LEAST_DIFFERENT = 5
 T = TypeVar("T")
@@ -21,7 +21,7 @@ COMMON = ("password", "passwort", "qwertyuiop", "administrator", "letmein", "wel
 
 
 class Passwords:
-    """Makes and checks hashes. Any thread may call; at most `AT_A_TIME` are at work.
+    """Makes and checks hashes. Any thread may call; at most `AT_A_TIME` hashes run at once.
 
     Parameters
     ----------
@@ -38,34 +38,34 @@ class Passwords:
         self.hashes = 0
 
     def hash(self, password: str) -> str:
-        """Return the hash to keep."""
+        """Return the hash to store."""
         return self._work(lambda: self._hasher.hash(password))
 
     def verify(self, kept: str | None, password: str) -> bool:
-        """Tell whether a password belongs to a hash; without a hash (no such user) the work is done all the same."""
-        password = password[: LONGEST + 1]  # longer ones are never right, and are not read to their end
+        """Whether a password matches a hash; without a hash (unknown user) it does the same work."""
+        password = password[: LONGEST + 1]  # longer ones never match; do not hash them in full
 
         def work() -> bool:
             try:
-                self._hasher.verify(kept or self._nobody, password)
+                self._hasher.verify(kept or self._dummy_hash, password)
                 return kept is not None
             except (VerifyMismatchError, InvalidHashError):
                 return False
 
         if kept is None:
-            _ = self._nobody  # made once, before the first is timed
+            _ = self._dummy_hash  # computed once, before the first timed check
         return self._work(work)
 
     @cached_property
-    def _nobody(self) -> str:
+    def _dummy_hash(self) -> str:
         return self._hasher.hash("the hash of nobody's password")
 
     def prepare(self) -> None:
-        """Make ready what the first check of an unknown user would have to wait for."""
-        _ = self._nobody
+        """Compute the dummy hash for unknown users in advance."""
+        _ = self._dummy_hash
 
     def outdated(self, kept: str) -> bool:
-        """Tell whether a hash was made at another cost than today's."""
+        """Whether a hash was made at another cost than the present one."""
         return self._hasher.check_needs_rehash(kept)
 
     def _work(self, work: Callable[[], T]) -> T:
@@ -82,12 +82,12 @@ class Passwords:
 
 
 def check_new(name: str, password: str) -> None:
-    """Refuse a password that is guessed first.
+    """Refuse a password that is easily guessed.
 
     Raises
     ------
     PasswordRefused
-        Too short, too long, too few different characters, the user's name in it, or one that everybody tries.
+        The password is too short or too long, has too few different characters, holds the user's name, or is a common one.
     """
     low = password.lower()
     if not SHORTEST <= len(password) <= LONGEST:

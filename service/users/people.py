@@ -1,4 +1,4 @@
-"""What is done with users: added, changed, disabled, logged in and out, and who a secret belongs to."""
+"""Users: add, change, disable, log in and out, and find the owner of a secret."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from abbe.service.users.roles import ALLOWED, Permission, Role
 IDLE = timedelta(minutes=15)
 LONGEST = timedelta(hours=12)
 TOUCH = timedelta(seconds=30)
-"""A session's last use is written down no more often than this: a page that refreshes itself is not a write each time."""
+"""Shortest interval between stored uses of a session: a page that refreshes itself must not write each time."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 DEVICE = re.compile(r"[0-9a-f]{32}\.[0-9a-f]{64}")
 TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
@@ -30,18 +30,8 @@ TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 class Principal:
     """The account behind a request, and its permissions.
 
-    Parameters
-    ----------
-    name : str
-        ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``; so it stands in the audit.
-    role : Role or None
-        None: no account.
-    permissions : frozenset of Permission
-        What is allowed.
-    by : str
-        ``session``, ``token`` or ``nobody``.
-    digest : str
-        SHA-256 of the session's secret.
+    ``name``: ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``, as in the audit; ``role`` None: no account; ``by``: ``session``,
+    ``token`` or ``nobody``; ``digest``: SHA-256 of the session's secret.
     """
 
     name: str = "anonymous"
@@ -51,23 +41,13 @@ class Principal:
     digest: str = ""
 
 
-NOBODY = Principal()
-ONLOOKER = Principal("anonymous", Role.VIEWER, ALLOWED[Role.VIEWER])
-"""Who asks a service without users: it listens on this computer only, and shows."""
+ANONYMOUS = Principal()
+LOCAL_VIEWER = Principal("anonymous", Role.VIEWER, ALLOWED[Role.VIEWER])
+"""Any visitor of a service without users, which listens on this computer only and is read-only."""
 
 
 class People:
-    """Users of one database.
-
-    Parameters
-    ----------
-    store : Store
-        Its clock is that of all times here.
-    clock : Clock
-        Now.
-    passwords : Passwords, optional
-        Cost of the hashes.
-    """
+    """Users of one database."""
 
     def __init__(self, store: Store, clock: Clock, passwords: Passwords | None = None) -> None:
         self._store, self._clock = store, clock
@@ -79,7 +59,7 @@ class People:
         Raises
         ------
         UserRefused, PasswordRefused, StoreError
-            The name or role is none, the password is weak, or the name is taken.
+            The name or role is invalid, the password is weak, or the name is taken.
         """
         if not NAME.fullmatch(name):
             raise UserRefused(f"{name!r} is no name of a user", "1 to 64 letters, digits and . _ @ -, beginning with a letter or digit")
@@ -87,33 +67,27 @@ class People:
         self._store.people.add(name, role_of(role), self.passwords.hash(password))
 
     def get(self, name: str) -> UserRecord:
-        """A user by name.
-
-        Raises
-        ------
-        UserRefused
-            There is none.
-        """
+        """A user by name. Raises UserRefused."""
         user = self._store.people.find(name)
         if user is None:
             raise UserRefused(f"there is no user {name!r}", "`abbe user list` lists them")
         return user
 
     def set_role(self, name: str, role: str) -> None:
-        """Give a user another role; the user's sessions end, so that none keeps the old rights."""
+        """Change a user's role; the user's sessions end, so that none keeps the old permissions."""
         user, new = self.get(name), role_of(role)
         if new is not Role.ADMIN:
             self._keep_an_admin(user)
         self._store.people.change(user.id, role=new)
 
     def set_password(self, name: str, password: str) -> None:
-        """Give a user another password; the user's sessions end."""
+        """Change a user's password; the user's sessions end."""
         user = self.get(name)
         check_new(name, password)
         self._store.people.change(user.id, password=self.passwords.hash(password))
 
     def disable(self, name: str, *, enable: bool = False) -> None:
-        """Disable a user with all sessions and tokens, or enable the user again. Users are never deleted: the audit names them."""
+        """Disable a user with all sessions and tokens, or enable it again. Users are never deleted: the audit names them."""
         user = self.get(name)
         if not enable:
             self._keep_an_admin(user)
@@ -125,7 +99,7 @@ class People:
             raise UserRefused(f"{user.name!r} is the only admin", "make somebody else admin first: abbe user role")
 
     def check(self, name: str, password: str) -> UserRecord | None:
-        """The user, if the password is right and the user is not disabled. It takes as long for a user that does not exist."""
+        """The user, if the password matches and the user is enabled; else None. An unknown user takes the same time."""
         user = self._store.people.find(name) if NAME.fullmatch(name) else None
         right = self.passwords.verify(None if user is None else user.password, password)
         if not right or user is None or user.disabled_utc is not None:
@@ -135,11 +109,11 @@ class People:
         return user
 
     def known(self, name: str) -> bool:
-        """Tell whether there is such a user: what else is typed where a name belongs is not repeated anywhere, it may be a password."""
+        """Whether there is such a user. Callers must not repeat an unknown name: it may be a mistyped password."""
         return bool(NAME.fullmatch(name)) and self._store.people.find(name) is not None
 
     def begin(self, user: UserRecord, instead_of: str = "") -> str:
-        """Begin a session, always with a new secret; the session whose secret came with the login ends. Returns the secret."""
+        """Begin a session with a new secret and return it; the session with the secret ``instead_of`` ends."""
         secret = secrets.token_urlsafe(32)
         self._store.people.add_session(user.id, digest_of(secret), digest_of(instead_of) if instead_of else "")
         return secret
@@ -149,45 +123,45 @@ class People:
         self._store.people.end_session(digest_of(secret))
 
     def by_session(self, secret: str, *, in_use: bool = True) -> Principal:
-        """Who has this secret; `NOBODY` if the session has ended, was idle or is too old, or its user is disabled.
+        """Owner of a session's secret; `ANONYMOUS` if the session has ended, is idle or too old, or its user is disabled.
 
-        ``in_use`` False: this request does not count as use of the session, which stays idle.
+        ``in_use`` False: this request does not count as use of the session.
         """
         digest = digest_of(secret)
         found = self._store.people.session(digest)
         if found is None:
-            return NOBODY
+            return ANONYMOUS
         session, user = found
         now = self._clock.utc()
-        seen, begun = moment(session.seen_utc), moment(session.created_utc)
+        seen, begun = parse_utc(session.seen_utc), parse_utc(session.created_utc)
         if session.ended_utc is not None or user.disabled_utc is not None or now - seen > IDLE or now - begun > LONGEST:
-            return NOBODY
+            return ANONYMOUS
         if in_use and now - seen > TOUCH:
             self._store.people.touch_session(session.id)
         role = Role(user.role)
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
 
     def device_of(self, name: str, cookie: str) -> str:
-        """Name of the browser, if this user has logged in with it since the password was set; else empty.
+        """Id of a browser, if this user has logged in with it since the password was set; else empty.
 
-        The cookie is not kept: its seal is made with the hash of the user's password, which leaves the database nowhere.
+        The cookie is not stored: its seal is keyed with the hash of the user's password, which never leaves the database.
         """
         label, _, seal = cookie.partition(".")
         user = self._store.people.find(name) if DEVICE.fullmatch(cookie) and NAME.fullmatch(name) else None
         return label if user is not None and hmac.compare_digest(seal, _device_seal(user, label)) else ""
 
     def new_device(self, user: UserRecord) -> str:
-        """A cookie by which a browser is known again when this user logs in with it."""
+        """Make a cookie that identifies the browser at this user's next login."""
         label = secrets.token_hex(16)
         return f"{label}.{_device_seal(user, label)}"
 
     def add_token(self, name: str, title: str, scopes: list[str], days: float) -> str:
-        """Make a token of a user; return its text, which is kept nowhere.
+        """Make a token of a user; return its text, which is not stored.
 
         Raises
         ------
         UserRefused, StoreError
-            No such user or scope, a scope beyond the user's role, no sensible life time, or the title is taken.
+            The user or a scope does not exist, a scope exceeds the user's role, the life time is invalid, or the title is taken.
         """
         user = self.get(name)
         if not NAME.fullmatch(title):
@@ -209,46 +183,34 @@ class People:
         return text
 
     def revoke_token(self, name: str, title: str) -> None:
-        """Revoke a token.
-
-        Raises
-        ------
-        UserRefused
-            There is none of this name.
-        """
+        """Revoke a token. Raises UserRefused if there is none of this name."""
         found = [token for token, owner in self._store.people.tokens() if (owner.name, token.name) == (name, title)]
         if not found:
             raise UserRefused(f"{name!r} has no token {title!r}", "`abbe user token list` lists them")
         self._store.people.revoke_token(found[0].id)
 
     def by_token(self, text: str) -> Principal:
-        """Who has this token: the rights of its user today, at most those of its scopes; `NOBODY` if it does not hold."""
+        """Owner of a token, with the present permissions of its user within the token's scopes; `ANONYMOUS` if it is not valid."""
         match = TOKEN.fullmatch(text)
         found = self._store.people.token(match[1]) if match else None
         if found is None:
-            return NOBODY
+            return ANONYMOUS
         token, user = found
         right = hmac.compare_digest(token.digest, digest_of(text))
-        over = moment(token.expires_utc) <= self._clock.utc()
+        over = parse_utc(token.expires_utc) <= self._clock.utc()
         if not right or over or token.revoked_utc is not None or user.disabled_utc is not None:
-            return NOBODY
+            return ANONYMOUS
         role = Role(user.role)
         scopes = frozenset(Permission(s) for s in token.scopes)
         return Principal(f"token:{user.name}/{token.name}", role, ALLOWED[role] & scopes, "token")
 
-    def anybody(self) -> bool:
-        """Whether there is a user, even a disabled one: then reading needs a login."""
+    def has_users(self) -> bool:
+        """Whether there is any user, even a disabled one; if so, reading needs a login."""
         return bool(self._store.people.all())
 
 
 def role_of(text: str) -> Role:
-    """A role by name.
-
-    Raises
-    ------
-    UserRefused
-        There is none.
-    """
+    """A role by name. Raises UserRefused."""
     try:
         return Role(text)
     except ValueError:
@@ -261,10 +223,10 @@ def _device_seal(user: UserRecord, label: str) -> str:
 
 
 def digest_of(secret: str) -> str:
-    """SHA-256 of a secret of 256 random bits: nothing slower is needed, there is nothing to guess."""
+    """SHA-256 of a secret. It has 256 random bits, so no slow hash is needed."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-def moment(text: str) -> datetime:
-    """A time of the database."""
+def parse_utc(text: str) -> datetime:
+    """Parse a stored time into UTC."""
     return datetime.fromisoformat(text).astimezone(UTC)

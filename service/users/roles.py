@@ -1,4 +1,4 @@
-"""Roles and what each may do: the one table that decides. What is not in it is not allowed."""
+"""Roles and their permissions: the one table that decides. What is not in it is forbidden."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Role(StrEnum):
-    """What a person is in this service. One role for each person."""
+    """The role of a person; each person has one."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
@@ -16,7 +16,7 @@ class Role(StrEnum):
 
 
 class Permission(StrEnum):
-    """One kind of thing that can be done. Also the scopes of tokens."""
+    """A permission; also a scope of tokens."""
 
     READ = "read"
     MEASURE = "measure"
@@ -37,6 +37,6 @@ ALLOWED: dict[Role, frozenset[Permission]] = {
     Role.METROLOGIST: _OPERATOR | {Permission.SOLVE, Permission.PROPOSE},
     # Approvers judge what others propose: one who also measures and proposes would judge their own work.
     Role.APPROVER: frozenset({Permission.READ, Permission.ACKNOWLEDGE, Permission.APPROVE, Permission.AUDIT}),
-    # Gives rights and keeps the settings. Neither proposes nor approves a table.
+    # Manages users and settings. Neither proposes nor approves a table.
     Role.ADMIN: frozenset({Permission.READ, Permission.CONFIGURE, Permission.AUDIT, Permission.USERS}),
 }

@@ -221,7 +221,7 @@ async def test_never_proved_is_for_attended_pushes_only_and_says_so(place):
         (OneBank, {"two_banks", "generation", "lease", "swap_compares", "interlocks"}, 0, "a write into one bank is not kept apart"),
         (OpenBank, {"two_banks"}, 0, "the bank in force takes writes"),
         (NeverSeals, {"two_banks", "swap_compares", "interlocks"}, 0, "cannot be made ready"),
-        (TakesNothing, {"swap_compares"}, 2, "what is right is refused as well"),
+        (TakesNothing, {"swap_compares"}, 2, "a correct activation is refused as well"),
     ],
 )
 async def test_a_controller_that_does_not_keep_a_promise_is_found_and_not_trusted_by_night(place, kind, lost, level, words):
@@ -266,7 +266,7 @@ async def test_where_nothing_may_move_the_watch_over_the_axes_is_not_proved(plac
     found = await commission_levels(b.session.controller, store, b.site)
     missing = {name: text for name, ok, text in found.rows() if not ok}
     assert "no axis may move: the spindle turns" in missing["interlocks"]
-    assert "what is right is refused as well: interlock" in missing["swap_compares"]
+    assert "a correct activation is refused as well: interlock" in missing["swap_compares"]
     assert found.capabilities.level == 2
 
 

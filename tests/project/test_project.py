@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base
-from abbe.service.backup.restore import BESIDE
+from abbe.service.backup.restore import SQLITE_SUFFIXES
 from abbe.service.capture.settings import CaptureSettings, segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.storage.migrate import known_revisions
@@ -67,7 +67,7 @@ def test_what_lies_beside_a_database_is_not_committed(tmp_path: Path, monkeypatc
     for stem in ("abbe", "my shop"):
         file = tmp_path / f"{stem}.sqlite3"
         key, heads = files_of(sqlite_base(file))
-        beside = [Path(f"{file}{ending}") for ending in (*BESIDE, *(f".before-{revision}" for revision in known_revisions()))]
+        beside = [Path(f"{file}{ending}") for ending in (*SQLITE_SUFFIXES, *(f".before-{revision}" for revision in known_revisions()))]
         names |= {one.name for one in (*beside, key, heads)} | {f"{segment_folder(f'sqlite:///{file}', CaptureSettings()).name}/run-1"}
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         AuditBook(store, f"sqlite:///{tmp_path / 'abbe.sqlite3'}").write(AuditEvent(who="a", action="b", target="c", outcome="done"))

@@ -17,12 +17,12 @@ Made = tuple[Candidate, CandidateContext]
 
 
 def good(rng: Random) -> Made:
-    """A table that nothing speaks against, with the scene that it is for."""
+    """A table that nothing speaks against, with the context that it is for."""
     columns = tuple(_column(a, i, rng) for a in "XYZ" for i in "XYZ")
     active = {(c.moved, c.corrected): (0.0,) * N for c in columns} | {("X", "X"): (0.0, *(10 * LSB_MM,) * (N - 1))}
     evidence = TableEvidence(4, NOW_S - 3600.0, (20.0, 20.6), 0.0005, 0.0004, 0.006, 0.0005, "mark 7", (NOW_S + 1e6, NOW_S + 2e6))
-    scene = CandidateContext("mill", "mark 7", 1, 100, 4800, dict.fromkeys("XYZ", (0.0, 800.0)), {}, 0xABCD, active, {}, NOW_S)
-    return signed(Candidate("mill", 1, 100, "mm", columns, 0xABCD, evidence, "")), scene
+    context = CandidateContext("mill", "mark 7", 1, 100, 4800, dict.fromkeys("XYZ", (0.0, 800.0)), {}, 0xABCD, active, {}, NOW_S)
+    return signed(Candidate("mill", 1, 100, "mm", columns, 0xABCD, evidence, "")), context
 
 
 def _column(moved: str, corrected: str, rng: Random) -> Column:
@@ -50,9 +50,9 @@ def _values(change: Callable[[tuple[float, ...], Random], tuple[float, ...]]) ->
     """A class that spoils the corrections of one column."""
 
     def make(rng: Random) -> Made:
-        candidate, scene = good(rng)
+        candidate, context = good(rng)
         at = rng.randrange(9)
-        return _with(candidate, at, correction_mm=change(candidate.columns[at].correction_mm, rng)), scene
+        return _with(candidate, at, correction_mm=change(candidate.columns[at].correction_mm, rng)), context
 
     return make
 
@@ -61,23 +61,23 @@ def _everywhere(factor: float) -> Callable[[Random], Made]:
     """A class that multiplies the whole table, the first one of its machine."""
 
     def make(rng: Random) -> Made:
-        candidate, scene = good(rng)
+        candidate, context = good(rng)
         columns = tuple(
             replace(
                 c, correction_mm=tuple(factor * v if v else 0.0 for v in c.correction_mm), left_mm=tuple(0.0 - v for v in c.correction_mm)
             )
             for c in candidate.columns
         )
-        return signed(replace(candidate, columns=columns)), replace(scene, active={})
+        return signed(replace(candidate, columns=columns)), replace(context, active={})
 
     return make
 
 
 def _positions(change: Callable[[list[float], Random], list[float]]) -> Callable[[Random], Made]:
     def make(rng: Random) -> Made:
-        candidate, scene = good(rng)
+        candidate, context = good(rng)
         at = rng.randrange(9)
-        return _with(candidate, at, position_mm=tuple(change(list(candidate.columns[at].position_mm), rng))), scene
+        return _with(candidate, at, position_mm=tuple(change(list(candidate.columns[at].position_mm), rng))), context
 
     return make
 
@@ -88,27 +88,27 @@ def _swapped(p: list[float], k: int) -> list[float]:
 
 def _size(n: Callable[[Random], int]) -> Callable[[Random], Made]:
     def make(rng: Random) -> Made:
-        candidate, scene = good(rng)
+        candidate, context = good(rng)
         at, many = rng.randrange(9), n(rng)
         values = (candidate.columns[at].correction_mm * (many // N + 1))[:many]
-        return _with(candidate, at, correction_mm=values), scene
+        return _with(candidate, at, correction_mm=values), context
 
     return make
 
 
 def _evidence(**change: Callable[[Random], object]) -> Callable[[Random], Made]:
     def make(rng: Random) -> Made:
-        candidate, scene = good(rng)
+        candidate, context = good(rng)
         evidence = replace(candidate.evidence, **{name: draw(rng) for name, draw in change.items()})
-        return signed(replace(candidate, evidence=evidence)), scene
+        return signed(replace(candidate, evidence=evidence)), context
 
     return make
 
 
 def _candidate(**change: Callable[[Random], object]) -> Callable[[Random], Made]:
     def make(rng: Random) -> Made:
-        candidate, scene = good(rng)
-        return signed(replace(candidate, **{name: draw(rng) for name, draw in change.items()})), scene
+        candidate, context = good(rng)
+        return signed(replace(candidate, **{name: draw(rng) for name, draw in change.items()})), context
 
     return make
 
@@ -118,64 +118,64 @@ def _put(values: tuple[float, ...], at: int, value: float) -> tuple[float, ...]:
 
 
 def _wrong_axis(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return _with(candidate, rng.randrange(9), **{rng.choice(("moved", "corrected")): rng.choice("ABCxw")}), scene
+    candidate, context = good(rng)
+    return _with(candidate, rng.randrange(9), **{rng.choice(("moved", "corrected")): rng.choice("ABCxw")}), context
 
 
 def _wrong_grid(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return candidate, replace(scene, grid_mm={rng.choice("XYZ"): tuple(80.0 * k + rng.uniform(0.1, 5.0) for k in range(N))})
+    candidate, context = good(rng)
+    return candidate, replace(context, grid_mm={rng.choice("XYZ"): tuple(80.0 * k + rng.uniform(0.1, 5.0) for k in range(N))})
 
 
 def _exchanged(rng: Random) -> Made:
     """The column of the way back stands where that of the way there belongs."""
-    candidate, scene = good(rng)
+    candidate, context = good(rng)
     at, play = rng.randrange(9), rng.uniform(0.002, 0.005)
     there = candidate.columns[at].correction_mm
-    return _with(candidate, at, reverse_mm=tuple(v + play for v in there), reversal_mm=play), scene
+    return _with(candidate, at, reverse_mm=tuple(v + play for v in there), reversal_mm=play), context
 
 
 def _all_zero(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return signed(replace(candidate, columns=tuple(replace(c, correction_mm=(0.0,) * N) for c in candidate.columns))), scene
+    candidate, context = good(rng)
+    return signed(replace(candidate, columns=tuple(replace(c, correction_mm=(0.0,) * N) for c in candidate.columns))), context
 
 
 def _the_same(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return candidate, replace(scene, active={(c.moved, c.corrected): c.correction_mm for c in candidate.columns})
+    candidate, context = good(rng)
+    return candidate, replace(context, active={(c.moved, c.corrected): c.correction_mm for c in candidate.columns})
 
 
 def _changed_machine(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return candidate, replace(scene, machine_mark=f"mark {rng.randint(8, 99)}")
+    candidate, context = good(rng)
+    return candidate, replace(context, machine_mark=f"mark {rng.randint(8, 99)}")
 
 
 def _unsigned(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return replace(candidate, seal=EvidenceSeal()), scene
+    candidate, context = good(rng)
+    return replace(candidate, seal=EvidenceSeal()), context
 
 
 def _wrong_role(rng: Random) -> Made:
-    candidate, scene = good(rng)
-    return signed(candidate, rng.choice(("viewer", "operator", "approver", "admin", "service"))), scene
+    candidate, context = good(rng)
+    return signed(candidate, rng.choice(("viewer", "operator", "approver", "admin", "service"))), context
 
 
 def _altered(rng: Random) -> Made:
-    candidate, scene = good(rng)
+    candidate, context = good(rng)
     at = rng.randrange(9)
     columns = list(candidate.columns)
     values = columns[at].correction_mm
     k = rng.randrange(1, N)
     columns[at] = replace(columns[at], correction_mm=_put(values, k, round(values[k] / LSB_MM + 1) * LSB_MM))
-    return replace(candidate, columns=tuple(columns)), scene
+    return replace(candidate, columns=tuple(columns)), context
 
 
 def _steep(rng: Random) -> Made:
     """Small steps, but on a grid so fine that the slope is a wall."""
-    candidate, scene = good(rng)
+    candidate, context = good(rng)
     at = rng.randrange(9)
     position = tuple(0.5 * k for k in range(N))
-    return _with(candidate, at, position_mm=position), scene
+    return _with(candidate, at, position_mm=position), context
 
 
 def _signed_wrong(rng: Random) -> Made:

@@ -10,7 +10,7 @@ LOOKS_SAFE = ("machine", 'return f"not safe now: {truth.unsafe}" if truth.unsafe
 MUTANTS: dict[str, Edits] = {
     "second read-back skipped": (
         ("staging", "step = bracket(known, image.bank, words, again=True)", "step = bracket(known, image.bank, words, again=False)"),
-        ("staging", "known.image != image.data or known.meaning != image.meaning:", "known.image != image.data:"),
+        ("staging", "known.image != image.data or known.decoded_digest != image.semantic_digest:", "known.image != image.data:"),
     ),
     "full read-back skipped": (
         (
@@ -18,7 +18,7 @@ MUTANTS: dict[str, Edits] = {
             "step = bracket(known, image.bank, words, again=True)",
             "step = Operation(OperationKind.LOOK) if known.truth is None else Coherent(known.truth)",
         ),
-        ("staging", "if known.image != image.data or known.meaning != image.meaning:", "if False:"),
+        ("staging", "if known.image != image.data or known.decoded_digest != image.semantic_digest:", "if False:"),
     ),
     "journal after the action": (
         (
@@ -28,7 +28,7 @@ MUTANTS: dict[str, Edits] = {
             'Operation(OperationKind.ACTIVATE, bank=f.target, crc=f.crc, gen=f.staged_gen, owner=f.owner)',
         ),
     ),
-    "activation sent again blindly": (("machine", "not known.asked and not known.stop:", "(not known.asked or known.doubts):"),),
+    "activation sent again blindly": (("machine", "not known.asked and not known.stop:", "(not known.asked or known.unanswered):"),),
     "only the first chunk compared": (("learn", "outcome.value == op.data:", "(op.first > 0 or outcome.value == op.data):"),),
     "boot id ignored": (
         ("machine", '(truth.boot, truth.gen) != (f.boot, f.probation_gen)', 'truth.gen != f.probation_gen'),

@@ -29,8 +29,8 @@ def test_there_are_all_classes_of_the_specification() -> None:
 
 @pytest.mark.parametrize("k", range(EACH))
 def test_nothing_speaks_against_a_good_table(k: int) -> None:
-    candidate, scene = good(Random(k))
-    assert reasons_against(candidate, scene, LIMITS) == []
+    candidate, context = good(Random(k))
+    assert reasons_against(candidate, context, LIMITS) == []
     assert str(in_the_world([]).journal[-1].state) == "KEEP"
 
 
@@ -38,8 +38,8 @@ def test_nothing_speaks_against_a_good_table(k: int) -> None:
 def test_every_class_is_rejected_with_its_reason_and_without_a_write(name: str) -> None:
     make, word = CLASSES[name]
     for k in range(EACH):
-        candidate, scene = make(Random(f"{name} {k}"))
-        reasons = reasons_against(candidate, scene, LIMITS)
+        candidate, context = make(Random(f"{name} {k}"))
+        reasons = reasons_against(candidate, context, LIMITS)
         assert any(reason.startswith(word) for reason in reasons), (k, reasons)
         world = in_the_world(reasons)
         assert str(world.journal[-1].state) == "REJECTED"
@@ -63,9 +63,9 @@ UNATTENDED = {
 @pytest.mark.parametrize("name", UNATTENDED)
 def test_what_the_classes_do_not_hold_is_rejected_too(name: str) -> None:
     change, word = UNATTENDED[name]
-    candidate, scene = good(Random(3))
+    candidate, context = good(Random(3))
     limits = replace(LIMITS, value_mm=0.012) if word == "VALUE" else LIMITS
-    made: tuple[Candidate, CandidateContext] = change(candidate, scene)
+    made: tuple[Candidate, CandidateContext] = change(candidate, context)
     assert [r for r in reasons_against(*made, limits) if r.startswith(word)]
 
 
@@ -73,23 +73,23 @@ def test_what_the_classes_do_not_hold_is_rejected_too(name: str) -> None:
 def test_the_reference_stays_where_it_is(units: int, refused: bool) -> None:
     """One unit there moves the axis at once when the table comes into force."""
     for at in range(9):
-        candidate, scene = good(Random(11))
+        candidate, context = good(Random(11))
         columns = list(candidate.columns)
         columns[at] = replace(columns[at], correction_mm=(units * LSB_MM, *columns[at].correction_mm[1:]))
-        reasons = reasons_against(signed(replace(candidate, columns=tuple(columns))), scene, LIMITS)
+        reasons = reasons_against(signed(replace(candidate, columns=tuple(columns))), context, LIMITS)
         assert [reason.split(":")[0] for reason in reasons] == ["REFERENCE"] * refused, at
 
 
 def test_all_reasons_are_told_at_once() -> None:
-    candidate, scene = good(Random(5))
+    candidate, context = good(Random(5))
     bad = signed(replace(candidate, machine="other", lsb_nm=1, evidence=replace(candidate.evidence, run_count=0)))
-    words = {reason.split(":")[0] for reason in reasons_against(bad, scene, LIMITS)}
+    words = {reason.split(":")[0] for reason in reasons_against(bad, context, LIMITS)}
     assert words == {"MACHINE", "SCALE", "RUNS"}
 
 
 def test_a_limit_itself_is_allowed_and_nothing_is_clamped() -> None:
-    candidate, scene = good(Random(7))
+    candidate, context = good(Random(7))
     worst = max(abs(v) for v in candidate.columns[1].correction_mm)
     before = candidate.columns
-    assert reasons_against(candidate, scene, replace(LIMITS, change_mm=max(LIMITS.change_mm, worst))) == []
+    assert reasons_against(candidate, context, replace(LIMITS, change_mm=max(LIMITS.change_mm, worst))) == []
     assert candidate.columns is before

@@ -29,9 +29,9 @@ class Told(Pushing):
 
     paused: list[bool] = field(default_factory=list)
 
-    async def _stand_still(self) -> None:
+    async def _wait_for_standstill(self) -> None:
         self.ask()
-        await super()._stand_still()
+        await super()._wait_for_standstill()
 
     def ask(self) -> None:
         self.control.pause()

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.pushing import AGAIN_S, Pushing, Questions, WantedTable
+from abbe.service.compensation.pushing import RECHECK_S, Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
 from abbe.service.push.adapter import BEAT_S, ControllerPort, no_actors
@@ -107,9 +107,9 @@ async def test_a_control_that_refuses_an_activation_and_does_it_later_is_found(m
 
     class Waiting(Jumping):
         async def sleep(self, s: float) -> None:
-            if s == AGAIN_S and does_it:  # the push has been given up; what was refused happens now
+            if s == RECHECK_S and does_it:  # the push has been given up; what was refused happens now
                 comp.active, comp.generation = refused[0], comp.generation + 1
-            await super().sleep(0.0 if s == AGAIN_S else s)
+            await super().sleep(0.0 if s == RECHECK_S else s)
 
     comp.activate = refuse
     questions = Questions(list, "a test", never, never)

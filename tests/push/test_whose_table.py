@@ -19,7 +19,7 @@ from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.urls import DeviceUrls, address_of, control_of
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.entries import WORD, check_chain
+from abbe.service.push.entries import NO_PUSH, check_chain
 from abbe.service.push.operations import Verdict
 from abbe.service.push.states import PushState
 from abbe.service.report.report_table import table_remarks
@@ -367,7 +367,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             for again in (site, left.site("mill-A")):
                 assert await recover(controller, store, again, accept_by="bob") is None  # there is nothing left to accept
             check_chain(read_entries(store, site.name))
-            assert [(e.push, e.state, e.doc["by"]) for e in read_entries(store, site.name)] == [(WORD, PushState.ACCEPTED, "ann")]
+            assert [(e.push, e.state, e.doc["by"]) for e in read_entries(store, site.name)] == [(NO_PUSH, PushState.ACCEPTED, "ann")]
             told = JournalView.read(store, site.name).history()
             assert (told.now.how, told.pushes, f"{told.now.crc:08X}") == ("accepted", (), crc)
             await accept(controller, store, site, "eve")  # the same word by `abbe accept-table`

@@ -43,7 +43,7 @@ async def test_an_interlock_in_the_middle_is_pending_and_loud_and_goes_at_the_ed
             assert "made active again" in done
             assert (await active(session), state(store)) == (base, "ROLLED_BACK")
             assert took_s < LIMIT_S
-            assert await finish_when_safe(session.controller, store, shop.site, limit_s=1.0, clock=SystemClock(), say=print) is None
+            assert await finish_when_safe(session.controller, store, shop.site, limit_s=1.0, clock=SystemClock(), notify=print) is None
 
 
 def released(shop: Shop) -> None:
@@ -60,7 +60,7 @@ async def _finished(shop: Shop, store: Store, session: Session, make_safe: Calla
         heard.append(text)
         loud.set()
 
-    waiting = asyncio.ensure_future(finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=SystemClock(), say=say))
+    waiting = asyncio.ensure_future(finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=SystemClock(), notify=say))
     await loud.wait()
     assert "UNVERIFIED TABLE IS ACTIVE" in heard[0]
     assert not waiting.done()
@@ -80,17 +80,17 @@ async def test_waiting_ends_when_its_time_is_over_and_can_be_broken_off(shop: Sh
             with pytest.raises(StillActive):
                 await Push(shop, store, session, shop.tables(), lambda: shop.sims.ask("estop", on=True)).bring()
             with pytest.raises(StillActive, match="STILL ACTIVE after 0 s"):
-                await finish_when_safe(session.controller, store, shop.site, limit_s=0.2, clock=clock, say=heard.append)
+                await finish_when_safe(session.controller, store, shop.site, limit_s=0.2, clock=clock, notify=heard.append)
             assert len(heard) == 1
             entries = len(read_entries(store, "sim"))
             waiting = asyncio.ensure_future(
-                finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=clock, say=lambda text: waiting.cancel())
+                finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=clock, notify=lambda text: waiting.cancel())
             )
             with pytest.raises(asyncio.CancelledError):
                 await waiting
             assert (state(store), len(read_entries(store, "sim"))) == ("ROLLBACK_PENDING", entries)  # looking writes nothing
             released(shop)
-            done = await finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=clock, say=heard.append)
+            done = await finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=clock, notify=heard.append)
             assert "made active again" in str(done)
             assert await active(session) == base
 

@@ -19,12 +19,12 @@ from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.correct import Correction, push
 from abbe.service.compensation.gate import PushContext, admit
-from abbe.service.compensation.proposal_checks import hold
+from abbe.service.compensation.proposal_checks import precheck
 from abbe.service.compensation.proposal_decisions import approve
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
 from abbe.service.compensation.proposal_states import proposal_status, status_of_proposal
 from abbe.service.compensation.proposals import load_runs, login
-from abbe.service.compensation.push_approved import Approved, PushOrder, next_approved, push_approved
+from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder, next_approved, push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.decisions import ProposalApproval
@@ -157,7 +157,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
 
     async def unattended(site: Site, number: int) -> list[str]:
         async with open_session(site.urls) as session:
-            return (await hold(session.controller, store, site, number, load(store, number), SystemClock(), attended=False)).reasons()
+            return (await precheck(session.controller, store, site, number, load(store, number), SystemClock(), attended=False)).reasons()
 
     with Store.open(shop.url) as store:
         number = shop.copy(store)
@@ -169,7 +169,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
         assert before is None or before.proposal != number  # of this file's other tests
         row = approve(store, number, "anna", 24.0, SystemClock())
         found = next_approved(store, "sim", [], SystemClock().utc().timestamp())
-        assert found == Approved(number, row.id, 0)
+        assert found == ApprovedProposal(number, row.id, 0)
         begun: list[int] = []
 
         async def tell_begun() -> None:

@@ -77,10 +77,10 @@ async def test_a_stop_that_comes_before_a_question_moves_nothing(start_sims, tmp
             return Verdict(True, "a stand-in")
 
         class StopsBeforeTheProbe(Pushing):
-            async def _ask(self, question):
+            async def _run_question(self, question):
                 task.cancel()
                 await asyncio.sleep(0)
-                return await super()._ask(question)
+                return await super()._run_question(question)
 
         wanted = WantedTable(steep(site), await read_base(session.controller), 100, None, {})
         with pytest.raises(asyncio.CancelledError):

@@ -110,7 +110,7 @@ async def test_a_table_that_nobody_knows_is_refused_by_the_questions_too(start_s
         await push(session.controller, store, site, steep(site))
         gen = await generation(session)
         image = encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7))
-        monkeypatch.setattr(workflow, "table_before_last_kept", lambda *_: workflow.KnownTables(image, "m", "a table from elsewhere"))
+        monkeypatch.setattr(workflow, "table_before_last_kept", lambda *_: workflow.KnownTable(image, "m", "a table from elsewhere"))
         with pytest.raises(TableRefused, match="UNKNOWN"):
             await rollback(session.controller, store, site)
         assert (await generation(session), last(store)) == (gen, PushState.REJECTED)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaigns.measure import MeasureOptions, measure
-from abbe.service.compensation.push_approved import Approved, PushOrder
+from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.config_schema import Web
@@ -37,7 +37,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from tests.scenarios.test_push import linear_tables
 
-PROPOSAL = Approved(4, 9, 0)
+PROPOSAL = ApprovedProposal(4, 9, 0)
 
 
 def say(word: str) -> None:

@@ -76,7 +76,7 @@ def _make_sure(words: str, given: Mapping[str, Any]) -> None:
     AbbeError
         What the machine file or the database would be refused for anyway; or the audit, with the remedy.
     """
-    from abbe.service.audit.book import HEADS, KEY, AuditBook, files_ready, place
+    from abbe.service.audit.book import HEADS, KEY, AuditBook, files_base, files_ready
     from abbe.service.cli.common import database_url, open_store
     from abbe.service.errors import AuditBroken
 
@@ -86,7 +86,7 @@ def _make_sure(words: str, given: Mapping[str, Any]) -> None:
         return  # the command makes the folder, or refuses it
     try:
         if missing is not None:
-            base = place(None, url)
+            base = files_base(None, url)
             files_ready(Path(f"{base}{KEY}"), Path(f"{base}{HEADS}"))
             return
         with open_store(url) as store:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from abbe.service.capture.live import LiveFeed
     from abbe.service.channel.messages import MachineSummary
-    from abbe.service.compensation.ordered_rollback import BackOrder
+    from abbe.service.compensation.ordered_rollback import RollbackOrder
     from abbe.service.compensation.push_approved import PushOrder
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import AlarmSection, OpcUa, Web
@@ -204,7 +204,7 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
     from abbe.service.core.orders import OrderActions
 
     def on(store: Store) -> OrderActions:
-        async def back(order: BackOrder) -> JobOutcome:
+        async def back(order: RollbackOrder) -> JobOutcome:
             return await ordered_rollback(site, store, order, clock=SystemClock())
 
         async def push(order: PushOrder) -> JobOutcome:

@@ -10,8 +10,8 @@ from abbe.service.cli.common import JsonOption, print_json, print_table
 from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session
 
 if TYPE_CHECKING:
-    from abbe.service.compensation.commission import Proved
-    from abbe.service.compensation.commission_levels import Levels
+    from abbe.service.compensation.commission import SignCommissioning
+    from abbe.service.compensation.commission_levels import ProvedLevels
     from abbe.service.storage.store import Store
 
 ALLOWED = {3: "unattended pushes", 2: "pushes that a person attends", 1: "no push", 0: "no push: read and export only"}
@@ -46,7 +46,7 @@ def commission(
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
 
-    async def work(store: Store) -> tuple[Levels, Proved | None]:
+    async def work(store: Store) -> tuple[ProvedLevels, SignCommissioning | None]:
         async with ready_session(store, site, accept_table=accept_table) as session:
             levels = await commission_levels(session.controller, store, site)
             if not as_json:
@@ -67,7 +67,7 @@ def commission(
     raise typer.Exit(0 if levels.capabilities.level == 3 and (found is None or found.proof.proved) else 1)
 
 
-def _show_levels(levels: Levels) -> None:
+def _show_levels(levels: ProvedLevels) -> None:
     rows = [(name, "proved" if ok else "NOT PROVED", text) for name, ok, text in levels.rows()]
     level = levels.capabilities.level
     print_table(("flag", "", "how"), rows, title=f"the controller has level L{level}: {ALLOWED[level]}")
@@ -75,7 +75,7 @@ def _show_levels(levels: Levels) -> None:
         typer.echo(f"not shown: {text}")
 
 
-def _levels_doc(levels: Levels) -> dict[str, Any]:
+def _levels_doc(levels: ProvedLevels) -> dict[str, Any]:
     flags = {name: {"proved": ok, "how": text} for name, ok, text in levels.rows()}
     return {
         "solution": levels.solution_id, "level": levels.capabilities.level, "flags": flags, "not_shown": list(levels.not_shown),
@@ -83,13 +83,13 @@ def _levels_doc(levels: Levels) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _proof_doc(found: Proved) -> dict[str, Any]:
+def _proof_doc(found: SignCommissioning) -> dict[str, Any]:
     proof = found.proof
     doc = {"solution": found.solution_id, "step_um": 1e3 * proof.step_mm, "proved": proof.proved, "faults": list(proof.faults)}
     return doc | {"response": proof.response.tolist(), "u_response": proof.u.tolist()}
 
 
-def _show_proof(found: Proved) -> None:
+def _show_proof(found: SignCommissioning) -> None:
     proof = found.proof
     rows = [
         (f"{axis} by {1e3 * proof.step_mm:g} µm", *(f"{1e3 * proof.step_mm * r:+.2f} ± {2e3 * proof.step_mm * u:.2f}" for r, u in one))

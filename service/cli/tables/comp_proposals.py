@@ -11,7 +11,7 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 from abbe.service.cli.measure import MachineArgument, ready_session
 
 if TYPE_CHECKING:
-    from abbe.service.compensation.proposals import Made
+    from abbe.service.compensation.proposals import StoredProposal
     from abbe.service.queries.proposals import ProposalSummary
     from abbe.service.storage.store import Store
 
@@ -38,7 +38,7 @@ def propose(
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
 
-    async def work(store: Store) -> Made:
+    async def work(store: Store) -> StoredProposal:
         store.campaigns.find(campaign)
         with display() as sink:
             async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
@@ -50,7 +50,7 @@ def propose(
     raise typer.Exit(1 if made.proposed.reasons else 0)
 
 
-def _print_made(store: Store, made: Made, *, as_json: bool) -> None:
+def _print_made(store: Store, made: StoredProposal, *, as_json: bool) -> None:
     from abbe.service.queries.proposals import proposal
     from abbe.service.queries.reader import json_value
 

@@ -11,7 +11,7 @@ from abbe.service.cli.tables.comp_proposals import ProposalArgument
 
 if TYPE_CHECKING:
     from abbe.service.compensation.correct import Correction
-    from abbe.service.compensation.rollback import Back
+    from abbe.service.compensation.rollback import RollbackResult
     from abbe.service.storage.store import Store
 
 
@@ -91,7 +91,7 @@ def rollback(
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
 
-    async def work(store: Store) -> Back | str | None:
+    async def work(store: Store) -> RollbackResult | str | None:
         last = read_entries(store, site.name, site.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
         if not (finished and to is None) and not yes and not await _asked(to):

@@ -1,1 +1,1 @@
-"""One file per aggregate: what is read and written of campaigns, runs, pushes, people."""
+"""Repositories, one file per aggregate: campaigns, runs, pushes, people and so on."""

@@ -1,4 +1,4 @@
-"""Alarms: lines that are only ever appended, each together with the messages about it."""
+"""Alarms: append-only entries, each stored together with its messages."""
 
 from __future__ import annotations
 
@@ -23,27 +23,23 @@ class Alarms(Repository):
     def append(
         self, machine: str, alarm: int | None, seq: int, kind: str, doc: Doc, messages: Sequence[tuple[str, Doc]] = ()
     ) -> AlarmEntryRecord:
-        """Append a line to an alarm, with the messages for the broker: both or neither survive a power cut.
+        """Append an entry to an alarm, with the messages for the broker: both or neither survive a power cut.
 
         Parameters
         ----------
-        machine : str
-            Name of the machine.
         alarm : int or None
-            Which; None: the next one of this machine. 0 gathers what belongs to none.
+            None: the next alarm of this machine. 0 collects entries that belong to no alarm.
         seq : int
-            Number of the line: one more than the last that was read, so that a decision on old knowledge is refused.
+            One more than the last entry that the caller has read, so that a decision on stale data is refused.
         kind : str
-            What happened (`abbe.service.verification.alarm_states`).
-        doc : dict
-            What is known of it.
+            One of `abbe.service.verification.alarm_states`.
         messages : sequence of (topic, document)
-            Each is given the number of the alarm.
+            Each document gets the number of the alarm.
 
         Raises
         ------
         StoreError
-            Somebody else wrote this line meanwhile.
+            Somebody else wrote this entry meanwhile.
         """
 
         def work(connection: Connection) -> AlarmEntryRecord:
@@ -63,5 +59,5 @@ class Alarms(Repository):
         return self._db.commit(work)
 
     def entries(self, machine: str) -> list[AlarmEntryRecord]:
-        """Read everything about a machine's alarms, in the order in which it was written."""
+        """Read all entries of a machine's alarms in the order of writing."""
         return self._all(ALARM_ENTRY, alarm_entries.c.machine == machine)

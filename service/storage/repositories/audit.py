@@ -1,4 +1,4 @@
-"""The audit: only ever appended, each event made on the one before it within one transaction."""
+"""The audit: append-only; each event is chained to the one before it within one transaction."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Audit(Repository):
         """Append the event that ``make(last event, present UTC)`` makes. Two processes wait for each other: the chain never forks."""
 
         def work(connection: Connection) -> AuditEvent:
-            if self._db.is_postgresql:  # SQLite's BEGIN IMMEDIATE has shut out the others already
+            if self._db.is_postgresql:  # on SQLite BEGIN IMMEDIATE has shut out others already
                 connection.execute(text("LOCK TABLE audit IN EXCLUSIVE MODE"))
             last = connection.execute(AUDIT.select().order_by(audit.c.id.desc()).limit(1)).first()
             event = make(None if last is None else AUDIT.read(last), self._db.now())

@@ -1,4 +1,4 @@
-"""The journal of a campaign that is being measured: only ever appended, one line for everything that cannot be undone."""
+"""Journal of a running campaign: append-only, one entry for everything that cannot be undone."""
 
 from __future__ import annotations
 
@@ -15,21 +15,9 @@ class Checkpoints(Repository):
     """Checkpoints of campaigns."""
 
     def add(self, campaign_id: int, kind: str, doc: Doc) -> int:
-        """Append a line to a campaign's journal; on return it is on disk. Returns its number in the campaign, from 0.
+        """Append an entry to a campaign's journal; on return it is on disk. Returns its number in the campaign, from 0.
 
-        Parameters
-        ----------
-        campaign_id : int
-            The campaign.
-        kind : str
-            What happened (`abbe.service.sequences.journal` lists the kinds).
-        doc : dict
-            What is known of it.
-
-        Raises
-        ------
-        StoreError
-            It cannot be written.
+        ``kind``: one of those in `abbe.service.sequences.journal`. Raises StoreError.
         """
 
         def work(connection: Connection) -> int:

@@ -1,4 +1,4 @@
-"""Chunks of samples. The capture may give one twice: as it arrived, and again from a segment after a crash."""
+"""Chunks of samples. The capture may deliver one twice: on arrival, and again from a segment after a crash."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sqlalchemy.exc import IntegrityError
 from abbe.service.domain.measured import RUNNING, ChannelRecord, ChunkRecord
 from abbe.service.errors import CaptureConflict, NotStored, StoreError
 from abbe.service.storage.mapping import CHUNK
-from abbe.service.storage.repository import Repository, given
+from abbe.service.storage.repository import Repository, if_given
 from abbe.service.storage.tables import campaigns, chunks, runs
 
 
@@ -35,18 +35,14 @@ class Chunks(Repository):
 
         Parameters
         ----------
-        run_id : int
-            The run.
         channel : str
             ``"bar"``, ``"laser"``, ...
         seq : int
             Number of the chunk in its channel, from 0.
         n : int
-            Samples in it.
+            Number of samples.
         codec : str
-            How they are packed (`abbe.service.runs.codec`).
-        payload : bytes
-            The packed samples.
+            Packing of ``payload`` (`abbe.service.runs.codec`).
         first_host_s, last_host_s : float
             Monotonic host time of the first and last arrival.
         first_device_us, last_device_us : int
@@ -55,7 +51,7 @@ class Chunks(Repository):
         Raises
         ------
         StoreError
-            The run is closed, or there is such a chunk.
+            The run is closed, or the chunk exists.
         """
         chunk = ChunkRecord(
             run_id, channel, seq, n, codec, zlib.crc32(payload), payload, first_host_s, last_host_s, first_device_us, last_device_us
@@ -68,18 +64,14 @@ class Chunks(Repository):
         self._db.commit(work)
 
     def ingest(self, chunks_given: Sequence[ChunkRecord]) -> int:
-        """Add chunks of one running run, in any order: all of them, or after an error none. One that is stored already is accepted
-        when it is equal.
+        """Add chunks of one running run, in any order: all of them, or after an error none. Returns the number of new ones.
 
-        Returns
-        -------
-        int
-            How many were new.
+        A chunk that is stored already is accepted if it is equal.
 
         Raises
         ------
         CaptureConflict
-            The database holds another chunk under the same run, channel and number.
+            The database holds a different chunk of the same run, channel and number.
         StoreError
             The run is closed or does not exist, or the database cannot take it now.
         """
@@ -101,17 +93,19 @@ class Chunks(Repository):
         except StoreError as error:
             if not isinstance(error.__cause__, IntegrityError):
                 raise
-            return self._db.commit(work)  # another process put the same in between our look and our insert (PostgreSQL): look again
+            return self._db.commit(work)  # another process inserted the same chunk after our look (PostgreSQL): look again
 
     def of_run(self, run_id: int, channel: str | None = None) -> list[ChunkRecord]:
-        """Read a run's samples (of one channel), in order of channel and seq, and check that they are as they were written.
+        """Read a run's samples (of one channel), in order of channel and seq, and check their CRC.
 
         Raises
         ------
         StoreError
-            Naming run and chunk, if the stored bytes have changed.
+            The stored bytes have changed; names run and chunk.
         """
-        query = CHUNK.select().where(chunks.c.run_id == run_id, *given(chunks.c.channel, channel)).order_by(chunks.c.channel, chunks.c.seq)
+        query = (
+            CHUNK.select().where(chunks.c.run_id == run_id, *if_given(chunks.c.channel, channel)).order_by(chunks.c.channel, chunks.c.seq)
+        )
         found = [CHUNK.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]
         for chunk in found:
             if zlib.crc32(chunk.payload) != chunk.crc32:
@@ -127,19 +121,19 @@ class Chunks(Repository):
         return self._all(CHUNK, *where, order=chunks.c.seq)
 
     def crcs(self, run_id: int) -> dict[tuple[str, int], int]:
-        """CRC of every chunk of a run by channel and number; payloads are not read."""
+        """CRC of every chunk of a run by channel and number, without reading payloads."""
         query = select(chunks.c.channel, chunks.c.seq, chunks.c.crc32).where(chunks.c.run_id == run_id)
         return {(row.channel, row.seq): row.crc32 for row in self._db.read(lambda connection: connection.execute(query).all())}
 
     def channels(self, run_id: int) -> list[ChannelRecord]:
-        """What a run holds, channel by channel."""
+        """List the channels of a run with the numbers of their chunks and samples."""
         columns = (chunks.c.channel, func.min(chunks.c.codec), func.count(), func.sum(chunks.c.n))
         query = select(*columns).where(chunks.c.run_id == run_id).group_by(chunks.c.channel).order_by(chunks.c.channel)
         rows = self._db.read(lambda connection: connection.execute(query).all())
         return [ChannelRecord(channel, codec, int(count), int(n)) for channel, codec, count, n in rows]
 
     def sizes(self, run_id: int, channel: str) -> list[tuple[int, int]]:
-        """Number and samples of every chunk of a channel, in order; payloads are not read."""
+        """Number and sample count of every chunk of a channel, in order, without reading payloads."""
         query = select(chunks.c.seq, chunks.c.n).where(chunks.c.run_id == run_id, chunks.c.channel == channel).order_by(chunks.c.seq)
         return [(int(seq), int(n)) for seq, n in self._db.read(lambda connection: connection.execute(query).all())]
 
@@ -149,7 +143,7 @@ class Chunks(Repository):
 
 
 def insert_chunk(connection: Connection, chunk: ChunkRecord) -> None:
-    """Add a chunk that is not stored yet."""
+    """Insert a new chunk. Raises StoreError if it exists."""
     try:
         connection.execute(insert(chunks).values(CHUNK.values(chunk)))
     except IntegrityError:
@@ -166,7 +160,7 @@ def require_running(connection: Connection, run_id: int) -> None:
 
 
 def _stored(connection: Connection, wanted: Sequence[ChunkRecord]) -> dict[tuple[str, int], ChunkRecord]:
-    """What the database holds in the stretches of these chunks."""
+    """Stored chunks in the ranges of the wanted ones, by channel and number."""
     found: dict[tuple[str, int], ChunkRecord] = {}
     for channel in {one.channel for one in wanted}:
         numbers = [one.seq for one in wanted if one.channel == channel]

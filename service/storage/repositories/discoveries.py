@@ -1,4 +1,4 @@
-"""Discoveries, whose states are only ever appended, and the versions of machines' models."""
+"""Discoveries with their append-only states, and versions of machines' models."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.results import DiscoveryRecord, ModelRecord, NewVersion, StepRecord
 from abbe.service.errors import ModelMovedOn, StoreError
 from abbe.service.storage.mapping import DISCOVERY, MODEL, STEP
-from abbe.service.storage.repository import Repository, given, insert_row
+from abbe.service.storage.repository import Repository, if_given, insert_row
 from abbe.service.storage.tables import discoveries, discovery_steps, machine_models
 
 
@@ -26,39 +26,23 @@ class Discoveries(Repository):
 
     def all(self, campaign_id: int | None = None) -> list[DiscoveryRecord]:
         """List discoveries (of one campaign), oldest first."""
-        return self._all(DISCOVERY, *given(discoveries.c.campaign_id, campaign_id))
+        return self._all(DISCOVERY, *if_given(discoveries.c.campaign_id, campaign_id))
 
     def steps(self, discovery_id: int) -> list[StepRecord]:
         """List the states that a discovery has reached, first to last."""
         return self._all(STEP, discovery_steps.c.discovery_id == discovery_id, order=discovery_steps.c.seq)
 
     def add_step(self, discovery_id: int, seq: int, state: str, doc: Doc, model: NewVersion | None = None) -> int | None:
-        """Write the next state of a discovery and, together with it or not at all, the version of a model that it brings.
+        """Write the next state of a discovery and, in the same transaction, the model version that it brings.
 
-        Parameters
-        ----------
-        discovery_id : int
-            The discovery.
-        seq : int
-            Number of the state, from 0.
-        state : str
-            The state.
-        doc : dict
-            Evidence, numbers, who decided.
-        model : NewVersion, optional
-            New version of a machine's model.
-
-        Returns
-        -------
-        int or None
-            Number of the new version.
+        ``seq``: number of the state, from 0; ``doc``: evidence, numbers, who decided. Returns the number of the new version, or None.
 
         Raises
         ------
         StoreError
-            This state was written already: another process works on the same discovery.
+            The state exists: another process works on the same discovery.
         ModelMovedOn
-            The version that the new one was made on is no longer the current one. The state is not written either.
+            The base of the new version is no longer the current version. The state is not written either.
         """
 
         def work(connection: Connection) -> int | None:
@@ -77,32 +61,25 @@ class Models(Repository):
     """Model books of machines."""
 
     def add(self, model: NewVersion, discovery_id: int | None = None) -> int:
-        """Append a version to the model book of a machine; return its number, from 1.
-
-        Parameters
-        ----------
-        model : NewVersion
-            Machine, document, and the version that it was made on.
-        discovery_id : int, optional
-            The discovery that brought it; None for a person's doing.
+        """Append a version to the model book of a machine; return its number, from 1. ``discovery_id`` None: a person made it.
 
         Raises
         ------
         ModelMovedOn
-            The version that it was made on is no longer the current one.
+            Its base is no longer the current version.
         """
         return self._db.commit(lambda connection: _add_version(connection, model, discovery_id, self._db.now()))
 
     def all(self, machine: str | None = None) -> list[ModelRecord]:
         """List versions of models (of one machine), oldest first."""
-        return self._all(MODEL, *given(machine_models.c.machine, machine))
+        return self._all(MODEL, *if_given(machine_models.c.machine, machine))
 
 
 def _add_version(connection: Connection, model: NewVersion, discovery_id: int | None, now: str) -> int:
-    """Compare and swap: the version is appended only to the one that it was made on.
+    """Compare and swap: append the version only if its base is the current one.
 
-    SQLite lets one writer in at a time, so the look decides. On PostgreSQL two may look at once; there the second one to insert
-    the number waits for the first and meets the constraint.
+    SQLite has one writer at a time, so the SELECT decides. On PostgreSQL two may read at once; the second one to insert the number waits
+    for the first and violates the constraint.
     """
     table = machine_models.c
     last = connection.execute(select(func.max(table.version)).where(table.machine == model.machine)).scalar()

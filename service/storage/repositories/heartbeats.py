@@ -1,4 +1,4 @@
-"""Heartbeats: the latest state of each machine's service, one row a machine, written anew each time."""
+"""Heartbeats: the latest state of each machine's service, one row per machine, overwritten each time."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from abbe.service.storage.tables import heartbeats
 
 
 class Heartbeats(Repository):
-    """The services that write to this database."""
+    """Heartbeats of the services that use this database."""
 
     def put(self, machine: str, doc: Doc) -> None:
-        """Write the present state of this process, the service of a machine."""
+        """Write the present state of this process as the service of a machine."""
         values = {"doc": doc, "seen_utc": self._db.now(), **owner_of(heartbeats).values(this_process())}
 
         def work(connection: Connection) -> None:

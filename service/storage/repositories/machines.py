@@ -15,7 +15,7 @@ from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import campaigns, heartbeats, machines
 
 MOST_DIGITS = 10
-"""A number with more is no number of a row."""
+"""A text with this many digits or more is no row id."""
 
 
 class Machines(Repository):
@@ -34,7 +34,7 @@ class Machines(Repository):
         return self._all(MACHINE)
 
     def names(self) -> list[str]:
-        """Names of all machines that this database knows, whatever descriptions they have had."""
+        """Names of all machines in this database, each once."""
         query = select(machines.c.name).union(select(heartbeats.c.machine))
         return sorted(str(name) for name in self._db.read(lambda connection: connection.scalars(query).all()))
 
@@ -43,21 +43,12 @@ class Campaigns(Repository):
     """Campaigns on machines."""
 
     def add(self, machine_id: int, name: str, doc: Doc) -> int:
-        """Open a campaign.
-
-        Parameters
-        ----------
-        machine_id : int
-            Its machine.
-        name : str
-            Unique in this database.
-        doc : dict
-            What else is known (``current_model``, ``instruments``, ... of the exchange format).
+        """Open a campaign; return its id. ``doc``: ``current_model``, ``instruments``, ... of the exchange format.
 
         Raises
         ------
         StoreError
-            The name is taken.
+            The name is taken in this database.
         """
         return self._db.commit(lambda connection: insert_campaign(connection, machine_id, name, doc, self._db.now()))
 

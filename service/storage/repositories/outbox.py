@@ -1,4 +1,4 @@
-"""Messages for the broker, kept until it has them."""
+"""Messages for the broker, stored until the broker has them."""
 
 from __future__ import annotations
 
@@ -32,23 +32,19 @@ class Outbox(Repository):
         return int(self._db.read(lambda connection: connection.execute(query).scalar_one()))
 
     def pending(self, limit: int = 100) -> list[OutboxRecord]:
-        """List messages that were not sent yet, in the order in which they were added."""
+        """List unsent messages in the order in which they were added."""
         return self._all(OUTBOX, outbox.c.sent_utc.is_(None), limit=limit)
 
     def done(self, message_id: int) -> None:
-        """Note that the broker has a message; noting it again changes nothing."""
+        """Mark a message as sent; a second call changes nothing."""
         statement = update(outbox).where(outbox.c.id == message_id, outbox.c.sent_utc.is_(None)).values(sent_utc=self._db.now())
         self._db.commit(lambda connection: connection.execute(statement))
 
     def prune(self, keep: int, at_most: int = 1000) -> int:
-        """Forget messages that the broker has, oldest first; return how many.
+        """Delete sent messages, oldest first; return how many.
 
-        Parameters
-        ----------
-        keep : int
-            So many of them stay, at least one: a database that numbers by "largest so far plus one" would use a number again.
-        at_most : int
-            So many are forgotten in one transaction; call again while it returns as many.
+        The newest ``keep`` stay, at least one: a database that numbers by "largest id plus one" would reuse an id. At most ``at_most`` are
+        deleted in one transaction; call again while it returns that number.
         """
         sent = select(outbox.c.id).where(outbox.c.sent_utc.is_not(None))
         newest = sent.order_by(outbox.c.id.desc()).limit(max(keep, 1))
@@ -58,24 +54,17 @@ class Outbox(Repository):
     def shed(
         self, topics: Sequence[str], most: int, down_to: int, notice: Callable[[int, str, str], tuple[str, bytes]] | None = None
     ) -> int:
-        """Drop the oldest waiting messages of some topics when too many wait; messages of all other topics stay, however many.
+        """Drop the oldest waiting messages of some topics if more than ``most`` wait; return how many. Other topics are untouched.
 
         Parameters
         ----------
         topics : sequence of str
-            What may be dropped.
-        most : int
-            More waiting messages of these topics are too many.
+            Topics whose messages may be dropped.
         down_to : int
-            So many, the newest, stay then; at least one.
+            Number of the newest messages that stay; at least one.
         notice : callable, optional
-            Given how many are dropped and when the oldest and the newest of them were made, returns topic and payload of a message that
-            says so. It is queued in the same transaction: nothing is lost in silence.
-
-        Returns
-        -------
-        int
-            How many were dropped.
+            Makes topic and payload of a message about the loss, from the number of dropped messages and the times of the oldest and the
+            newest. It is queued in the same transaction: no loss is silent.
         """
         waiting = (outbox.c.sent_utc.is_(None), outbox.c.topic.in_(topics))
 

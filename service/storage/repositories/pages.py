@@ -1,4 +1,4 @@
-"""Lists a page at a time, newest first, without their heavy documents: histories grow for years."""
+"""Lists in pages, newest first, without their large documents: histories grow for years."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from abbe.service.storage.tables import (
 )
 
 LARGEST = 2**31 - 1
-"""Numbers of rows are not larger on any database."""
+"""The largest row id of any database."""
 
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """One kind of list: its columns by their names outside, where they come from, and which of them may be asked for."""
+    """One kind of list: its columns by their public names, the FROM clause, and the columns that may be filtered."""
 
     columns: Mapping[str, ColumnElement[Any]]
     source: FromClause
@@ -87,21 +87,12 @@ _DOCUMENTS: dict[str, Any] = {
 
 
 class Pages(Repository):
-    """Lists a page at a time."""
+    """Lists in pages."""
 
     def page(self, kind: str, filters: Mapping[str, object], before: int | None, limit: int) -> list[Doc]:
-        """Read the newest rows of a list.
+        """Read one page of a list, one of `LISTINGS`.
 
-        Parameters
-        ----------
-        kind : str
-            One of `LISTINGS`.
-        filters : mapping
-            Columns and the values they must have; None: any.
-        before : int, optional
-            Only rows with a smaller number: the last number of the page before.
-        limit : int
-            At most so many.
+        ``filters``: required values by column, None for any; ``before``: only rows with a smaller id, the last one of the page before.
         """
         listing = LISTINGS[kind]
         where = [listing.columns[name] == filters[name] for name in listing.filters if filters.get(name) is not None]
@@ -110,7 +101,7 @@ class Pages(Repository):
         return [dict(row) for row in self._db.read(lambda connection: connection.execute(query).mappings().all())]
 
     def row(self, kind: str, number: int) -> Doc | None:
-        """One row of a list with its document as ``doc``, where it has one; None: there is none."""
+        """One row of a list with its document as ``doc``, if it has one; None: there is no such row."""
         listing = LISTINGS[kind]
         query = listing.query().where(listing.columns["id"] == number)
         if kind in _DOCUMENTS:
@@ -120,5 +111,5 @@ class Pages(Repository):
 
 
 def visible_status(row: Doc) -> str:
-    """State of the run of a row, as `RunRecord.visible_status`."""
+    """`RunRecord.visible_status` of a row of runs."""
     return measured.visible_status(row["status"], Owner(row["owner_host"], row["owner_pid"], row["owner_start"]))

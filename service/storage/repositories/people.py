@@ -1,4 +1,4 @@
-"""Users, sessions and tokens. Secrets come in as digests or hashes only; `abbe.service.users` decides what they mean."""
+"""Users, sessions and tokens. Secrets arrive as digests or hashes only; `abbe.service.users` interprets them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import api_tokens, sessions, users
 
 FORGOTTEN = timedelta(days=30)
-"""A session that began earlier ended long ago; its row is deleted."""
+"""Age at which the row of a session is deleted; it has ended long ago."""
 
 
 class People(Repository):
@@ -26,7 +26,7 @@ class People(Repository):
         Raises
         ------
         StoreError
-            There is one of this name.
+            The name is taken.
         """
 
         def work(connection: Connection) -> int:
@@ -61,7 +61,7 @@ class People(Repository):
         self._db.commit(work)
 
     def add_session(self, user_id: int, digest: str, instead_of: str = "") -> int:
-        """Begin a session; the one of digest ``instead_of`` ends with it. Rows of sessions from a month ago are deleted."""
+        """Begin a session and end that of digest ``instead_of``; delete rows older than a month."""
 
         def work(connection: Connection) -> int:
             now = self._db.now()
@@ -79,12 +79,12 @@ class People(Repository):
         return None if row is None else (SESSION.read(row), USER.read(row))
 
     def touch_session(self, session_id: int) -> None:
-        """Note that a session was used just now."""
+        """Store that a session was used now."""
         statement = update(sessions).where(sessions.c.id == session_id).values(seen_utc=self._db.now())
         self._db.commit(lambda connection: connection.execute(statement))
 
     def end_session(self, digest: str) -> None:
-        """End a session; nothing happens if there is none."""
+        """End a session; does nothing if there is none."""
         self._db.commit(lambda connection: connection.execute(_ended(self._db.now()).where(sessions.c.digest == digest)))
 
     def add_token(self, token: TokenRecord) -> int:
@@ -93,7 +93,7 @@ class People(Repository):
         Raises
         ------
         StoreError
-            The user has one of this name.
+            The user has a token of this name.
         """
 
         def work(connection: Connection) -> int:
@@ -119,11 +119,11 @@ class People(Repository):
         return [(TOKEN.read(row), USER.read(row)) for row in rows]
 
     def revoke_token(self, token_id: int) -> None:
-        """Revoke a token, for ever."""
+        """Revoke a token for good."""
         statement = update(api_tokens).where(api_tokens.c.id == token_id, api_tokens.c.revoked_utc.is_(None))
         self._db.commit(lambda connection: connection.execute(statement.values(revoked_utc=self._db.now())))
 
 
 def _ended(now: str) -> Update:
-    """End sessions that have not ended yet; the caller says which."""
+    """Statement that ends open sessions; the caller adds which."""
     return update(sessions).where(sessions.c.ended_utc.is_(None)).values(ended_utc=now)

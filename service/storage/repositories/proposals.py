@@ -1,11 +1,11 @@
-"""Proposals of tables and what people decided on them: only ever appended."""
+"""Proposals of tables and people's decisions on them: append-only."""
 
 from __future__ import annotations
 
 from abbe.service.domain.decisions import ProposalApproval, ProposalRecord, ProposalRejection
 from abbe.service.domain.document import Doc
 from abbe.service.storage.mapping import APPROVAL, PROPOSAL, REJECTION
-from abbe.service.storage.repository import Repository, given
+from abbe.service.storage.repository import Repository, if_given
 from abbe.service.storage.tables import approvals, proposals, rejections
 
 
@@ -13,7 +13,7 @@ class Proposals(Repository):
     """Proposals, approvals, rejections."""
 
     def add(self, machine: str, solution_id: int, doc: Doc, digest: str) -> int:
-        """Store a proposal for a machine, by name, that follows from a solution. ``digest``: SHA-256 of ``doc``, which holds no NaN."""
+        """Store a proposal for a machine (by name) from a solution; return its id. ``digest``: SHA-256 of ``doc``, which holds no NaN."""
         return self._add(proposals, machine=machine, solution_id=solution_id, doc=doc, digest=digest, created_utc=self._db.now())
 
     def get(self, proposal_id: int) -> ProposalRecord:
@@ -22,7 +22,7 @@ class Proposals(Repository):
 
     def all(self, machine: str | None = None) -> list[ProposalRecord]:
         """List proposals (for one machine), oldest first."""
-        return self._all(PROPOSAL, *given(proposals.c.machine, machine))
+        return self._all(PROPOSAL, *if_given(proposals.c.machine, machine))
 
     def approve(self, approval: ProposalApproval) -> int:
         """Store an approval; return its id."""

@@ -1,4 +1,4 @@
-"""The journals of pushes: one chain for each control, named as the machine was that pushed first; only ever appended."""
+"""Push journals: one append-only chain for each control, named after the machine that first pushed into it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import push_entries
 
 MARKS = ("base_crc", "crc", "accepted_crc", "machine", "control", "by")
-"""Keys of an entry's document that say which tables, whose, and who vouched."""
+"""Keys of an entry's document that `Pushes.marks` reads: tables, machine, control, and who vouched."""
 NAME_LENGTH = 200
 
 
@@ -27,7 +27,7 @@ class Pushes(Repository):
         Raises
         ------
         StoreError
-            Another process has written an entry meanwhile, or it cannot be written.
+            Another process has written an entry meanwhile, or the entry cannot be written.
         """
 
         def work(connection: Connection) -> int:
@@ -43,14 +43,9 @@ class Pushes(Repository):
         return self._db.commit(work)
 
     def chain(self, machine: str, control: str = "") -> str:
-        """Name of the journal of a control: that of the first machine that pushed into it.
+        """Name of a control's journal, that of the first machine that pushed into it.
 
-        Parameters
-        ----------
-        machine : str
-            Name of the machine.
-        control : str
-            Identity of its control. Empty: not known, the journal is that which this name was last used in.
+        ``control``: identity of the control; empty: unknown, then it is the journal in which this machine name was last used.
         """
         doc = push_entries.c.doc
         names = (push_entries.c.machine, doc["machine"].as_string().label("name"), doc["control"].as_string().label("control"))
@@ -63,7 +58,7 @@ class Pushes(Repository):
         return self.entries_of(self.chain(machine, control))
 
     def entries_of(self, chain: str) -> list[PushEntryRecord]:
-        """Read a journal by its own name."""
+        """Read a journal by its name."""
         return self._all(PUSH_ENTRY, push_entries.c.machine == chain)
 
     def last(self, machine: str, control: str = "") -> list[PushEntryRecord]:
@@ -73,7 +68,7 @@ class Pushes(Repository):
         return self._all(PUSH_ENTRY, push_entries.c.machine == chain, push_entries.c.push == latest)
 
     def marks(self) -> list[PushEntryRecord]:
-        """Read what the journals of all machines say of tables, in the order of writing; documents hold `MARKS` only, no images."""
+        """Read the entries of all journals in the order of writing; documents hold `MARKS` only, no images."""
         marks = [push_entries.c.doc[key].as_string().label(f"mark_{key}") for key in MARKS]
         query = PUSH_MARK.select().add_columns(*marks).order_by(push_entries.c.id)
         rows = self._db.read(lambda connection: connection.execute(query).mappings().all())
@@ -87,26 +82,26 @@ class Pushes(Repository):
 
 
 def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) -> str:
-    """Which journal is that of a control.
+    """Find the journal of a control.
 
     Parameters
     ----------
     begun : sequence of tuple
-        First entries of pushes, newest first: journal, name of the machine, control (empty: not known).
+        First entries of pushes, newest first: journal, machine name, control (empty: unknown).
     machine, control : str
-        Name and control of the machine; without a control the name decides: the journal that it was last used in.
+        Without a control the name decides: the journal in which it was last used.
     """
     if not control:
         return next((chain for chain, name, _ in begun if name == machine), machine)
     last: dict[str, tuple[str, str]] = {}
     for chain, name, at in begun:
         last.setdefault(chain, (name, at))
-    # An address that a control has left says nothing of who is there now: the last one of each journal counts.
+    # Only the last address of each journal counts: a control may have left an earlier one.
     own = next((chain for chain, (_, at) in last.items() if at == control), None)
     if own is not None:
         return own
-    # A control that is nowhere noted: at a new address. The journal of its name is its, unless a machine of another name has used it
-    # since. An open push in it is held against the control (`abbe.service.compensation.recover.is_own`).
+    # An unknown control has a new address. It owns the journal of its name, unless a machine of another name has used that since.
+    # `abbe.service.compensation.recover.is_own` checks an open push in it against the control.
     named = next((chain for chain, (name, _) in last.items() if name == machine), None)
     if named is not None:
         return named

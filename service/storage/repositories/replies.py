@@ -1,4 +1,4 @@
-"""Answers that are given once: a request that comes again with the same key does nothing again."""
+"""Idempotency: a repeated request with the same key gets the stored answer and does nothing."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from abbe.service.storage.repository import Repository, insert_row
 from abbe.service.storage.tables import replies
 
 KEPT = timedelta(days=7)
-"""How long an answer is kept for its key."""
+"""How long an answer is stored."""
 ABANDONED = timedelta(minutes=1)
-"""A request that has had no answer for this long died with its process; the key may be used again."""
+"""A request without an answer for this long has died with its process; its key is free again."""
 
 
 class Replies(Repository):
     """Answers by idempotency key. Each key belongs to ``who`` sent it: two people may use the same text."""
 
     def claim(self, who: str, key: str, digest: str) -> ReplyRecord | None:
-        """Take a key for a request of this digest. None: it is the caller's, who has to `keep` or `drop` it. Else what is stored."""
+        """Claim a key for a request of this digest. None: the caller has it and must `keep` or `drop` it; otherwise the stored reply."""
 
         def work(connection: Connection) -> ReplyRecord | None:
             now = self._db.utcnow()
@@ -36,7 +36,7 @@ class Replies(Repository):
             try:
                 with connection.begin_nested():
                     insert_row(connection, replies, who=who, key=key, digest=digest, created_utc=utc_text(now))
-            except IntegrityError:  # another process was first (PostgreSQL): it is working on it
+            except IntegrityError:  # another process was first (PostgreSQL) and is working on the request
                 return ReplyRecord(digest, None, None)
             return None
 
@@ -48,6 +48,6 @@ class Replies(Repository):
         self._db.commit(lambda connection: connection.execute(statement))
 
     def drop(self, who: str, key: str) -> None:
-        """Give back a key whose request was not completed."""
+        """Release a key whose request was not completed."""
         statement = delete(replies).where(replies.c.who == who, replies.c.key == key, replies.c.status.is_(None))
         self._db.commit(lambda connection: connection.execute(statement))

@@ -1,4 +1,4 @@
-"""What was computed from runs, and what was done with it: solutions, compensation tables, checks."""
+"""Results computed from runs: solutions, compensation tables, verifications."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.results import SolutionRecord, TableRecord, VerificationRecord
 from abbe.service.storage.mapping import SOLUTION, TABLE, VERIFICATION
 from abbe.service.storage.repositories.outbox import queue_message
-from abbe.service.storage.repository import Repository, given, insert_row
+from abbe.service.storage.repository import Repository, if_given, insert_row
 from abbe.service.storage.tables import campaigns, comp_tables, machines, solutions, verifications
 
 
@@ -19,7 +19,7 @@ class Solutions(Repository):
     """Results of solvers."""
 
     def add(self, campaign_id: int, kind: str, run_ids: Sequence[int], doc: Doc) -> int:
-        """Store what a solver (``kind``) found from some runs of a campaign."""
+        """Store a solver's result (``kind``) from some runs of a campaign; return its id."""
         return self._add(solutions, campaign_id=campaign_id, kind=kind, run_ids=list(run_ids), doc=doc, created_utc=self._db.now())
 
     def get(self, solution_id: int) -> SolutionRecord:
@@ -28,10 +28,10 @@ class Solutions(Repository):
 
     def all(self, campaign_id: int | None = None) -> list[SolutionRecord]:
         """List solutions (of one campaign), oldest first."""
-        return self._all(SOLUTION, *given(solutions.c.campaign_id, campaign_id))
+        return self._all(SOLUTION, *if_given(solutions.c.campaign_id, campaign_id))
 
     def latest(self, kind: str, limit: int) -> list[SolutionRecord]:
-        """List the newest solutions of a kind, newest first: each may be half a megabyte."""
+        """List the newest solutions of a kind, newest first. Each may be half a megabyte."""
         return self._all(SOLUTION, solutions.c.kind == kind, newest=True, limit=limit)
 
 
@@ -39,20 +39,9 @@ class Tables(Repository):
     """Compensation tables."""
 
     def add(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:
-        """Store a table.
+        """Store a table; return its id.
 
-        Parameters
-        ----------
-        machine_id : int
-            Its machine.
-        solution_id : int or None
-            Its solution; None for a table that was read back from the controller.
-        image : bytes
-            As the controller holds it.
-        crc : int
-            CRC-32 of the image.
-        doc : dict
-            Grid and prediction.
+        ``solution_id`` None: the table was read back from the controller. ``crc``: CRC-32 of ``image``; ``doc``: grid and prediction.
         """
         values = {"machine_id": machine_id, "solution_id": solution_id, "image": image, "crc": crc, "doc": doc}
         return self._add(comp_tables, **values, created_utc=self._db.now())
@@ -63,27 +52,27 @@ class Tables(Repository):
 
     def all(self, machine_id: int | None = None) -> list[TableRecord]:
         """List tables (of one machine), oldest first."""
-        return self._all(TABLE, *given(comp_tables.c.machine_id, machine_id))
+        return self._all(TABLE, *if_given(comp_tables.c.machine_id, machine_id))
 
 
 class Verifications(Repository):
     """Checks of machines."""
 
     def add(self, machine_id: int, campaign_id: int | None, verdict: str, doc: Doc) -> int:
-        """Store the result of a check, with the campaign that was measured for it: figures, limits and verdict."""
+        """Store the figures, limits and verdict of a check and the campaign that was measured for it; return its id."""
         return self._add(verifications, machine_id=machine_id, campaign_id=campaign_id, verdict=verdict, doc=doc, utc=self._db.now())
 
     def add_with_messages(self, machine_id: int, doc: Doc, messages: Sequence[tuple[str, Doc]]) -> int:
-        """Store the result of a check together with the messages about it: both or neither survive a power cut.
+        """Store the result of a check together with its messages: both or neither survive a power cut.
 
         Parameters
         ----------
         machine_id : int
-            The machine, for checks that failed before they had a campaign.
+            Used for checks that failed before they had a campaign.
         doc : dict
             As made by `abbe.service.scheduler.record`.
         messages : sequence of (topic, document)
-            For the broker; each is given the number of the verification.
+            For the broker; each document gets the number of the verification.
         """
 
         def work(connection: Connection) -> int:
@@ -99,10 +88,10 @@ class Verifications(Repository):
 
     def latest(self, machine_id: int | None = None, limit: int = 100) -> list[VerificationRecord]:
         """List checks (of one description of a machine), newest first."""
-        return self._all(VERIFICATION, *given(verifications.c.machine_id, machine_id), newest=True, limit=limit)
+        return self._all(VERIFICATION, *if_given(verifications.c.machine_id, machine_id), newest=True, limit=limit)
 
     def of_machine(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
-        """List the latest checks of a machine by name, newest first, whatever descriptions it has had."""
+        """List the latest checks of a machine by name, newest first, over all its descriptions."""
         return self._all(VERIFICATION, verifications.c.machine_id.in_(_descriptions(machine)), newest=True, limit=limit)
 
     def counts(self, machine: str) -> dict[str, int]:

@@ -14,7 +14,7 @@ from abbe.service.errors import NotStored, StoreError
 from abbe.service.storage.mapping import RUN, owner_of
 from abbe.service.storage.repositories.chunks import insert_chunk, require_running
 from abbe.service.storage.repositories.machines import Campaigns, insert_campaign, machine_id_of
-from abbe.service.storage.repository import Repository, given, insert_row
+from abbe.service.storage.repository import Repository, if_given, insert_row
 from abbe.service.storage.tables import campaigns, runs
 
 
@@ -22,18 +22,16 @@ class Runs(Repository):
     """Runs of campaigns."""
 
     def start(self, campaign_id: int, label: str, test: str, role: str, doc: Doc) -> int:
-        """Begin a run, owned by this process until it is finished.
+        """Begin a run, owned by this process until it is finished; return its id.
 
         Parameters
         ----------
-        campaign_id : int
-            Its campaign.
         label : str
             ``run_id`` of the exchange format, unique in the campaign, e.g. ``"r01"``.
         test, role : str
             As in the exchange format.
         doc : dict
-            Start document (`abbe.service.runs.columns` says what it holds).
+            Start document (`abbe.service.runs.columns`).
 
         Raises
         ------
@@ -48,19 +46,17 @@ class Runs(Repository):
 
         Parameters
         ----------
-        run_id : int
-            The run.
         status : str
             One of `abbe.service.domain.measured.FINISHED`.
         reason : str
-            Why, in words; empty for a complete run.
+            A sentence; empty for a complete run.
         doc : dict or None
             End document; None if the end was not reached.
 
         Raises
         ------
         StoreError
-            There is no such run, or it is closed already.
+            There is no such run, or it is already closed.
         """
         if status not in FINISHED:
             raise StoreError(f"run status {status!r} is not one of {', '.join(FINISHED)}")
@@ -74,7 +70,7 @@ class Runs(Repository):
         self._db.commit(work)
 
     def import_campaign(self, machine: tuple[str, Doc], campaign: tuple[str, Doc], imported: Sequence[ImportedRun]) -> int:
-        """Store a campaign that was measured elsewhere: everything, or after an error nothing. Returns its id.
+        """Store a campaign that was measured elsewhere, entirely or after an error not at all; return its id.
 
         Parameters
         ----------
@@ -99,13 +95,17 @@ class Runs(Repository):
         return self._db.commit(work)
 
     def all(self, campaign: str | int | None = None) -> list[RunRecord]:
-        """List runs (of one campaign, by name or id) in the order in which they were started. Raises NotStored."""
+        """List runs (of one campaign, by name or id) in order of their start. Raises NotStored."""
         campaign_id = None if campaign is None else Campaigns(self._db).find(campaign).id
-        return self._all(RUN, *given(runs.c.campaign_id, campaign_id))
+        return self._all(RUN, *if_given(runs.c.campaign_id, campaign_id))
 
     def latest(self, limit: int, *, campaign: str = "", test: str = "", status: str = "") -> list[RunRecord]:
-        """List the newest runs, newest first: of this campaign, of this test, with this written status; empty: of any."""
-        where = (*given(campaigns.c.name, campaign or None), *given(runs.c.test, test or None), *given(runs.c.status, status or None))
+        """List the newest runs, newest first, of a campaign, test and stored status; empty: any."""
+        where = (
+            *if_given(campaigns.c.name, campaign or None),
+            *if_given(runs.c.test, test or None),
+            *if_given(runs.c.status, status or None),
+        )
         return self._all(RUN, *where, newest=True, limit=limit)
 
     def find(self, id_or_label: int | str) -> RunRecord:
@@ -131,7 +131,7 @@ class Runs(Repository):
         return found[0]
 
     def numbered(self, run_id: int) -> RunRecord | None:
-        """The run of a number, None if there is none."""
+        """The run of an id, None if there is none."""
         return self._first(RUN, runs.c.id == run_id)
 
 
@@ -143,7 +143,7 @@ def _insert_run(connection: Connection, values: Doc) -> int:
 
 
 def _insert_imported(connection: Connection, campaign_id: int, run: ImportedRun, now: str) -> None:
-    """Store a run that was measured elsewhere, closed from the start."""
+    """Store a run that was measured elsewhere; it is closed from the start."""
     values = {"campaign_id": campaign_id, "label": run.label, "test": run.test, "role": run.role, "start_doc": run.start_doc}
     run_id = _insert_run(connection, values | {"status": "complete", "reason": "imported", "started_utc": now, "ended_utc": now})
     insert_chunk(connection, ChunkRecord(run_id, "columns", 0, run.n, run.codec, zlib.crc32(run.payload), run.payload, 0.0, 0.0, 0, 0))

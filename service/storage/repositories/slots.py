@@ -1,4 +1,4 @@
-"""Slots of schedules: each is taken by one process only, and none stays open when that process no longer runs."""
+"""Slots of schedules: one process only claims each, and another adopts it when that process no longer runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from abbe.service.storage.tables import slots
 CLAIMED = "claimed"
 RUNNING = "running"
 RELEASED = "released"
-"""Claimed and not started by a service that ended: the next one takes it."""
+"""A service ended after claiming the slot and before starting it: the next service takes it."""
 NOT_RUN = ("missed", "skipped", "interrupted")
 _OWNER = owner_of(slots)
 _NO_OWNER: dict[str, object] = {"owner_host": None, "owner_pid": None, "owner_start": None}
@@ -31,7 +31,7 @@ class Slots(Repository):
     """
 
     def claim(self, schedule: str, slot_utc: datetime | str) -> bool:
-        """Take a slot of a schedule; False if it is taken."""
+        """Claim a slot of a schedule; False if it is taken."""
         values = {"schedule": schedule, "slot_utc": _slot(slot_utc), "state": CLAIMED, "claimed_utc": self._db.now()}
 
         def work(connection: Connection) -> bool:
@@ -41,42 +41,21 @@ class Slots(Repository):
         return self._db.commit(work)
 
     def begin(self, schedule: str, slot_utc: datetime | str) -> None:
-        """Note that the machine is about to move for a claimed slot: from here on no other process runs it.
-
-        Raises
-        ------
-        StoreError
-            It was not claimed.
-        """
+        """Store that the machine is about to move for a claimed slot: no other process will run it. Raises StoreError if unclaimed."""
         self._mark(schedule, slot_utc, {"state": RUNNING})
 
     def release(self, schedule: str, slot_utc: datetime | str) -> None:
-        """Give a claimed slot back that was not started: the next service decides on it.
-
-        Raises
-        ------
-        StoreError
-            It was not claimed.
-        """
+        """Release a claimed slot that was not started: the next service decides on it. Raises StoreError if unclaimed."""
         self._mark(schedule, slot_utc, _NO_OWNER | {"state": RELEASED})
 
     def finish(self, schedule: str, slot_utc: datetime | str, state: str, reason: str = "") -> None:
-        """Write how a claimed slot ended: ``state``, at most 30 characters (``"done"``), and the sentence to it.
-
-        Raises
-        ------
-        StoreError
-            It was not claimed.
-        """
+        """Store how a claimed slot ended: ``state``, at most 30 characters (``"done"``), and a sentence. Raises StoreError if unclaimed."""
         self._mark(schedule, slot_utc, {"state": state, "reason": reason, "finished_utc": self._db.now()})
 
     def adopt(self, schedule: str) -> list[SlotRecord]:
-        """Take over the open slots of a schedule whose process no longer runs; each is given to one caller only.
+        """Take over the open slots of a schedule whose process no longer runs; only one caller gets each.
 
-        Returns
-        -------
-        list of SlotRecord
-            As they were found, in order of time; they belong to this process now.
+        Returns the slots as they were found, in order of time; they belong to this process now.
         """
         owner = (slots.c.owner_host, slots.c.owner_pid, slots.c.owner_start)
         query = SLOT.select().add_columns(*owner).where(slots.c.schedule == schedule, slots.c.finished_utc.is_(None))
@@ -100,12 +79,12 @@ class Slots(Repository):
         return self._all(SLOT, slots.c.schedule == schedule, order=slots.c.slot_utc, newest=True, limit=limit)
 
     def newest(self, schedules: Sequence[str]) -> str:
-        """Number and state of the slot of these schedules that was taken last, as one word; empty: none was."""
+        """Id and state of the last claimed slot of these schedules as one text; empty: none was claimed."""
         found = self._all(SLOT, slots.c.schedule.in_(schedules), newest=True, limit=1)
         return "".join(f"{one.id}-{one.state}" for one in found)
 
     def last_due(self, schedule: str) -> datetime | None:
-        """When the latest slot of a schedule was due that any process claimed; None: there is none."""
+        """Due time of the latest claimed slot of a schedule; None: none was claimed."""
         found = self._all(SLOT, slots.c.schedule == schedule, order=slots.c.slot_utc, newest=True, limit=1)
         return datetime.fromisoformat(found[0].slot_utc) if found else None
 
@@ -115,7 +94,7 @@ class Slots(Repository):
         return self._all(SLOT, _timetable_of(machine), states, newest=True, limit=limit)
 
     def counts(self, machine: str) -> dict[str, int]:
-        """How many slots of a machine's timetables are in each state."""
+        """Number of slots of a machine's timetables by state."""
         query = select(slots.c.state, func.count()).where(_timetable_of(machine)).group_by(slots.c.state)
         return {str(state): int(count) for state, count in self._db.read(lambda connection: connection.execute(query).all())}
 
@@ -127,23 +106,23 @@ class Slots(Repository):
 
 
 def _take(connection: Connection, slot: SlotRecord, owner: Owner | None) -> bool:
-    """Only from the owner that was seen: of two services that start together after a power cut one gets it."""
+    """Take a slot only from the owner that was read: of two services that start together after a power cut, one gets it."""
     was = slots.c.owner_pid.is_(None) if owner is None else slots.c.owner_start == owner.start
-    state = CLAIMED if slot.state == RELEASED else slot.state  # one that ran stays one that ran: it must not be run again
+    state = CLAIMED if slot.state == RELEASED else slot.state  # a slot that ran keeps that state: it must not run again
     statement = update(slots).where(slots.c.id == slot.id, slots.c.state == slot.state, was)
     return connection.execute(statement.values(_OWNER.values(this_process()) | {"state": state})).rowcount == 1
 
 
 def _timetable_of(machine: str) -> ColumnElement[bool]:
-    """Slots of a machine. Not by LIKE: SQLite's takes mill-7 and MILL-7 for the same machine."""
+    """Condition for the slots of a machine. Not LIKE: SQLite would match MILL-7 for mill-7."""
     prefix = f"{machine}/"
     return func.substr(slots.c.schedule, 1, len(prefix)) == prefix
 
 
-def _slot(moment: datetime | str) -> str:
-    if isinstance(moment, datetime):
-        return utc_text(moment)
+def _slot(due: datetime | str) -> str:
+    if isinstance(due, datetime):
+        return utc_text(due)
     try:
-        return utc_text(datetime.fromisoformat(moment))
+        return utc_text(datetime.fromisoformat(due))
     except ValueError:
-        raise StoreError(f"slot time {moment!r} is not ISO 8601", "write e.g. 2026-11-21T03:00:00Z") from None
+        raise StoreError(f"slot time {due!r} is not ISO 8601", "write e.g. 2026-11-21T03:00:00Z") from None

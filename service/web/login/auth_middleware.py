@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AbbeError
-from abbe.service.users.people import NOBODY, ONLOOKER, Principal
+from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, Principal
 from abbe.service.web.bodies import Body
 from abbe.service.web.login.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
 from abbe.service.web.login.authentication import Authenticator, csrf_token
@@ -66,7 +66,7 @@ class AuthMiddleware:
         if route is None:  # the router distinguishes unknown paths from unknown methods
             await self._app(scope, receive, send)
             return
-        visit = Visit(NOBODY, address)
+        visit = Visit(ANONYMOUS, address)
         scope.setdefault("state", {})["visit"] = visit
         changes = scope["type"] == "http" and scope["method"] in MUTATING
         body = Body(scope, receive, route) if changes else None
@@ -91,7 +91,7 @@ class AuthMiddleware:
         secret = None if self._auth is None else request.cookies.get(self._auth.cookie(tls=tls))
         if need is not PUBLIC or (changes and secret):
             used = changes or in_use(request.url.path, request.headers.get(ACTIVE_HEADER))
-            visit.principal = ONLOOKER if self._auth is None else await self._auth.who(bearer, secret, in_use=used)
+            visit.principal = LOCAL_VIEWER if self._auth is None else await self._auth.who(bearer, secret, in_use=used)
         visit.secret = (secret or "") if visit.principal.by == "session" else ""
         if need is not PUBLIC and (unknown := _unknown(request, visit.principal, changes=changes)) is not None:
             return unknown
@@ -188,7 +188,7 @@ class _Log:
 
 def _unknown(request: HTTPConnection, principal: Principal, *, changes: bool) -> Response | None:
     # Without users everybody may look; a change needs a known user.
-    if principal is NOBODY or (changes and principal.by == "nobody"):
+    if principal is ANONYMOUS or (changes and principal.by == "nobody"):
         if "text/html" in request.headers.get("accept", "") and not changes and request.scope["type"] == "http":
             return RedirectResponse("/login", 303)
         return problem(401, "log in, or send a token", headers={"WWW-Authenticate": "Bearer"})

@@ -13,7 +13,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.storage.store import Store
 from abbe.service.users.lockout import Buckets, Lockout
-from abbe.service.users.people import NOBODY, ONLOOKER, People, Principal
+from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, People, Principal
 
 COOKIE = "abbe"
 
@@ -82,9 +82,9 @@ class Authenticator:
             return self.people.by_token(bearer)
         if secret:
             found = self.people.by_session(secret, in_use=in_use)
-            if found is not NOBODY:
+            if found is not ANONYMOUS:
                 return found
-        return NOBODY if self.people.anybody() else ONLOOKER
+        return ANONYMOUS if self.people.has_users() else LOCAL_VIEWER
 
     async def ready(self) -> None:
         """Check before a change that the audit is writable. Raises AbbeError if not."""

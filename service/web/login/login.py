@@ -11,7 +11,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 
 from abbe.service.queries import people
-from abbe.service.users.lockout import Came
+from abbe.service.users.lockout import LoginOrigin
 from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
 from abbe.service.web.listening import is_local
@@ -111,10 +111,10 @@ def _add_reading(app: FastAPI, auth: Authenticator) -> None:
         return AuditList(records=await asyncio.to_thread(people.audit, auth.store, limit))
 
 
-def _login_origin(auth: Authenticator, request: Request, name: str) -> Came:
+def _login_origin(auth: Authenticator, request: Request, name: str) -> LoginOrigin:
     visit: Visit = request.state.visit
     device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(), ""))
-    return Came(visit.address, device, here=is_local(visit.address) and not auth.behind_tls)
+    return LoginOrigin(visit.address, device, local=is_local(visit.address) and not auth.behind_tls)
 
 
 def _set_cookie(auth: Authenticator, request: Request, answer: Response, secret: str) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.backup.backup_files import listed
+from abbe.service.backup.backup_files import file_list
 from abbe.service.cli import run
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
@@ -127,7 +127,7 @@ def _edited(made: Path, statement: str) -> None:
         database.execute(statement)
         database.commit()
     doc = json.loads((made / "backup.json").read_text())
-    (made / "backup.json").write_text(json.dumps(doc | {"files": listed(made)}))
+    (made / "backup.json").write_text(json.dumps(doc | {"files": file_list(made)}))
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,8 @@ class Control:
 
             return check
 
-        async def hold(*_: object, **options: object) -> Any:
-            self.asked.append(f"hold attended={options['attended']}")
+        async def precheck(*_: object, **options: object) -> Any:
+            self.asked.append(f"precheck attended={options['attended']}")
             return SimpleNamespace(reasons=lambda: list(reasons))
 
         monkeypatch.setattr(gate, "recover", answers("recover", True, "", ""))
@@ -41,7 +41,7 @@ class Control:
         monkeypatch.setattr(gate, "check_commissioned", answers("commissioned", commissioned, "never proved", "abbe comp commission"))
         monkeypatch.setattr(gate, "check_level", answers("level", level, "level 1 is too low", "a person has to attend"))
         monkeypatch.setattr(gate, "load", lambda *_: None)
-        monkeypatch.setattr(gate, "hold", hold)
+        monkeypatch.setattr(gate, "precheck", precheck)
         site = SimpleNamespace(machine=None, watching=SimpleNamespace(air_c=None))
         monkeypatch.setattr(gate, "verification", lambda *_, **__: None)
         self.context = PushContext(
@@ -60,29 +60,29 @@ async def test_all_reasons_come_at_once_with_the_first_remedy(monkeypatch: pytes
 async def test_each_question_is_asked_once_and_the_old_push_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch)
     admission = await gate.admit(control.context, 4)
-    assert control.asked == ["recover", "devices", "commissioned", "level", "hold attended=False"]
+    assert control.asked == ["recover", "devices", "commissioned", "level", "precheck attended=False"]
     assert admission.hint == "a hint"
 
 
 async def test_a_session_that_recovered_when_it_was_opened_does_not_recover_again(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch, recovered=True)
     await gate.admit(control.context, 4)
-    assert control.asked == ["devices", "commissioned", "level", "hold attended=False"]
+    assert control.asked == ["devices", "commissioned", "level", "precheck attended=False"]
 
 
 async def test_what_was_asked_before_the_proposal_was_made_is_not_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch)
-    await gate.admit(control.context, 4, await gate.ready(control.context))
-    assert control.asked == ["recover", "devices", "commissioned", "level", "hold attended=False"]
+    await gate.admit(control.context, 4, await gate.check_preconditions(control.context))
+    assert control.asked == ["recover", "devices", "commissioned", "level", "precheck attended=False"]
 
 
 async def test_before_a_proposal_only_the_control_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch)
-    assert (await gate.ready(control.context)).hint == "a hint"
+    assert (await gate.check_preconditions(control.context)).hint == "a hint"
     assert control.asked == ["recover", "devices", "commissioned", "level"]
 
 
 async def test_a_control_that_was_never_proved_stops_the_measurement_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     control = Control(monkeypatch, commissioned=False)
     with pytest.raises(TableRefused, match="never proved"):
-        await gate.ready(control.context)
+        await gate.check_preconditions(control.context)

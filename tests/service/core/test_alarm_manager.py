@@ -18,7 +18,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Steering, SteerJob
 from abbe.service.compensation import push_approved
 from abbe.service.compensation.gate import PushContext
-from abbe.service.compensation.push_approved import Approved, PushOrder
+from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.domain.job_state import JobOutcome, JobState
@@ -132,7 +132,7 @@ class Bench:
 
     async def pushed(self, control: Control | None = None) -> tuple[str, str]:
         """Let the desk push proposal 4; the word and the sentence that the alarm's line says."""
-        job = self.desk.push_job(Approved(4, 9, NO_ALARM), YEARLY)
+        job = self.desk.push_job(ApprovedProposal(4, 9, NO_ALARM), YEARLY)
         state = await carry_out(job, NOON, control or Control())
         last = self.lines()[-1]
         assert (last.kind, state) == (AlarmKind.PUSHED, f"done: {last.doc['word']}")
@@ -231,7 +231,7 @@ async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(b
         return JobOutcome("refused", "not today")
 
     bench.push = push
-    assert await bench.book.run(bench.desk.push_job(Approved(4, 9, NO_ALARM), YEARLY)) == "done: refused"
+    assert await bench.book.run(bench.desk.push_job(ApprovedProposal(4, 9, NO_ALARM), YEARLY)) == "done: refused"
     assert seen == [("conflict", "it cannot be paused now: a table that nobody has verified may be in force"), ("done", "")]
     (job,) = bench.jobs()
     assert (job.kind, job.state, job.text) == ("push", "done: refused", "not today")

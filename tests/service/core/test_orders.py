@@ -18,7 +18,7 @@ import pytest
 from abbe.drivers.tables import crc32
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, RollBack, StartJob
-from abbe.service.compensation.ordered_rollback import BackOrder
+from abbe.service.compensation.ordered_rollback import RollbackOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.core.rights import may
@@ -47,7 +47,7 @@ class Bench:
     store: Store
     audit: AuditBook
     clock: FakeClock = field(default_factory=lambda: FakeClock(utc(2026, 6, 1, 12)))
-    orders_seen: list[BackOrder] = field(default_factory=list)
+    orders_seen: list[RollbackOrder] = field(default_factory=list)
     states: tuple[PushState, ...] = KEPT
     said: JobOutcome | Exception = field(default_factory=lambda: JobOutcome("kept", "push 2"))
     may_end: asyncio.Event = field(default_factory=asyncio.Event)
@@ -74,12 +74,12 @@ class Bench:
         """A push in the journal, as far as ``states`` go."""
         await as_if_pushed(self.store, self.clock, MACHINE, doc, (base, image), states)
 
-    async def ordered_rollback(self, order: BackOrder) -> JobOutcome:
+    async def ordered_rollback(self, order: RollbackOrder) -> JobOutcome:
         self.orders_seen.append(order)
         if self.states:
-            await self.push({"kind": KIND, "order": order.ordered.number, "reason": order.ordered.reason}, NEW, OLD, self.states)
+            await self.push({"kind": KIND, "order": order.request.number, "reason": order.request.reason}, NEW, OLD, self.states)
         self.written.set()
-        await order.ordered.control.unless_stopped(self.may_end.wait())
+        await order.request.control.unless_stopped(self.may_end.wait())
         if isinstance(self.said, Exception):
             raise self.said
         return self.said
@@ -121,7 +121,7 @@ async def test_it_is_a_job_with_who_and_why_in_the_audit(bench: Bench) -> None:
     done = await bench.ended()
     assert (done.id, done.kind, done.who, done.state) == (answer.job, "rollback", "user:ann", "done: kept")
     (order,) = bench.orders_seen
-    assert (order.push, order.crc, order.ordered.who, order.ordered.reason) == (1, crc32(NEW), "user:ann", "worse")
+    assert (order.push, order.crc, order.request.who, order.request.reason) == (1, crc32(NEW), "user:ann", "worse")
     assert bench.recorded() == [("user:ann", "rollback", "begun", "worse"), ("user:ann", "rollback", "kept", "worse")]
     assert bench.audit.verify() == []
     told = JournalView.read(bench.store, MACHINE).history()

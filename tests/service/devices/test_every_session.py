@@ -87,7 +87,7 @@ async def opened(monkeypatch: pytest.MonkeyPatch, done: list[str], error: Except
     monkeypatch.setattr(recovered_session, "recover", recovers)
     urls = DeviceUrls("cnc", "ballbar", "laser", "fixture")
     site = Site("m", MACHINE, {}, urls)
-    async with recovered_session.recovered_session(None, site, accept_by="ann", told=done.append):  # type: ignore[arg-type]
+    async with recovered_session.recovered_session(None, site, accept_by="ann", report=done.append):  # type: ignore[arg-type]
         done.append("in use")
 
 

@@ -23,7 +23,7 @@ from abbe.service.cli.administration.audited import record_all
 from abbe.service.cli.common import print_table
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
-from abbe.service.storage.private import private_file, seen_by_others
+from abbe.service.storage.private import private_file, readable_by_others
 from abbe.service.storage.store import Store
 from tests.migration import next_revision
 from tests.service.users.conftest import World
@@ -294,9 +294,9 @@ def test_the_database_its_copy_and_its_journal_are_the_owners_only(
     assert {"abbe.sqlite3", f"abbe.sqlite3.before-{newest}", "abbe.sqlite3.audit-key", "abbe.sqlite3.audit-head"} <= rights.keys()
     assert set(rights.values()) == {0o600}, rights
     assert any("journal" in name or "wal" in name for name in rights)
-    assert seen_by_others(path) == ""
+    assert readable_by_others(path) == ""
     path.chmod(0o644)
-    assert "chmod 600" in seen_by_others(path)
+    assert "chmod 600" in readable_by_others(path)
 
 
 def test_a_database_that_others_may_read_is_warned_of(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from abbe.service.errors import PasswordRefused, StoreError, UserRefused
-from abbe.service.users.lockout import MOST, Buckets, Came, Lockout
+from abbe.service.users.lockout import MOST, Buckets, Lockout, LoginOrigin
 from abbe.service.users.passwords import AT_A_TIME, Passwords
-from abbe.service.users.people import NOBODY, digest_of
+from abbe.service.users.people import ANONYMOUS, digest_of
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.users.conftest import PHRASE, World
 
@@ -81,22 +81,22 @@ def test_a_session_ends_by_idleness_age_password_role_and_disabling(world: World
         clock.later(minutes=10)
         assert people.by_session(secret).name == "user:ana"
     clock.later(minutes=11)
-    assert people.by_session(secret) is NOBODY
+    assert people.by_session(secret) is ANONYMOUS
     idle = begin()
     clock.later(minutes=15, seconds=1)
-    assert people.by_session(idle) is NOBODY
+    assert people.by_session(idle) is ANONYMOUS
     for change in (
         lambda: people.set_role("ana", "viewer"),
         lambda: people.set_password("ana", PHRASE + "!"),
         lambda: people.disable("ana"),
     ):
         secret = begin()
-        assert people.by_session(secret) is not NOBODY
+        assert people.by_session(secret) is not ANONYMOUS
         change()
-        assert people.by_session(secret) is NOBODY
+        assert people.by_session(secret) is ANONYMOUS
     people.disable("ana", enable=True)
-    assert people.by_session(secret) is NOBODY
-    assert people.by_session("x" * 43) is NOBODY
+    assert people.by_session(secret) is ANONYMOUS
+    assert people.by_session("x" * 43) is ANONYMOUS
 
 
 def test_a_login_gives_a_new_secret_and_ends_the_old_session(world: World) -> None:
@@ -105,7 +105,7 @@ def test_a_login_gives_a_new_secret_and_ends_the_old_session(world: World) -> No
     first = world.people.begin(ana)
     second = world.people.begin(ana, first)
     assert first != second
-    assert world.people.by_session(first) is NOBODY
+    assert world.people.by_session(first) is ANONYMOUS
     assert world.people.by_session(second).role is Role.OPERATOR
 
 
@@ -128,17 +128,17 @@ def test_a_token_has_at_most_its_scopes_and_ends(world: World) -> None:
     people.set_role("met", "viewer")  # the rights of today, not those of the day it was made
     assert people.by_token(text).permissions == {Permission.READ}
     people.disable("met")
-    assert people.by_token(text) is NOBODY
+    assert people.by_token(text) is ANONYMOUS
     people.disable("met", enable=True)
-    assert people.by_token(text) is not NOBODY
+    assert people.by_token(text) is not ANONYMOUS
     flipped = text[:-1] + ("A" if text[-1] != "A" else "B")
     for wrong in (flipped, text + "A", "", "abbe__", text.replace("abbe_", "abbe-")):
-        assert people.by_token(wrong) is NOBODY
+        assert people.by_token(wrong) is ANONYMOUS
     clock.later(days=2)
-    assert people.by_token(text) is NOBODY
+    assert people.by_token(text) is ANONYMOUS
     again = people.add_token("met", "ci2", ["read"], 2)
     people.revoke_token("met", "ci2")
-    assert people.by_token(again) is NOBODY
+    assert people.by_token(again) is ANONYMOUS
     with pytest.raises(UserRefused, match="scopes of viewer: read"):
         people.add_token("met", "ci3", ["approve"], 2)
 
@@ -188,9 +188,9 @@ def test_a_thousand_tries_a_minute_are_at_most_ten_hashes(world: World) -> None:
     lockout = Lockout(clock.monotonic_s)
     hashes = 0
     for _ in range(1000):
-        if lockout.wait_s("ana", Came("10.0.0.9")) == 0:
+        if lockout.wait_s("ana", LoginOrigin("10.0.0.9")) == 0:
             hashes += 1
-            lockout.failed("ana", Came("10.0.0.9"))
+            lockout.failed("ana", LoginOrigin("10.0.0.9"))
         clock.later(seconds=0.06)
     assert 5 < hashes <= 10
 
@@ -198,29 +198,29 @@ def test_a_thousand_tries_a_minute_are_at_most_ten_hashes(world: World) -> None:
 def test_another_addresss_guesses_do_not_shut_out_who_has_been_here(world: World) -> None:
     clock = world.clock
     lockout = Lockout(clock.monotonic_s)
-    lockout.succeeded("ana", Came("10.0.0.1"))
+    lockout.succeeded("ana", LoginOrigin("10.0.0.1"))
     for _ in range(50):
-        lockout.failed("ANA", Came("10.0.0.9"))
-    assert 0 < lockout.wait_s("ana", Came("10.0.0.9")) <= 900
-    assert lockout.wait_s("ana", Came("10.0.0.8")) > 0
-    assert lockout.wait_s("ana", Came("10.0.0.1")) == 0
+        lockout.failed("ANA", LoginOrigin("10.0.0.9"))
+    assert 0 < lockout.wait_s("ana", LoginOrigin("10.0.0.9")) <= 900
+    assert lockout.wait_s("ana", LoginOrigin("10.0.0.8")) > 0
+    assert lockout.wait_s("ana", LoginOrigin("10.0.0.1")) == 0
     clock.later(seconds=901)
-    assert lockout.wait_s("ana", Came("10.0.0.9")) == 0  # never for ever
+    assert lockout.wait_s("ana", LoginOrigin("10.0.0.9")) == 0  # never for ever
 
 
 def test_one_address_that_tries_many_names_has_to_wait(world: World) -> None:
     lockout = Lockout(world.clock.monotonic_s)
     tried = 0
     for number in range(100):
-        if lockout.wait_s(f"user{number}", Came("10.0.0.9")) == 0:
+        if lockout.wait_s(f"user{number}", LoginOrigin("10.0.0.9")) == 0:
             tried += 1
-            lockout.failed(f"user{number}", Came("10.0.0.9"))
+            lockout.failed(f"user{number}", LoginOrigin("10.0.0.9"))
     assert tried == 20
 
 
 def test_who_logs_in_is_no_guesser_however_many_share_his_address(world: World) -> None:
     """Each try is counted before the password is looked at: the count of those that were right is taken back."""
-    lockout, shared = Lockout(world.clock.monotonic_s), Came("10.0.0.9")
+    lockout, shared = Lockout(world.clock.monotonic_s), LoginOrigin("10.0.0.9")
     for number in range(60):
         assert lockout.wait_s(f"user{number}", shared) == 0
         lockout.failed(f"user{number}", shared)
@@ -239,7 +239,7 @@ def test_who_logs_in_is_no_guesser_however_many_share_his_address(world: World) 
 def test_what_is_counted_stays_small(world: World) -> None:
     lockout, buckets = Lockout(world.clock.monotonic_s), Buckets(1.0, 2.0, world.clock.monotonic_s)
     for number in range(MOST + 500):
-        lockout.failed(f"u{number}", Came(f"a{number}"))
+        lockout.failed(f"u{number}", LoginOrigin(f"a{number}"))
         buckets.take(f"a{number}")
     assert len(lockout._counts) <= MOST
     assert len(buckets._left) <= MOST

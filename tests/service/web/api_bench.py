@@ -18,7 +18,7 @@ from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.compensation.proposal_doc import digest_of_doc, doc_of, load
-from abbe.service.compensation.proposals import Gathered, make
+from abbe.service.compensation.proposals import GatheredCampaign, make
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
@@ -152,7 +152,7 @@ async def _proposals(store: Store) -> list[int]:
     base = Base(CompStatus(0xAB, 2, 0, (crc32(image), 0), (2, 0), 0, 0), image)
     found = from_store(store, "c1")
     records = store.runs.all("c1")
-    gathered = Gathered(store.campaigns.find("c1"), records, found.runs, base, TableFormat(100, 4096))
+    gathered = GatheredCampaign(store.campaigns.find("c1"), records, found.runs, base, TableFormat(100, 4096))
     made = await make(store, found.site, gathered, progress=ignore_progress)
     assert made.proposed.reasons, "imported circles without temperatures speak against themselves"
     free = replace(made.proposed, reasons=(), by="somebody")

@@ -129,11 +129,11 @@ async def test_a_rejection_is_final_and_says_why(client, plant, fresh):
 
 
 async def test_a_push_is_told_of_a_rejection(plant, fresh):
-    from abbe.service.compensation.proposal_checks import HoldReason
+    from abbe.service.compensation.proposal_checks import PushPrecheck
 
     rejection = reject(plant.store, fresh, "somebody", "no", plant.clock, "user:somebody")
     assert isinstance(rejection, ProposalRejection)
-    held = HoldReason.__new__(HoldReason)
+    held = PushPrecheck.__new__(PushPrecheck)
     object.__setattr__(held, "rejections", (rejection,))
     assert list(held._rejected()) == [f"REJECTED: by somebody at {rejection.utc}: no"]
 

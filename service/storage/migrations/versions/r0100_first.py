@@ -1,4 +1,4 @@
-"""The first schema. What was there before the first release is part of it, and not brought up to it (decision 0033)."""
+"""The first schema. Databases from before the first release are not migrated (decision 0033)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TABLES = (
     "users", "sessions", "api_tokens",
     "audit", "identity",
 )  # fmt: skip
-"""In the order in which they are made."""
+"""In order of creation."""
 ONLY_GROWS_POSTGRESQL = (
     """
     CREATE FUNCTION audit_only_grows() RETURNS trigger AS $$
