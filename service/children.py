@@ -1,7 +1,7 @@
-"""Programs of ours in a Python of their own: how each is started, so that nothing in the working directory is imported in place of ours.
+"""Start Abbe's own modules in child processes, so that no module in the working directory shadows them.
 
-A plain ``python -m`` or ``python -c`` looks for modules in the working directory first: a folder ``abbe`` that lies there would run.
-Children are therefore started by this file's absolute path, with ``-P``: ``python -P .../service/children.py MODULE WORD ...``.
+A plain ``python -m`` or ``python -c`` looks for modules in the working directory first: a folder ``abbe`` there would run instead.
+Children therefore start with this file's absolute path and ``-P``: ``python -P .../service/children.py MODULE ARGUMENT ...``.
 """
 
 from __future__ import annotations
@@ -14,25 +14,17 @@ from contextlib import contextmanager
 
 SAFE = "PYTHONSAFEPATH"
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-"""Where the package ``abbe`` lies."""
+"""Parent directory of the package ``abbe``."""
 
 
-def python_words(module: str, *words: object) -> list[str]:
-    """Return the command line that runs a module of ours.
-
-    Parameters
-    ----------
-    module : str
-        As after ``python -m``.
-    *words : object
-        Its arguments.
-    """
+def python_command(module: str, *words: object) -> list[str]:
+    """Return the command line that runs a module of Abbe; ``module`` as after ``python -m``."""
     return [sys.executable, "-P", os.path.abspath(__file__), module, *map(str, words)]
 
 
 @contextmanager
 def started_safely() -> Iterator[None]:
-    """Whatever Python is started inside, by ``multiprocessing`` for example, looks for no module in the working directory either."""
+    """Set ``PYTHONSAFEPATH`` for every Python process started inside, for example by ``multiprocessing``."""
     before = os.environ.get(SAFE)
     os.environ[SAFE] = "1"
     try:
@@ -47,7 +39,7 @@ def started_safely() -> Iterator[None]:
 def _run() -> None:
     module, sys.argv[1:] = sys.argv[1], sys.argv[2:]
     if ROOT not in sys.path:
-        sys.path.append(ROOT)  # last: of use where Abbe runs from a folder and is not installed
+        sys.path.append(ROOT)  # last: needed only where Abbe runs from a folder and is not installed
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 
 

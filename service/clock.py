@@ -1,4 +1,4 @@
-"""The service's clocks: monotonic for waiting and for differences, UTC for people and for slots."""
+"""The service's clocks: monotonic for waiting and for durations, UTC for people and for slots."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What the service knows of time. Injected, so that tests drive weeks in milliseconds."""
+    """The clocks that the service uses. Injected, so that tests run weeks in milliseconds."""
 
     def monotonic_s(self) -> float:
-        """Return seconds since an arbitrary moment; never jumps."""
+        """Return seconds since an arbitrary origin; never jumps."""
         ...
 
     def utc(self) -> datetime:
-        """Return the wall clock, aware, in UTC; may jump when somebody sets it."""
+        """Return the wall clock, timezone-aware, in UTC; it may jump when the clock is set."""
         ...
 
     async def sleep(self, s: float) -> None:
@@ -28,11 +28,11 @@ class SystemClock:
     """The clocks of this computer."""
 
     def monotonic_s(self) -> float:
-        """Return seconds since an arbitrary moment; never jumps."""
+        """Return seconds since an arbitrary origin; never jumps."""
         return time.monotonic()
 
     def utc(self) -> datetime:
-        """Return the wall clock, aware, in UTC."""
+        """Return the wall clock, timezone-aware, in UTC."""
         return datetime.now(UTC)
 
     async def sleep(self, s: float) -> None:

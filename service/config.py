@@ -1,4 +1,4 @@
-"""The machine file: read, checked, overridden by the environment; every mistake is one line that names the key.
+"""Read and check the machine file, and apply overrides from the environment; every mistake is one line that names the key.
 
 Order of precedence: environment (``ABBE_WEB__PORT=9000`` is ``port`` in ``[web]``), then the file, then the defaults.
 """
@@ -19,29 +19,19 @@ from pydantic_settings.exceptions import SettingsError
 
 from abbe.service.config_schema import MachineFile
 from abbe.service.errors import ConfigError
-from abbe.service.explain import expected, nearest, where
+from abbe.service.explain import expected, location_text, nearest
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage.engine import resolve_url
 
 PREFIX = "ABBE_"
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-"""How pydantic calls a key that a model, or a dataclass, does not have."""
+"""Pydantic's error types for a key that a model or a dataclass does not have."""
 Origin = Literal["default", "file", "environment"]
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedMachine:
-    """A machine file with everything that decides its values.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    machine : MachineFile
-        Effective values; the database URL of a SQLite file is absolute.
-    origins : dict
-        Dotted key to where its value comes from.
-    """
+    """A machine file with its effective values; ``origins``: dotted key to the source of its value."""
 
     path: Path
     machine: MachineFile
@@ -59,35 +49,25 @@ class LoadedMachine:
 
 
 class _Environment(MachineFile, BaseSettings):
-    """Tells pydantic-settings which variables there can be; it is never filled itself."""
+    """Defines the environment variables for pydantic-settings; it is never instantiated."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_nested_delimiter="__", extra="forbid")
 
 
 def load_machine(path: Path | str) -> LoadedMachine:
-    """Read and check a machine file.
-
-    Parameters
-    ----------
-    path : Path or str
-        The TOML file.
-
-    Returns
-    -------
-    Loaded
-        Effective values and where they come from.
+    """Read and check a machine file (TOML).
 
     Raises
     ------
     ConfigError
-        File, key, and what is expected there.
+        Names file, key, and the expected value.
     """
     path = Path(path)
     from_file = read_toml(path)
     from_environment = _overrides()
     merged = _merged(from_file, from_environment)
     try:
-        # By way of JSON: there strict means that text is no number, while a list still is a tuple.
+        # Via JSON: there, strict mode refuses text for a number but still accepts a list for a tuple.
         machine = MachineFile.model_validate_json(json.dumps(merged, default=str), strict=True)
     except ValidationError as err:
         raise _config_error(path, err.errors(), from_environment) from None
@@ -97,12 +77,12 @@ def load_machine(path: Path | str) -> LoadedMachine:
 
 
 def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
-    """Content of a machine file, or of another that ``what`` names in errors.
+    """Return the content of a machine file, or of another TOML file that ``what`` names in errors.
 
     Raises
     ------
     ConfigError
-        It is missing, unreadable, not UTF-8 or not TOML; the message says which.
+        The file is missing, unreadable, not UTF-8 or not TOML; the message says which.
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -157,23 +137,23 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[str, Any]) -> ConfigError:
-    # A mistyped key is both unknown and missing: what stands there says more than what does not.
+    # A mistyped key is both unknown and missing: the unknown one says more.
     first, more = min(errors, key=lambda one: one["type"] not in UNKNOWN_KEY), len(errors) - 1
     location = first["loc"]
-    source = f"{PREFIX} environment" if _holds(environment, location) else str(path)
+    source = f"{PREFIX} environment" if _contains(environment, location) else str(path)
     tail = f" (and {more} more)" if more else ""
-    key = where(location)
+    key = location_text(location)
     if first["type"] in UNKNOWN_KEY:
         hint = nearest(str(location[-1]), _siblings(location))
         return ConfigError(f"{source}: unknown key {key!r}{tail}", hint)
     if first["type"] == "missing":
         return ConfigError(f"{source}: key {key!r} is missing{tail}", f"add {location[-1]} = ...")
     wanted = expected(first).replace("expected an object", "expected a table of keys")
-    at = f"{source}: {key}" if key else source  # the file as a whole has no key
+    at = f"{source}: {key}" if key else source  # an error of the whole file has no key
     return ConfigError(mask_secrets(f"{at}: {wanted}{tail}"), "correct it; `abbe schema` describes every key")
 
 
-def _holds(values: Any, location: tuple[int | str, ...]) -> bool:
+def _contains(values: Any, location: tuple[int | str, ...]) -> bool:
     for part in location:
         if not isinstance(values, dict) or part not in values:
             return False
@@ -191,6 +171,6 @@ def _siblings(location: tuple[int | str, ...]) -> list[str]:
 
 
 def _keys(section: Any) -> dict[str, Any]:
-    """The keys of a table with their types; none of what is no table."""
+    """Return the keys of a table with their types; nothing for a type that is no table."""
     names = section.model_fields if hasattr(section, "model_fields") else getattr(section, "__dataclass_fields__", ())
     return {name: kind for name, kind in get_type_hints(section).items() if name in names} if names else {}

@@ -1,4 +1,4 @@
-"""What a machine file can say, with bounds on every number and the unit in every key. ``abbe.service.config`` reads it."""
+"""Schema of the machine file, with bounds on every number and the unit in every key. ``abbe.service.config`` reads it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from abbe.service.storage.engine import parse_url as parse_database
 Positive = Annotated[float, Field(gt=0.0)]
 
 SHORTEST_MM, LONGEST_MM = 50.0, 50_000.0
-"""Strokes of machines that there are. The shortest is also what a machine of a metre or two is in inches."""
+"""Range of real machines' strokes. A machine of a metre or two, given in inches, falls below the shortest."""
 COLDEST_C, WARMEST_C = -20.0, 50.0
-"""Where machines are measured; 68 to 72 is Fahrenheit."""
+"""Air temperatures of measurements; 68 to 72 is Fahrenheit."""
 CERTIFICATES = (date(2000, 1, 1), date(2199, 12, 31))
-"""Between these a date can be the last day of a certificate; the demonstration's are of 2099."""
+"""Earliest and latest plausible last day of a certificate; the demonstration's are of 2099."""
 
 
 def _celsius(window: tuple[float, float]) -> tuple[float, float]:
@@ -49,7 +49,7 @@ Certificate = Annotated[date | None, AfterValidator(_certificate)]
 
 
 class Section(BaseModel):
-    """A table of the machine file: no unknown key, no NaN, no change afterwards."""
+    """A table of the machine file: no unknown key, no NaN, immutable."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -71,7 +71,7 @@ class AxisPoints(Section):
 
 
 class Devices(Section):
-    """Where the devices are; an absent one is not connected."""
+    """Addresses of the devices; an absent one is not connected."""
 
     ballbar: str | None = Field(default=None, description="serial:///dev/ttyUSB0?baud=460800 or socket://host:port")
     laser: str | None = Field(default=None, description="modbus+tcp://host:port or modbus+rtu:///dev/ttyS0?baud=115200")
@@ -106,24 +106,24 @@ def _database(text: str) -> str:
 
 
 class StoreSection(Section):
-    """Where results are kept."""
+    """Where results are stored."""
 
     url: Annotated[str, AfterValidator(_database)] = Field(
         default="sqlite:///abbe.sqlite3", description="SQLite file (relative to the machine file's folder) or postgresql://user@host/name"
     )
     capture: str = Field(
         default="",
-        description="local folder in which samples are made safe before the database gets them; empty: beside the SQLite file; PostgreSQL "
+        description="local folder in which samples are saved before they reach the database; empty: beside the SQLite file; PostgreSQL "
         "needs one",
     )
     capture_reserve_mib: Annotated[float, Field(ge=0.0625, le=1024.0)] = Field(
-        default=16.0, description="disk space held back so that a run can be closed when the disk is full"
+        default=16.0, description="disk space reserved so that a run can be closed when the disk is full"
     )
-    keep_segments: bool = Field(default=False, description="keep the capture's files although the database has everything")
+    keep_segments: bool = Field(default=False, description="keep the capture files after the database has everything")
 
 
 class Limits(Section):
-    """What must never be exceeded. A table beyond a limit is refused, not clamped."""
+    """Limits that must never be exceeded. A table beyond a limit is refused, not clamped."""
 
     table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=100.0, description="largest correction at any grid point")
     table_change_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
@@ -135,44 +135,46 @@ class Limits(Section):
         default=20.0, description="largest change between neighbouring grid points"
     )
     table_walk_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
-        default=50.0, description="largest change of a correction over 30 days by pushes that nobody attends ([alarm] push)"
+        default=50.0, description="largest change of a correction over 30 days by unattended pushes ([alarm] push)"
     )
     measurement_age_h: Annotated[float, Field(gt=0.0, le=8760.0)] = Field(
-        default=72.0, description="a table is only written from runs that are not older"
+        default=72.0, description="a table is only written from runs of at most this age"
     )
     two_people: bool = Field(
         default=False,
-        description="a proposed table is only pushed when somebody else than its proposer has approved it (`abbe comp approve`)",
+        description="a proposed table is only pushed after a person other than its proposer has approved it (`abbe comp approve`)",
     )
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
-    temperature_c: Temperatures = Field(default=(18.0, 24.0), description="air temperature in which a measurement is allowed")
+    temperature_c: Temperatures = Field(default=(18.0, 24.0), description="permitted air temperature of a measurement")
     run_temperature_c: Temperatures | None = Field(
-        default=None, description="air temperature (of the laser) beyond which a running measurement stops; absent: it is not watched"
+        default=None, description="air temperature (of the laser) outside which a running measurement stops; absent: not watched"
     )
     continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
         default_factory=list,
-        description="conditions that only suspend a measurement, which goes on by itself when they have cleared; e-stop and alarm never "
-        "do. ballbar: its box was lost or switched on anew, and is back",
+        description="conditions that only suspend a measurement, which resumes by itself when they have cleared; e-stop and alarm always "
+        "end it. ballbar: the connection to its box was lost, or the box restarted, and it answers again",
     )
-    suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = Field(default=1800.0, description="longest suspension, then the run ends")
-    settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(default=10.0, description="so long all is well before it goes on")
+    suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = Field(default=1800.0, description="longest suspension; after it the run ends")
+    settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
+        default=10.0, description="how long all conditions must be clear before the measurement resumes"
+    )
 
 
 class Calibration(Section):
-    """Last days of the instruments' certificates. No table is written from an instrument without one, or after it."""
+    """Last days of the instruments' certificates. No table is written from an instrument without a valid certificate."""
 
     ballbar: Certificate = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
     laser: Certificate = Field(default=None, description="of the laser")
 
 
 class Nc(Section):
-    """The controller for which NC programs are written (`abbe measure --nc`)."""
+    """The controller that NC programs are written for (`abbe measure --nc`)."""
 
     acceleration_mm_s2: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(
-        default=500.0, description="along the path; only how long a program runs is told from it"
+        default=500.0, description="along the path; used only to estimate how long a program runs"
     )
     heidenhain_tool: Annotated[int, Field(ge=1, le=32_767)] | None = Field(
-        default=None, description="row of the tool table for what is in the spindle (length 0, radius 0); absent: the operator writes it"
+        default=None, description="row of the tool table for the tool in the spindle (length 0, radius 0); absent: the operator enters it"
     )
     memory_kib: dict[Literal["siemens", "fanuc", "heidenhain", "linuxcnc", "iso"], Positive] = Field(
         default_factory=dict, description="program memory by dialect; absent: 256 for fanuc and iso, no limit for the others"
@@ -180,7 +182,7 @@ class Nc(Section):
 
 
 class Verify(Section):
-    """Limits of the scheduled check: above one of them the machine does not pass."""
+    """Limits of the scheduled check: a machine above any of them fails."""
 
     body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
     helix_rms_um: Positive = Field(default=5.0, description="rms of the ball-bar residual on the check helix")
@@ -204,8 +206,8 @@ class Mqtt(Section):
     topic_prefix: str = Field(default="abbe", pattern=r"^[^+#\s/][^+#\s]*$", description="first part of every topic")
     ca: str = Field(
         default="",
-        description="authority that signed the broker's certificate, PEM file (relative to the machine file's folder); empty: those that "
-        "this computer trusts",
+        description="authority that signed the broker's certificate, PEM file (relative to the machine file's folder); empty: the "
+        "authorities that this computer trusts",
     )
     certificate: str = Field(default="", description="our certificate, PEM file, if the broker asks for one")
     key: str = Field(default="", description="private key of our certificate, PEM file")
@@ -235,10 +237,13 @@ class Web(Section):
     key: str = Field(default="", description="private key of the certificate, PEM file")
     behind_tls: bool = Field(
         default=False,
-        description="a reverse proxy on this computer takes off the TLS, keeps Host and appends to X-Forwarded-For, its name is in names",
+        description="a reverse proxy on this computer terminates TLS, keeps Host and appends to X-Forwarded-For; its name is in names",
     )
     memory_mb: int = Field(
-        default=PAGE_MEMORY_MB, ge=512, le=65536, description="most that the page's process gets, MiB; beyond it the core starts it again"
+        default=PAGE_MEMORY_MB,
+        ge=512,
+        le=65536,
+        description="memory limit of the page's process, MiB; the core restarts a process that exceeds it",
     )
 
     @model_validator(mode="after")
@@ -251,7 +256,7 @@ class Web(Section):
 
 
 class OpcUa(Section):
-    """An OPC UA server that shows the machine to the plant. Nothing can be written through it."""
+    """A read-only OPC UA server that shows the machine to the plant."""
 
     enabled: bool = Field(default=False, description="needs the extra: pip install 'abbe[opcua]'")
     host: str = Field(
@@ -277,7 +282,7 @@ class OpcUa(Section):
 
     @property
     def exposed(self) -> bool:
-        """Whether other computers can reach it: then encryption, and a certificate known here, are required of every client."""
+        """Whether other computers can reach it: then every client needs encryption and a known certificate."""
         try:
             return not ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -285,7 +290,7 @@ class OpcUa(Section):
 
     @property
     def guarded(self) -> bool:
-        """Whether only those with a known certificate may read."""
+        """Whether only clients with a known certificate may read."""
         return self.exposed or bool(self.clients)
 
 
@@ -304,20 +309,20 @@ class Signatures(Section):
 
 
 class AlarmSection(Section):
-    """When scheduled checks raise an alarm beside their limits, and what may follow by itself."""
+    """When scheduled checks raise an alarm before a limit is exceeded, and what the service may do about it by itself."""
 
     warn_days: float = Field(
-        default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within so many days (lower end, 95 %); 0: never"
+        default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within this many days (lower end, 95 %); 0: never"
     )
     campaign: str = Field(
         default="identification", min_length=1, description="what on_alarm measures: identification, or a recipe FILE.toml beside this file"
     )
     push: Literal["never", "approved"] = Field(
         default="never",
-        description="approved: a proposal that a person has approved is pushed by the service when the machine is idle, and verified",
+        description="approved: the service pushes a proposal that a person has approved when the machine is idle, and verifies it",
     )
     watch_table: bool = Field(
-        default=True, description="look every 10 s whether somebody else put another compensation table into force, and raise an alarm"
+        default=True, description="check every 10 s whether another program activated a compensation table, and raise an alarm"
     )
 
 
@@ -329,7 +334,7 @@ class MachineFile(Section):
     vertical_axis: str = Field(default="Z", pattern="^[XYZ]$")
     stroke_mm: AxisIntervals
     short_strokes: bool = Field(
-        default=False, description="strokes under 50 mm are meant: without this they are refused, since they may be inches"
+        default=False, description="accept strokes under 50 mm: otherwise they are refused, since they may be inches"
     )
     pivots_mm: AxisPoints = AxisPoints()
     tool_mm: Point = Field(default=(0.0, 0.0, 0.0), description="from the spindle reference point to the functional point")
@@ -377,6 +382,6 @@ class MachineFile(Section):
         return self
 
     def machine_doc(self) -> dict[str, object]:
-        """Write the ``machine`` object of the exchange format."""
+        """Return the ``machine`` object of the exchange format."""
         keys = {"name", "chain", "vertical_axis", "stroke_mm", "pivots_mm", "tool_mm"}
         return self.model_dump(mode="json", include=keys)

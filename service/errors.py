@@ -1,4 +1,4 @@
-"""Errors of the job, with stable codes. The command line prints one line of cause and remedy and exits with 2."""
+"""Errors of the service, with stable codes. The command line prints one line of cause and remedy and exits with 2."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 class AbbeError(Exception):
-    """Something a person has to know: what is wrong, where, and what to do.
+    """An error that a person has to know: what is wrong, where, and what to do.
 
     Parameters
     ----------
@@ -25,43 +25,43 @@ class AbbeError(Exception):
 
 
 class ConfigError(AbbeError):
-    """The machine file is missing, unreadable, or says something impossible."""
+    """The machine file is missing, unreadable, or has an impossible value."""
 
     code = "CFG-001"
 
 
 class FileFormatError(AbbeError):
-    """An exchange file is not what run-format demands: file, key, row and what was expected."""
+    """An exchange file violates run-format.md; the message names file, key, row and the expected value."""
 
     code = "FMT-001"
 
 
 class StoreError(AbbeError):
-    """The database cannot be opened, is of another version, or holds what cannot be."""
+    """The database cannot be opened, has another version, or holds impossible data."""
 
     code = "STO-001"
 
 
 class NotStored(StoreError):
-    """The database holds nothing under the number or name that was asked for."""
+    """The database has no entry with this number or name."""
 
     code = "STO-002"
 
 
 class Unusable(AbbeError):
-    """What is stored cannot be shown as it was asked for: it is not complete enough, damaged, or of another kind."""
+    """A stored entry cannot be shown as requested: it is incomplete, damaged, or of another kind."""
 
     code = "STO-003"
 
 
 class JournalChanged(StoreError):
-    """The push journal is not what was written: an entry was changed, removed or swapped."""
+    """The push journal was changed after it was written: an entry was edited, removed or swapped."""
 
     code = "STO-005"
 
 
 class BackupRefused(AbbeError):
-    """A backup cannot be made there, is damaged, or cannot be brought back over what is there. Nothing was changed."""
+    """A backup cannot be written to this place, is damaged, or cannot replace the existing data. Nothing was changed."""
 
     code = "STO-004"
 
@@ -73,7 +73,7 @@ class StrokeError(AbbeError):
 
 
 class UnsafeToMove(AbbeError):
-    """An interlock forbids motion, or went away during it."""
+    """An interlock forbids motion, or tripped during motion."""
 
     code = "SEQ-002"
 
@@ -85,21 +85,21 @@ class MeasurementFault(AbbeError):
 
 
 class Interlock(UnsafeToMove):
-    """A condition that stops motion at once. Each has a code of its own; ``condition`` is its name in files and tables."""
+    """A condition that stops motion at once. Each has its own code; ``condition`` is its name in files and tables."""
 
     code = "ILK-000"
     condition = ""
 
 
 class EstopPressed(Interlock):
-    """The e-stop is pressed. Never goes on by itself."""
+    """The e-stop is pressed. The measurement never resumes by itself."""
 
     code = "ILK-001"
     condition = "estop"
 
 
 class AlarmOn(Interlock):
-    """The controller has an alarm. Never goes on by itself."""
+    """The controller has an alarm. The measurement never resumes by itself."""
 
     code = "ILK-002"
     condition = "alarm"
@@ -113,7 +113,7 @@ class DoorOpen(Interlock):
 
 
 class RemoteLost(Interlock):
-    """The controller is not in remote mode any more."""
+    """The controller is no longer in remote mode."""
 
     code = "ILK-004"
     condition = "mode"
@@ -127,14 +127,14 @@ class DrivesOff(Interlock):
 
 
 class ProgramRuns(Interlock):
-    """An NC program runs: somebody else moves the machine."""
+    """An NC program runs and moves the machine."""
 
     code = "ILK-006"
     condition = "program"
 
 
 class BeamLost(Interlock):
-    """The laser has lost its beam or its signal is too low: its count is lost."""
+    """The laser has lost its beam, or its signal is too low: its count is invalid."""
 
     code = "ILK-007"
     condition = "beam"
@@ -155,111 +155,111 @@ class TemperatureOutside(Interlock):
 
 
 class StatusUnknown(Interlock):
-    """The controller, or the instrument that is being read, has not said for too long how it is."""
+    """The controller, or the instrument being read, has not reported its status for too long."""
 
     code = "ILK-010"
     condition = "status"
 
 
 class SpindleTurns(Interlock):
-    """The spindle turns: what is mounted on it, or in its cup, is torn off."""
+    """The spindle turns and would tear off what is mounted on it or in its cup."""
 
     code = "ILK-011"
     condition = "spindle"
 
 
 class Stopped(AbbeError):
-    """A person asked to stop. What is complete stays; `abbe measure --resume` goes on."""
+    """A person stopped the measurement. Completed runs are kept; `abbe measure --resume` continues."""
 
     code = "SEQ-004"
 
 
 class Aborted(AbbeError):
-    """A person asked to stop at once: the axes were stopped where they were."""
+    """A person aborted the measurement: the axes stopped where they were."""
 
     code = "SEQ-005"
 
 
 class RunInterrupted(AbbeError):
-    """A run was broken off and is gone on with: what it has is kept as evidence and never averaged with what follows."""
+    """A run was interrupted and its campaign resumed: its data are kept as evidence and never averaged with later data."""
 
     code = "SEQ-006"
 
 
 class PreconditionsChanged(AbbeError):
-    """A campaign cannot be gone on with: the controller, its table, the recipe or the machine is not what it was."""
+    """A campaign cannot be resumed: the controller, its table, the recipe or the machine has changed."""
 
     code = "SEQ-007"
 
 
 class SetupDisturbed(AbbeError):
-    """What was mounted is not where it was: it has to be mounted anew."""
+    """A mounted instrument or target has moved: it must be mounted again."""
 
     code = "SEQ-008"
 
 
 class StretchDiffers(SetupDisturbed):
-    """A path that was broken off reads otherwise, on the stretch that is read twice, than it did: what it has read is not gone on with."""
+    """An interrupted path, read again over its overlap, gives different readings: the path cannot be resumed from them."""
 
     code = "SEQ-009"
 
 
 class MachineInUse(UnsafeToMove):
-    """Another process has the machine, or is in the middle of a push into it. Nothing is wrong: it waits until that has ended."""
+    """Another process uses the machine, or pushes a table into it. This is no fault: wait until that process has finished."""
 
     code = "SEQ-010"
 
 
 class DevicesNotReady(AbbeError):
-    """Several devices that a measurement needs are missing, silent or not what they should be. Nothing has moved."""
+    """Several devices that the measurement needs are missing, silent or of the wrong kind. Nothing has moved."""
 
     code = "SEQ-011"
 
 
 class NotObservable(AbbeError):
-    """The data cannot carry the claim that was asked for."""
+    """The data do not determine the requested quantity."""
 
     code = "SOL-001"
 
 
 class InstrumentsDisagree(AbbeError):
-    """Two instruments contradict each other by more than their calibration allows: one of them, or its set-up, is wrong."""
+    """Two instruments differ by more than their calibration allows: one of them, or its set-up, is wrong."""
 
     code = "SOL-002"
 
 
 class CampaignRefused(AbbeError):
-    """A run of the campaign cannot be what it says: another unit, exchanged axes, a copy, another machine. Nothing was solved."""
+    """A run of the campaign contradicts its description: another unit, exchanged axes, a copy, another machine. Nothing was solved."""
 
     code = "SOL-003"
 
 
 class ModelUnknown(AbbeError):
-    """The model book of a machine does not hold what was asked for, or holds what this version cannot compute."""
+    """The model book of a machine has no such version or effect, or has one that this version of Abbe cannot compute."""
 
     code = "DIS-001"
 
 
 class EffectUnknown(AbbeError):
-    """The catalogue of effects has no entry of this name."""
+    """The catalogue of effects has no entry with this name."""
 
     code = "DIS-002"
 
 
 class EffectPluginBroken(AbbeError):
-    """An effect of another package cannot be used. It was left out; all else works."""
+    """An effect from a plug-in package cannot be used. It was left out; everything else works."""
 
     code = "DIS-003"
 
 
 class ModelMovedOn(AbbeError):
-    """The model of a machine has a newer version than the one that an addition was made on. Nothing was added."""
+    """The machine's model has a newer version than the one that the addition is based on. Nothing was added."""
 
     code = "DIS-004"
 
 
 class TableRefused(AbbeError):
-    """A table breaks a limit (value, step, change). Nothing was written."""
+    """A table exceeds a limit (value, step, change). Nothing was written."""
 
     code = "CMP-001"
 
@@ -269,119 +269,119 @@ class TableRefused(AbbeError):
 
     @classmethod
     def because(cls, reasons: Sequence[str], remedy: str = "nothing was written") -> TableRefused:
-        """One refusal for all reasons."""
+        """Return one refusal for all reasons."""
         return cls("; ".join(reasons), remedy, reasons)
 
 
 class TableMismatch(AbbeError):
-    """The controller does not hold the table that was sent. It was not activated."""
+    """The controller's table differs from the one that was sent. It was not activated."""
 
     code = "CMP-002"
 
 
 class StillActive(AbbeError):
-    """An unverified table is still active: the controller could not be switched back. Every later command tries again first."""
+    """An unverified table is still active: the controller could not be switched back. Every later command first tries again."""
 
     code = "CMP-003"
 
 
 class PushNotBegun(AbbeError):
-    """A table was not brought into force: something spoke against it on the way. The old table is in force."""
+    """A table was not activated: a condition of the push was not met. The old table is in force."""
 
     code = "CMP-004"
 
 
 class TakenBack(TableRefused):
-    """A table was in force for its probe, was refuted, and the old one is in force again."""
+    """A table was active for its probe and failed it; the old table is in force again."""
 
     code = "CMP-005"
 
 
 class FormatRefused(AbbeError):
-    """Tables do not fit what a control's format can hold (points, spacing, size, zero at the reference, kind). Nothing was written."""
+    """The tables do not fit the control's format (points, spacing, size, zero at the reference, kind). Nothing was written."""
 
     code = "TAB-001"
 
 
 class TableFileError(AbbeError):
-    """A control's table file is not what the control would read as a whole: file, line, what is wrong."""
+    """A control could not read this table file completely; the message names file, line and mistake."""
 
     code = "TAB-002"
 
 
 class TableContradicts(AbbeError):
-    """Tables are not those that were expected: wrong sign, wrong unit, exchanged directions. They must not be loaded."""
+    """The tables differ from the expected ones: wrong sign, wrong unit, exchanged directions. They must not be loaded."""
 
     code = "TAB-003"
 
 
 class CaptureFault(AbbeError):
-    """Samples cannot be made safe: the disk reports an error, or there can be no segment. The run ends; what was acknowledged is kept."""
+    """Samples cannot be saved: the disk reports an error, or no segment can be created. The run ends; acknowledged samples are kept."""
 
     code = "CAP-001"
 
 
 class DiskFull(AbbeError):
-    """No disk space is left. The reserve was released so that the run could be closed; every acknowledged sample is kept."""
+    """No disk space is left. The reserve was released to close the run; every acknowledged sample is kept."""
 
     code = "CAP-002"
 
 
 class CaptureConflict(AbbeError):
-    """The database holds another chunk under the same number than the segment does. Nothing was overwritten."""
+    """The database has a different chunk under this number than the segment. Nothing was overwritten."""
 
     code = "CAP-003"
 
 
 class PasswordRefused(AbbeError):
-    """A new password is one that is guessed first."""
+    """The new password is too easy to guess."""
 
     code = "USR-001"
 
 
 class UserRefused(AbbeError):
-    """No such user, role, scope or token, or what was asked would leave nobody who may manage users. Nothing was changed."""
+    """The user, role, scope or token does not exist, or the change would leave no one who can manage users. Nothing was changed."""
 
     code = "USR-002"
 
 
 class AuditBroken(AbbeError):
-    """The audit was changed after it was written, or its end is missing; or a record of it cannot be written."""
+    """The audit was changed after it was written, or its end is missing, or a record cannot be written."""
 
     code = "AUD-001"
 
 
 class SignatureRefused(AbbeError):
-    """A signed compensation file is not what was signed, or not for this machine, base, limits or day. It was not taken in."""
+    """A signed compensation file was changed, or is for another machine, base, limits or day. It was not imported."""
 
     code = "SIG-001"
 
 
 class KeyRefused(AbbeError):
-    """A key cannot be read, is no Ed25519 key, or would overwrite another."""
+    """A key cannot be read, is not an Ed25519 key, or would overwrite another."""
 
     code = "SIG-002"
 
 
 class ChannelBroken(AbbeError):
-    """What came over the channel between the processes of the service is none of its messages. The process at the other end is ended."""
+    """The service's processes exchanged an invalid message. The process at the other end is ended."""
 
     code = "SRV-001"
 
 
 class CoreSilent(AbbeError):
-    """The core of the service does not answer its web process. What runs on the machine is not known to the page."""
+    """The service's core does not answer its web process. The page does not know what runs on the machine."""
 
     code = "SRV-002"
 
 
 class KeyReused(AbbeError):
-    """An Idempotency-Key came with another request than the first time. Nothing was done; a new request needs a new key."""
+    """An Idempotency-Key was used again with a different request. Nothing was done; a new request needs a new key."""
 
     code = "API-001"
 
 
 class KeyInUse(AbbeError):
-    """The request of this Idempotency-Key is still being worked on, or was not answered. Ask again after a minute."""
+    """The request with this Idempotency-Key is still running, or its result is unknown. Ask again after a minute."""
 
     code = "API-002"

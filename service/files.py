@@ -1,4 +1,4 @@
-"""Files that others made: read only if they are plain files, and never more than was agreed."""
+"""Read files from outside Abbe: plain files only, up to a size limit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 PIECE = 1 << 20
-"""So much is asked for at once: a buffer of the longest file that is allowed would be made for the shortest."""
+"""Bytes read at once: reading the limit at once would allocate a buffer of that size for the smallest file."""
 _KINDS = (
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISCHR, "a device"),
@@ -19,31 +19,29 @@ _KINDS = (
 
 
 class NotPlainError(OSError):
-    """It is no plain file, or a longer one than is read: ``strerror`` says which."""
+    """The path is no plain file, or the file is larger than the limit: ``strerror`` says which."""
 
 
 def read_plain(path: Path, most: int) -> bytes:
-    """Read a whole file that somebody else may have put there. A link counts as what it leads to.
+    """Read a whole file from outside Abbe. A link counts as its target.
 
-    A pipe is not waited for, a device not even opened: opening a serial port moves its lines.
+    A pipe is not waited for, and a device is not even opened: opening a serial port moves its lines.
 
     Parameters
     ----------
-    path : Path
-        The file.
     most : int
-        Longest file that is read, bytes: those that come are counted, whatever the system says of its size.
+        Size limit, bytes. The bytes read are counted, whatever size the system reports.
 
     Raises
     ------
     NotPlainError
-        It is a device, a pipe, a folder ..., or longer than that.
+        The path is a device, a pipe, a folder ..., or the file is larger than ``most``.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     _check(path, os.stat(path).st_mode)
     with open(path, "rb", opener=_without_waiting) as file:
-        _check(path, os.fstat(file.fileno()).st_mode)  # another one may lie there by now
+        _check(path, os.fstat(file.fileno()).st_mode)  # the path may lead to another file by now
         content = bytearray()
         while piece := file.read(min(PIECE, most + 1 - len(content))):
             content += piece
@@ -56,7 +54,7 @@ def read_plain(path: Path, most: int) -> bytes:
 
 
 def is_plain(path: Path) -> bool:
-    """Tell whether a path is a plain file or a plain folder itself, no link to one."""
+    """Return whether a path is itself a plain file or folder, not a link to one."""
     return stat.S_IFMT(os.lstat(path).st_mode) in {stat.S_IFREG, stat.S_IFDIR}
 
 
@@ -66,5 +64,5 @@ def _without_waiting(path: str, flags: int) -> int:
 
 def _check(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
-        kind = next((word for is_kind, word in _KINDS if is_kind(mode)), "something else")
+        kind = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
         raise NotPlainError(errno.EINVAL, f"it is {kind}, expected a plain file", str(path))

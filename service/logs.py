@@ -1,4 +1,4 @@
-"""How the processes of the service log: to stderr, one JSON object a line for machines, readable lines in a terminal."""
+"""Logging of the service's processes: to stderr, one JSON object a line for machines, readable lines in a terminal."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def configure_logs() -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=last))
     logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
-    # Libraries that have something to say at each request or each lost connection: we say it ourselves, once.
+    # These libraries log each request or each lost connection; the service logs that once itself.
     for name, level in (
         ("mqtt", logging.CRITICAL),
         ("asyncua", logging.CRITICAL),

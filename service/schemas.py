@@ -1,4 +1,4 @@
-"""JSON Schemas of everything that people write or exchange, generated from the models that check it."""
+"""JSON Schemas of all files that people write or exchange, generated from the models that check them."""
 
 from __future__ import annotations
 
@@ -25,35 +25,13 @@ MODELS: dict[str, type[BaseModel]] = {
 
 
 def schema_text(name: str) -> str:
-    """Generate one schema.
-
-    Parameters
-    ----------
-    name : str
-        Key of ``MODELS``.
-
-    Returns
-    -------
-    str
-        JSON text, the same at every call.
-    """
+    """Return one schema as JSON text, the same at every call; ``name``: a key of `MODELS`."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema"} | MODELS[name].model_json_schema()
     return json.dumps(schema, indent=2, ensure_ascii=False, sort_keys=True) + "\n"
 
 
 def write_schemas(folder: Path) -> list[Path]:
-    """Write all schemas.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to; made if missing.
-
-    Returns
-    -------
-    list of Path
-        The files.
-    """
+    """Write all schemas to a folder, created if missing; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{name}.schema.json" for name in MODELS]
     for name, path in zip(MODELS, paths, strict=True):

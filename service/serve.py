@@ -1,8 +1,8 @@
-"""The unattended service: what is wired to what, in which order it starts, and in which order it stops.
+"""The unattended service: its parts, the order in which they start, and the order in which they stop.
 
 This is the core process: devices, timetable, jobs, MQTT. It answers no HTTP; the page is a process of its own (`abbe.service.web.process`)
-that it starts, tells and hears over a channel of its own (`abbe.service.channel`). Start: store, MQTT, timetable, page. Stop, within five
-seconds: a running check is cancelled (the devices hold the motion), the page closes, the broker is told "offline", the store is closed.
+that the core starts and talks to over a channel (`abbe.service.channel`). Start: store, MQTT, timetable, page. Stop, within five seconds:
+a running check is cancelled (the devices hold the motion), the page closes, the state "offline" is published, the store closes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from abbe.service.campaigns.builtin_recipes import split_recipe_name
 from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board
-from abbe.service.core.cut_off import LastWords, cut_off_now, leave_now
+from abbe.service.core.cut_off import OpenPushReader, cut_off_now, leave_now
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns
 from abbe.service.core.push_recovery import PushRecovery
@@ -35,7 +35,7 @@ from abbe.service.core.setup import ServiceSetup
 from abbe.service.core.snapshot import SnapshotSource
 from abbe.service.core.systemd import notify
 from abbe.service.core.table_watch import TableWatch
-from abbe.service.core.watch import BoardWatch, StateTeller, VerifiedWatch
+from abbe.service.core.watch import BoardWatch, StatePublisher, VerifiedWatch
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import ConfigError
@@ -65,9 +65,9 @@ if TYPE_CHECKING:
 log = structlog.get_logger("abbe.serve")
 
 STOP_S = 4.5
-"""Promised are 5 s from the signal to the end of the process; what hangs after this is cut off. The store survives that."""
+"""The process promises to end within 5 s of the signal; after this it is cut off. The store survives that."""
 LEAVE_S = 0.3
-"""Longest wait for a thread that still computes once all is closed, s."""
+"""Longest wait for a thread that still computes after everything has closed"""
 HOLD_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0
@@ -76,7 +76,7 @@ EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - compared with, not
 
 
 class Service:
-    """All parts of the running service, wired. The store is open and the port is taken, or this object does not exist."""
+    """All parts of the running service, connected. The store is open and the port is bound before this object exists."""
 
     def __init__(self, setup: ServiceSetup, store: Store, listening: socket.socket, clock: Clock) -> None:
         self._setup = setup
@@ -90,7 +90,7 @@ class Service:
         )
         watchers: list[JobWatcher] = [BoardWatch(self.board, self._changed), self._presence]
         if self._publisher is not None:
-            watchers.append(StateTeller(self._publisher, clock))
+            watchers.append(StatePublisher(self._publisher, clock))
         topics = (setup.topics.verification, setup.topics.alarm) if self._publisher is not None else None
         self._shelf = StoreShelf(store, clock, (setup.machine, store.machines.add(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
@@ -152,7 +152,7 @@ class Service:
         setup = self._setup
         if setup.opcua is None:
             return None
-        from abbe.service.plant.opcua.server import OpcUaServer  # an extra, and slow to import
+        from abbe.service.plant.opcua.server import OpcUaServer  # optional dependency, slow to import
 
         broker = "" if setup.broker is None else str(setup.broker)
         reader = Reader(self._store, setup.machine, self._clock, setup.control)
@@ -171,7 +171,7 @@ class Service:
             self._publisher.wake()
 
     async def run(self, stop: asyncio.Event, *, once: bool) -> bool:
-        """Work until ``stop``, or, with ``once``, until every recipe was run once; return whether all of those passed."""
+        """Work until ``stop``, or, with ``once``, until every recipe has run once; return whether all of those passed."""
         passed = True
         if self._opcua is not None:
             await self._opcua.prepare()
@@ -185,7 +185,7 @@ class Service:
             stopped = parts.create_task(stop.wait(), name="stop")
             try:
                 await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
-            except asyncio.CancelledError:  # a part failed, and the group has cancelled us and all others
+            except asyncio.CancelledError:  # a part failed, and the group has cancelled this task and all others
                 self._ask_to_end()
                 raise
             notify("STOPPING=1")
@@ -196,16 +196,16 @@ class Service:
             await asyncio.wait({work, by_hand}, timeout=HOLD_S)
             self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
-            mqtt.cancel()  # a broker that accepts connections and then says nothing would hold us up
+            mqtt.cancel()  # a broker that accepts connections and never answers would delay the end
             for task in (beat, stopped, opcua, presence):
                 task.cancel()
         return passed
 
     def _ask_to_end(self) -> None:
-        """Page and broker end by themselves now.
+        """Ask page and publisher to end by themselves.
 
-        A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows one that comes together with what it waits for, such
-        as the broker's acknowledgement, and the service would stay half dead for ever.
+        A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows one that coincides with the awaited result, such as
+        the broker's acknowledgement, and the service would never end.
         """
         self._web.stop()
         if self._publisher is not None:
@@ -217,13 +217,13 @@ class Service:
             log.info("planned", schedule=schedule.name, next_utc=slot.isoformat())
         async with asyncio.TaskGroup() as tasks:
             if self._setup.recover is not None:
-                recover, told = self._setup.recover(self._store), self.board.attention
+                recover, attention = self._setup.recover(self._store), self.board.attention
                 is_open = partial(push_is_open, self._store, self._setup.machine, self._setup.control)
-                ends = PushRecovery(recover, is_open, self._scheduler, self._shelf, told, self._clock, self._attention_changed)
+                ends = PushRecovery(recover, is_open, self._scheduler, self._shelf, attention, self._clock, self._attention_changed)
                 tasks.create_task(ends.run(), name="recovery")
             if self._setup.table is not None:
-                look, told = self._setup.table(self._store), self.board.attention
-                tasks.create_task(TableWatch(look, self._shelf, told, self._clock, self._attention_changed).run(), name="table")
+                look, attention = self._setup.table(self._store), self.board.attention
+                tasks.create_task(TableWatch(look, self._shelf, attention, self._clock, self._attention_changed).run(), name="table")
             known = partial(verified_by, self._store, self._setup.machine, control=self._setup.control)
             tasks.create_task(VerifiedWatch(known, self._publisher, self._clock, self._changed).run(), name="verified")
             await self._scheduler.run()
@@ -231,14 +231,14 @@ class Service:
 
     def _attention_changed(self) -> None:
         self.board.changed()
-        self._presence.noted()
+        self._presence.attention_changed()
         self._changed()
 
     async def _once(self) -> bool:
         states = [await self._jobs(replace(s, name=f"{s.name} (once)"), self._clock.utc()) for s in self._setup.schedules]
         with suppress(TimeoutError):
             async with asyncio.timeout(FLUSH_S):
-                # Messages that are not delivered now are delivered by the next start.
+                # The next start delivers what is not delivered now.
                 while self.board.mqtt_connected and await asyncio.to_thread(self._store.outbox.count) > 0:
                     await self._clock.sleep(0.1)
         return all(state == "done: pass" for state in states)
@@ -248,27 +248,27 @@ class Service:
         watchdog_us = int(os.environ.get("WATCHDOG_USEC") or 0)
         while True:
             notify("WATCHDOG=1")
-            # From inside the loop: if the loop hangs, the beat stops, and systemd acts.
+            # From inside the loop: if the loop hangs, the heartbeat stops, and systemd restarts the service.
             await self._clock.sleep(watchdog_us / 2e6 if watchdog_us else 3600.0)
 
 
 def serve(setup: ServiceSetup, *, once: bool = False, clock: Clock | None = None) -> int:
-    """Run the service until SIGTERM or Ctrl-C; return the exit code: 0, or 1 if a check asked for by ``once`` did not pass.
+    """Run the service until SIGTERM or Ctrl-C; return the exit code: 0, or 1 if a check run by ``once`` did not pass.
 
     Raises
     ------
     AbbeError
-        It cannot start: the port is taken, the store cannot be opened, there is nothing to do.
+        The service cannot start: the port is in use, the store cannot be opened, or there is nothing to do.
     """
     if once and not setup.schedules:
         raise ConfigError("there is no [[schedule]] whose recipe could be run once", "add one to the machine file")
-    words: list[LastWords] = []
-    cut_off = threading.Timer(STOP_S, cut_off_now, [words])
+    open_push_readers: list[OpenPushReader] = []
+    cut_off = threading.Timer(STOP_S, cut_off_now, [open_push_readers])
     cut_off.daemon = True
-    # Selector, also on Windows: the MQTT client works with no other loop there.
+    # Selector loop, also on Windows: the MQTT client works with no other loop there.
     with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
-        passed = runner.run(_main(setup, once, clock or SystemClock(), cut_off, words))
-        # Devices and store are closed. A thread that still solves or searches has nothing that could be lost.
+        passed = runner.run(_main(setup, once, clock or SystemClock(), cut_off, open_push_readers))
+        # Devices and store are closed. A thread that still solves or searches can lose nothing.
         leave = threading.Timer(LEAVE_S, leave_now, [0 if passed else 1])
         leave.daemon = True
         leave.start()
@@ -277,7 +277,7 @@ def serve(setup: ServiceSetup, *, once: bool = False, clock: Clock | None = None
     return 0 if passed else 1
 
 
-async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threading.Timer, last_words: list[LastWords]) -> bool:
+async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threading.Timer, open_push_readers: list[OpenPushReader]) -> bool:
     stop = asyncio.Event()
 
     def on_signal(name: str) -> None:
@@ -300,15 +300,15 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
     listening = bind(setup.web.host, setup.web.port)
     try:
         store = await asyncio.to_thread(Store.open, setup.store_url)
-        if words := database_readable_by_others(setup.store_url):
-            log.warning("database", text=words)
+        if warning := database_readable_by_others(setup.store_url):
+            log.warning("database", text=warning)
         try:
             host, port = listening.getsockname()[:2]
             scheme = "https" if setup.web.certificate else "http"
             for line in setup.warnings:
                 log.warning("machine file", text=line)
             log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
-            last_words.append(lambda: JournalView.read(store, setup.machine, setup.control).open_push)
+            open_push_readers.append(lambda: JournalView.read(store, setup.machine, setup.control).open_push)
             return await Service(setup, store, listening, clock).run(stop, once=once)
         finally:
             await asyncio.to_thread(store.close)
@@ -318,7 +318,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
 
 
 def _admins(url: str) -> int:
-    """How many admins may log in; a database that is not there yet has none, and is not made for the question."""
+    """Return how many admins may log in. A database that does not exist has none, and this does not create it."""
     parsed = parse_url(url)
     if parsed.drivername == "sqlite" and not Path(parsed.database or "").is_file():
         return 0

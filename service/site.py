@@ -19,10 +19,10 @@ from abbe.service.sequences.nc.settings import NcSettings
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Everything a workflow needs to know about a machine. ``doc`` is the machine object of run-format.md 1.
+    """What a workflow needs to know about a machine. ``doc`` is the machine object of run-format.md 1.
 
-    ``calibrated_until``: last day of the certificates of ``ballbar`` and ``laser``; what is missing has none. ``two_people``: a proposed
-    table is only pushed when somebody else than its proposer has approved it.
+    ``calibrated_until``: last days of the certificates of ``ballbar`` and ``laser``; an instrument without certificate is absent.
+    ``two_people``: a proposed table is only pushed after approval by a person other than its proposer.
     """
 
     name: str
@@ -40,12 +40,12 @@ class Site:
 
     @property
     def control(self) -> str:
-        """Identity of the control (`control_of`); empty where there is none."""
+        """Identity of the control (`control_of`); empty without a control."""
         return control_of(self.urls.cnc)
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:
-    """Nominal geometry from a machine object (run-format.md 1); pivots and tool default to zero.
+    """Return the nominal geometry of a machine object (run-format.md 1); pivots and tool default to zero.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def machine_from_doc(doc: dict[str, Any]) -> Machine:
 
 
 def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[str, Any]:
-    """The machine object of run-format.md 1 for a nominal geometry."""
+    """Return the machine object of run-format.md 1 for a nominal geometry."""
     return {
         "name": name,
         "chain": machine.chain,
@@ -78,7 +78,7 @@ def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[s
 
 
 def site_of(config: MachineFile) -> Site:
-    """What the machine file says, in the units and types of the workflows."""
+    """Convert a machine file to the units and types of the workflows."""
     doc = config.machine_doc()
     devices, limits = config.devices, config.limits
     return Site(
@@ -98,7 +98,7 @@ def site_of(config: MachineFile) -> Site:
 
 
 def push_limits(limits: Limits) -> PushLimits:
-    """What the machine file limits tables to, in mm."""
+    """Return the machine file's limits for tables, in mm."""
     return PushLimits(
         value_mm=limits.table_value_um * 1e-3,
         change_mm=limits.table_change_um * 1e-3,

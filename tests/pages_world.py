@@ -131,14 +131,14 @@ def _checks(store: Store, machine: str, schedule: Schedule, count: int, evil: st
         occasion = record.Occasion(machine, schedule, at)
         if week == count - 3:
             trouble = LinkDown(f"modbus+tcp://127.0.0.1:5021{evil}", "connect", f"refused{evil}", f"is the laser on?{evil}")
-            store.verifications.add_with_messages(number, record.failed(occasion, trouble, at, 5.0), [])
+            store.verifications.add_with_messages(number, record.failed_doc(occasion, trouble, at, 5.0), [])
             continue
         drift = 11.0 + 0.02 * week**2
         verdict = "fail" if drift - 1.1 > 20 else "pass" if drift + 1.1 <= 20 else "cannot tell"
         values = {"diagonal_ppp_um": drift - 3, "body_diagonal_um": drift, "helix_rms_um": 1.2 + 0.1 * week}
         told = Result(verdict, values, text=f"{verdict}: worst body diagonal {drift:.1f} µm{evil}", started_utc=at, duration_s=312.0,
                       campaign=f"quick-check {week}{evil}")  # fmt: skip
-        store.verifications.add_with_messages(number, record.found(occasion, told), [])
+        store.verifications.add_with_messages(number, record.check_doc(occasion, told), [])
 
 
 def _slots(store: Store, machine: str, schedules: list[Schedule], evil: str) -> None:

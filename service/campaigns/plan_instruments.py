@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from abbe.models.planning.instruments import BAR_LENGTHS_MM, Instruments, SetupMinutes
 from abbe.service.config import read_toml
 from abbe.service.errors import ConfigError
-from abbe.service.explain import expected, nearest, where
+from abbe.service.explain import expected, location_text, nearest
 from abbe.service.site import Site
 
 USUAL = SetupMinutes()
@@ -68,8 +68,8 @@ def read_instruments(path: Path | None) -> Instruments:
         place = first["loc"]
         if first["type"] == "extra_forbidden":
             table = SetupTable if place[0] == "setup" and len(place) > 1 else InstrumentsFile
-            raise ConfigError(f"{path}: unknown key {where(place)!r}", nearest(str(place[-1]), table.model_fields)) from None
-        raise ConfigError(f"{path}: {where(place)}: {expected(first)}", "correct it; docs/how-to/plan.md shows a file") from None
+            raise ConfigError(f"{path}: unknown key {location_text(place)!r}", nearest(str(place[-1]), table.model_fields)) from None
+        raise ConfigError(f"{path}: {location_text(place)}: {expected(first)}", "correct it; docs/how-to/plan.md shows a file") from None
     except ValueError as error:
         raise ConfigError(f"{path}: {error}", "give bar_lengths_mm or laser = true") from None
 

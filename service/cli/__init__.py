@@ -11,19 +11,16 @@ from collections.abc import Sequence
 
 BAD_INPUT = 2
 UNWRITTEN = frozenset((errno.EPIPE, errno.EBADF, errno.ENOSPC, errno.EFBIG, errno.EDQUOT))
-"""What writing to stdout can end in: reader gone, closed, disk full, and so on."""
+"""Errors of writing to stdout: reader gone, closed, disk full, and so on."""
 INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and exit with its code: 0 done, 1 the job's answer is no, 2 bad input or a fault, 130 Ctrl-C.
+    """Run one command and exit with its code: 0 done, 1 negative answer, 2 bad input or a fault, 130 Ctrl-C.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Instead of the command line's, for tests.
+    ``arguments``: replaces the command line's, for tests.
     """
-    # Matrices of some hundred unknowns: threads of the linear algebra cost more than they give, minutes where other programs compute too.
+    # For matrices of some hundred unknowns BLAS threads cost more than they save: minutes where other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = run(arguments)
@@ -33,17 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; every error of job, device or command line becomes one line on stderr.
+    """Run one command and return its exit code; every error of service, device or command line becomes one line on stderr.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Instead of the command line's.
-
-    Returns
-    -------
-    int
-        Exit code.
+    ``arguments``: replaces the command line's.
     """
     import typer
 
@@ -55,13 +44,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
     if sys.stdout is None:
         sys.stdout = _Closed()
     degrade()
-    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:  # as every program has it
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:  # the usual option
         arguments = ["version"]
     try:
         code = int(app(args=arguments, prog_name="abbe", standalone_mode=False) or 0)
         sys.stdout.flush()
         return code
-    except (AbbeError, DriverError) as err:  # before OSError: a device that does not answer is a TimeoutError, and with it one
+    except (AbbeError, DriverError) as err:  # before OSError: a device that does not answer raises a TimeoutError, which is one
         return complain(err.code, "; ".join([str(err), *getattr(err, "__notes__", [])]))
     except OSError as err:
         return _unwritten(err)
@@ -76,7 +65,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Closed(io.TextIOBase):
-    """Stands in for a stdout that was closed before the program began (``>&-``): who writes to it learns that."""
+    """Replaces a stdout that was closed before the program began (``>&-``): writing to it raises."""
 
     def write(self, text: str, /) -> int:
         """Refuse."""
@@ -84,35 +73,22 @@ class _Closed(io.TextIOBase):
 
 
 def _unwritten(err: OSError) -> int:
-    """Exit code for output that cannot be written; every other error of the system is raised again."""
+    """Return the exit code for output that cannot be written; re-raise any other OS error."""
     if err.filename is not None or err.errno not in UNWRITTEN:
         raise err
-    with contextlib.suppress(OSError, ValueError):  # the rest of the buffer must not fail once more when the program ends
+    with contextlib.suppress(OSError, ValueError):  # the rest of the buffer must not fail again at exit
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
     if err.errno == errno.EPIPE:
-        return 1  # the reader has seen enough, as typer has it
+        return 1  # the reader has closed the pipe; typer does the same
     return complain("USE-002", f"the output cannot be written: {err.strerror} - give stdout a place to go")
 
 
 def complain(code: str, text: str) -> int:
-    """Write one line of error.
-
-    Parameters
-    ----------
-    code : str
-        Stable code.
-    text : str
-        What is wrong, where, what to do.
-
-    Returns
-    -------
-    int
-        Exit code for bad input.
-    """
+    """Write one line of error to stderr: stable code, then what is wrong, where, what to do. Return the exit code for bad input."""
     from abbe.service.secrets import mask_secrets, visible
 
-    if sys.stderr is not None:  # closed: only the exit code is left
+    if sys.stderr is not None:  # closed: only the exit code remains
         sys.stderr.write(f"error {code}: {visible(mask_secrets(' '.join(text.split())))}\n")
     return BAD_INPUT

@@ -1,4 +1,4 @@
-"""``abbe`` as a module, for children of ours."""
+"""``abbe`` as a module, for child processes."""
 
 from abbe.service.cli import main
 

@@ -1,4 +1,4 @@
-"""The list of commands. A new one is one line here and a function in a module that imports nothing heavy at its top."""
+"""The list of commands. A new command is one line here and a function in a module that imports nothing heavy at its top."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asking the person at the console, without stopping the event loop."""
+"""Ask the person at the console without blocking the event loop."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
 
 
 async def console_ask(text: str) -> None:
-    """Print what to do and wait for Enter. What was typed before the question is thrown away: people confirm only what they have read.
+    """Print what to do and wait for Enter. Input typed before the question is discarded: people confirm only what they have read.
 
     Raises
     ------
     ConfigError
-        Nobody is at the console (standard input is closed or not a terminal).
+        No one is at the console (standard input is closed or not a terminal).
     """
-    import termios  # here, because a computer without terminals still plans and reads
+    import termios  # here: a platform without termios still plans and reads
 
     if not sys.stdin.isatty():
-        raise ConfigError(f"nobody is at the console to: {text}", "run this from a terminal, or configure a remote fixture")
-    # The descriptor itself: Python's buffer would keep a second line of one paste for the next question, out of reach of tcflush.
+        raise ConfigError(f"no one is at the console to: {text}", "run this from a terminal, or configure a remote fixture")
+    # The descriptor itself: Python's buffer would keep a pasted second line for the next question, out of reach of tcflush.
     line = sys.stdin.fileno()
     termios.tcflush(line, termios.TCIFLUSH)
     sys.stderr.write(f"\n>> {text}\n   press Enter when done: ")
@@ -35,14 +35,14 @@ async def console_ask(text: str) -> None:
 
 
 def person_at_console() -> Ask:
-    """Who is asked at this console: the person at the terminal, or, known before anything moves, nobody."""
+    """Return how to ask at this console: the person at the terminal, or `no_console`, which refuses before anything moves."""
     from abbe.service.devices.session import no_console
 
     return console_ask if sys.stdin is not None and sys.stdin.isatty() else no_console
 
 
 async def _entered(line: int) -> bytes:
-    """What is typed up to Enter; nothing when the terminal has gone."""
+    """Return what is typed up to Enter; empty when the terminal is gone."""
     loop = asyncio.get_running_loop()
     entered: asyncio.Future[bytes] = loop.create_future()
 
@@ -52,7 +52,7 @@ async def _entered(line: int) -> bytes:
         try:
             entered.set_result(os.read(line, 4096))
         except OSError:
-            entered.set_result(b"")  # the terminal has gone
+            entered.set_result(b"")  # the terminal is gone
 
     loop.add_reader(line, ready)
     try:
@@ -62,7 +62,7 @@ async def _entered(line: int) -> bytes:
 
 
 async def console_confirm(text: str) -> bool:
-    """Ask a question that only a yes answers; where nobody is at the console the answer is no."""
+    """Ask a yes/no question; the answer is no if no one is at the console."""
     import termios
 
     if not sys.stdin.isatty():

@@ -1,4 +1,4 @@
-"""What commands share: the database option, and output for people and for programs."""
+"""Shared by commands: the database option, and output for people and for programs."""
 
 from __future__ import annotations
 
@@ -32,24 +32,12 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout."
 
 
 def database_url(db: str | None, machine: Path | None = None) -> str:
-    """Decide which database a command works on.
-
-    Parameters
-    ----------
-    db : str, optional
-        From ``--db``.
-    machine : Path, optional
-        From ``--machine``.
-
-    Returns
-    -------
-    str
-        ``--db`` or the machine file's, else the environment's, else the default.
+    """Return the database of a command: ``--db`` or the machine file's, else the environment's, else the default.
 
     Raises
     ------
     ConfigError
-        If both options are given.
+        Both options are given.
     """
     from abbe.service.errors import ConfigError
 
@@ -63,24 +51,14 @@ def database_url(db: str | None, machine: Path | None = None) -> str:
 
 
 def open_store(url: str, *, must_exist: bool = True) -> Store:
-    """Open the database of a command.
+    """Open the database of a command; the caller closes it.
 
-    Parameters
-    ----------
-    url : str
-        Database URL.
-    must_exist : bool
-        Whether a missing SQLite file is an error: a command that only reads must not leave an empty database behind.
-
-    Returns
-    -------
-    Store
-        Close it.
+    ``must_exist``: a missing SQLite file is an error, since a command that only reads must not leave an empty database behind.
 
     Raises
     ------
     StoreError
-        If it cannot be opened.
+        The database cannot be opened.
     """
     from abbe.service.errors import StoreError
     from abbe.service.storage.engine import parse_url
@@ -100,7 +78,7 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
 
 @contextmanager
 def reader_of(machine: Path) -> Iterator[Reader]:
-    """The read model of a machine file: its database and its control. A missing database is an error, and none is made."""
+    """Yield the read model of a machine file: its database and its control. A missing database is an error and is not created."""
     from abbe.service.config import load_machine
     from abbe.service.devices.urls import control_of
 
@@ -110,7 +88,7 @@ def reader_of(machine: Path) -> Iterator[Reader]:
 
 
 def reader(store: Store, machine: str = "", control: str = "") -> Reader:
-    """The read model of an open database, now."""
+    """Return the read model of an open database, with the current time."""
     from abbe.service.clock import SystemClock
     from abbe.service.queries.reader import Reader
 
@@ -118,15 +96,15 @@ def reader(store: Store, machine: str = "", control: str = "") -> Reader:
 
 
 def warn_of_readers(url: str) -> None:
-    """Say on stderr if others than its owner may read the file of a database: hashes of passwords are in it."""
+    """Warn on stderr if others than its owner may read a database file: it contains password hashes."""
     from abbe.service.storage.private import database_readable_by_others
 
-    if (words := database_readable_by_others(url)) and sys.stderr is not None:
-        sys.stderr.write(f"warning: {words}\n")
+    if (warning := database_readable_by_others(url)) and sys.stderr is not None:
+        sys.stderr.write(f"warning: {warning}\n")
 
 
 def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
-    """What is called so; a run before a campaign.
+    """Return the run of this name, else the campaign.
 
     Raises
     ------
@@ -145,30 +123,14 @@ def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
 
 
 def print_json(value: Any) -> None:
-    """Write a value as JSON to stdout.
-
-    Parameters
-    ----------
-    value : object
-        JSON value.
-    """
+    """Write a value as JSON to stdout."""
     from abbe.service.secrets import visible_json
 
     sys.stdout.write(visible_json(json.dumps(value, indent=2, ensure_ascii=False)) + "\n")
 
 
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> None:
-    """Write a table to stdout; when piped, as wide as it needs and without lines.
-
-    Parameters
-    ----------
-    headings : sequence of str
-        Of the columns.
-    rows : iterable of sequence of str
-        Cells.
-    title : str, optional
-        Above it.
-    """
+    """Write a table to stdout; when piped, at full width and without lines."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -179,6 +141,6 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: s
     console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=400)
     table = Table(*headings, title=title, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for row in rows:
-        # Text: brackets of file names are not markup. Visible: names and targets come from anywhere.
+        # Text: brackets in file names are not markup. Visible: names and targets come from outside.
         table.add_row(*(Text("\n".join(map(visible, cell.split("\n"))), overflow="fold") for cell in row))
     console.print(table)

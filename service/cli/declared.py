@@ -1,4 +1,4 @@
-"""What each command is to the audit. A command that is not here is recorded, and a test fails until it is."""
+"""Which commands the audit records. A command missing here is recorded, and a test fails until it is listed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def _always(_: Given) -> bool:
 
 
 def _moves(given: Given) -> bool:
-    """`abbe measure` as a rehearsal or as a writer of NC programs changes nothing."""
+    """A dry run of `abbe measure`, or one that writes an NC program, changes nothing."""
     return not (given.get("dry_run") or given.get("nc") or given.get("path") or given.get("picture"))
 
 
@@ -48,10 +48,10 @@ READS = frozenset(
         "audit verify",
     }
 )
-"""They show, or write a file that they were asked for."""
+"""Commands that show something or write a requested file."""
 
 RECORDS_ITSELF = frozenset({"serve", "backup", "restore"})
-"""The service runs for months: its record is written when it begins. A restored database has the record of its restoring."""
+"""Commands that write their own record: ``serve`` when it begins, since it runs for months; ``restore`` into the restored database."""
 
 CHANGES: dict[str, Callable[[Given], bool]] = {
     "demo": lambda given: bool(given.get("keep")),
@@ -82,11 +82,11 @@ CHANGES: dict[str, Callable[[Given], bool]] = {
     "user token new": _always,
     "user token revoke": _always,
 }
-"""They change a database, a machine, or who is trusted, if the function says so of their arguments."""
+"""Commands that change a database, a machine, or who is trusted, if the function returns True for their arguments."""
 
 
 def is_recorded(command: str, given: Given) -> bool:
-    """Whether a call of a command leaves a record."""
+    """Return whether a call of a command is recorded."""
     if command in READS or command in RECORDS_ITSELF:
         return False
     return CHANGES.get(command, _always)(given)

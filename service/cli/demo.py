@@ -1,4 +1,4 @@
-"""`abbe demo`: the whole job on a simulated machine, with a live display, a table, and a report."""
+"""`abbe demo`: the whole process on a simulated machine, with a live display, a table, and a report."""
 
 from __future__ import annotations
 
@@ -28,16 +28,18 @@ def demo(
     keep: Annotated[Path | None, typer.Option(help="Folder for database, machine file, tables and report.")] = None,
     hidden: Annotated[
         int | None,
-        typer.Option("--hidden", metavar="SEED", min=0, help="Find what this machine hides, if anything.", show_default=False),
+        typer.Option(
+            "--hidden", metavar="SEED", min=0, help="Find the hidden effect of this machine, if there is one.", show_default=False
+        ),
     ] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Let the service watch the machine, with its page, until Ctrl-C.")] = False,
     port: Annotated[int, typer.Option(help="Port of the page, with --serve; another one if it is taken.", min=0, max=65535)] = 8080,
 ) -> None:
     """Measure a simulated machine tool over real wires, correct it, and prove that it became better.
 
-    With --serve: the service checks the machine by a timetable; it drifts, an alarm says so, and a proposal waits in the page for a person;
-    once it is approved the service pushes and verifies it. With --hidden: find the physical effect that the simulation of the machine
-    lacks, prove it on a new measurement, and open the truth.
+    With --serve: the service checks the machine by a timetable; the machine drifts, an alarm reports it, and a proposal waits in the page
+    for a person; after approval the service pushes and verifies it. With --hidden: find the physical effect that the simulation of the
+    machine lacks, prove it on a new measurement, and reveal the truth.
     """
     if hidden is not None:
         hidden_demo(hidden, speed, as_json, keep)
@@ -69,7 +71,7 @@ def demo(
 
 
 def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> None:
-    """Play a discovery; only the simulator knows what the seed stands for."""
+    """Run a discovery; only the simulator knows the effect behind the seed."""
     from rich.console import Console
 
     from abbe.service.cli.progress import display
@@ -96,12 +98,12 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
 
 
 def _folder(keep: Path | None) -> Path:
-    """Make the folder of the report.
+    """Create the folder of the report.
 
     Raises
     ------
     ConfigError
-        It cannot be one.
+        It cannot be created.
     """
     from abbe.service.errors import ConfigError
 
@@ -116,7 +118,7 @@ def _folder(keep: Path | None) -> Path:
 
 @contextmanager
 def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
-    """Where database and links live: the kept folder, which must not hold another demonstration, or a temporary one."""
+    """Yield the folder of database and links: the kept one, which must not hold another demonstration, or a temporary one."""
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="abbe-") as name:
             yield Path(name)
@@ -129,7 +131,7 @@ def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
 
 
 def print_result(out: Console, result: DemoResult) -> None:
-    """Before and after as a table, then the verdict."""
+    """Print before and after as a table, then the verdict."""
     from rich.table import Table
 
     from abbe.service.demo.demo_report import demo_json, summary_rows

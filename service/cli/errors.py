@@ -1,4 +1,4 @@
-"""`abbe errors`: where the tool really stands, from error functions that are known."""
+"""`abbe errors`: actual positions of the tool, from known error functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`abbe listen`: the operator starts the NC program, Abbe listens."""
+"""`abbe listen`: the operator starts the NC program, Abbe records the laser."""
 
 from __future__ import annotations
 
@@ -43,4 +43,4 @@ def listen(
 
     with Store.open(loaded.database_url) as store:
         run_job(work(store))
-    typer.echo(f"heard: campaign {plan.name!r}, {len(plan.tests)} runs")
+    typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")

@@ -1,4 +1,4 @@
-"""`abbe measure` and `abbe correct`: the job by hand, on the devices of a machine file."""
+"""`abbe measure` and `abbe correct`: measure and correct by hand, on the devices of a machine file."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def measure(  # noqa: PLR0913 - one argument for each option
     helix: Annotated[str, typer.Option(help="Instead of a recipe: one ball-bar helix, X,Y,Z,RADIUS in mm.")] = "",
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
     rate_hz: Annotated[int, typer.Option(help="Ball-bar samples per second; must divide 1000.")] = 100,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would move and how long it takes; move nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would move and how long it takes; move nothing.")] = False,
     path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
     picture: Annotated[Path | None, typer.Option(metavar="FILE.html", help="With --dry-run: a page with the paths in three views.")] = None,
     nc: Annotated[str, typer.Option(help="Write an NC program: siemens, fanuc, heidenhain, linuxcnc or iso; with --out.")] = "",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where --nc writes.")] = None,
-    resume: Annotated[str, typer.Option(help="Go on with this campaign, which was broken off; its recipe is known.")] = "",
-    untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: nobody has touched what is mounted.")] = False,
+    resume: Annotated[str, typer.Option(help="Resume this interrupted campaign; its recipe is known.")] = "",
+    untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: the mounted instruments were not touched.")] = False,
     accept_table: AcceptTable = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
@@ -74,25 +74,25 @@ def measure(  # noqa: PLR0913 - one argument for each option
     if instead:
         rehearsal.run(site, plan, runs)
     if not nc:
-        _said_before(loaded, site, plan, dry=bool(instead))
+        _warn_before(loaded, site, plan, dry=bool(instead))
     if instead:
         warn_of_open_push(loaded.database_url, site)
         return
-    control, by_hand = Control(), ByHand(resume=bool(resume), untouched=untouched, accept_table=accept_table)
+    control, options = Control(), ConsoleOptions(resume=bool(resume), untouched=untouched, accept_table=accept_table)
     begun_s = SystemClock().monotonic_s()
     with Store.open(loaded.database_url) as store:
-        run_job(_measured(store, site, plan, control, source, by_hand), control)
+        run_job(_measured(store, site, plan, control, source, options), control)
         typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
         if source.recipe in CHECKS and not source.helix:
             typer.echo(_check(store, loaded.machine, plan.name, source.recipe, begun_s))
 
 
 CHECKS = ("quick-check", "verification")
-"""Shipped recipes that end with a verdict, as those of a schedule do."""
+"""Built-in recipes that end with a verdict, as scheduled checks do."""
 
 
 def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_s: float) -> str:
-    """Judge what was measured and store it as a check of the machine, which began with its campaign: a word for the table came before."""
+    """Judge the measured runs and store them as a check that began with its campaign; return a line for the console."""
     from datetime import datetime
 
     from abbe.service.clock import SystemClock
@@ -100,7 +100,7 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
     from abbe.service.errors import MeasurementFault
     from abbe.service.jobs.check import judged
     from abbe.service.runs.columns import load_run
-    from abbe.service.scheduler.record import Occasion, found
+    from abbe.service.scheduler.record import Occasion, check_doc
 
     record = store.campaigns.find(campaign)
     started = datetime.fromisoformat(record.created_utc)
@@ -109,15 +109,15 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
         result = judged(config, runs, campaign, started, SystemClock().monotonic_s() - begun_s)
     except MeasurementFault as fault:
         return f"not judged: {fault.detail}"
-    doc = found(Occasion(config.name, Schedule("by hand", "", "UTC", recipe), started), result)
+    doc = check_doc(Occasion(config.name, Schedule("by hand", "", "UTC", recipe), started), result)
     number = store.verifications.add(record.machine_id, record.id, str(doc["verdict"]), doc)
     return f"check {number}: {result.verdict}: {result.text}"
 
 
-def _said_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
-    """What the machine file lacks for this plan is refused; an expired certificate and a timetable that cannot be kept are told.
+def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
+    """Refuse a plan that the machine file lacks devices for; warn of an expired certificate and of a timetable that cannot be kept.
 
-    With a controller `measure` refuses it, after what an interrupted push left there is taken back.
+    With a controller, `measure` refuses the plan itself, after it has rolled back an interrupted push.
     """
     from abbe.service.campaigns.plausibility import certificates, unattended
     from abbe.service.clock import SystemClock
@@ -132,16 +132,16 @@ def _said_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: 
 
 
 @dataclass(frozen=True, slots=True)
-class ByHand:
-    """What the person at the console has said: go on with a campaign, nothing was touched, the strange table in force is right."""
+class ConsoleOptions:
+    """Statements of the person at the console: resume a campaign, nothing was touched, the unknown table in force is right."""
 
     resume: bool
     untouched: bool
     accept_table: bool
 
 
-async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: RecipeSource, said: ByHand) -> None:
-    """The measurement itself, from the beginning or from where it was broken off."""
+async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Control, source: RecipeSource, options: ConsoleOptions) -> None:
+    """Measure a campaign, from the beginning or from where it was interrupted."""
     from abbe.service.campaigns.measure import MeasureOptions
     from abbe.service.campaigns.measure import measure as work
     from abbe.service.campaigns.resume import resume as find
@@ -152,11 +152,11 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
         return True
 
     async def ask(text: str) -> bool:
-        return await control.unless_stopped(console_confirm(text))  # the first Ctrl-C ends the question, too
+        return await control.unless_stopped(console_confirm(text))  # the first Ctrl-C also ends the question
 
-    confirm = yes if said.untouched else ask
-    async with ready_session(store, site, accept_table=said.accept_table) as session:
-        found = await find(session, store, site, plan, plan.name, confirm) if said.resume else None
+    confirm = yes if options.untouched else ask
+    async with ready_session(store, site, accept_table=options.accept_table) as session:
+        found = await find(session, store, site, plan, plan.name, confirm) if options.resume else None
         for line in found.messages if found is not None else ():
             typer.echo(line, err=True)
         with display() as sink:
@@ -164,7 +164,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
 
 
 def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:
-    """What a plan is made from; a recipe file's text with it, so that a resumed campaign does not need the file."""
+    """Return the source of a plan; it includes a recipe file's text, so that a resumed campaign does not need the file."""
     from abbe.service.campaigns.builtin_recipes import RecipeSource
     from abbe.service.sequences.recipes.recipe_file import recipe_source
 
@@ -177,13 +177,13 @@ def correct(
     campaign: Annotated[str, typer.Argument(help="Identification campaign in the store.")],
     before: Annotated[str, typer.Option(help="Verification campaign measured with the present table; default: it is measured now.")] = "",
     wait_s: Annotated[
-        float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
+        float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
     accept_table: AcceptTable = False,
 ) -> None:
-    """Solve a campaign, push nine tables, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
+    """Solve a campaign, push nine tables, measure again; roll back to the old table if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import run_job
-    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.cli.waiting import rollback_when_safe
     from abbe.service.compensation.correct import Correction
     from abbe.service.compensation.correct import correct as work_correct
     from abbe.service.compensation.gate import PushContext, check_preconditions
@@ -197,7 +197,7 @@ def correct(
     site = site_of(loaded.machine)
     check_certificates(site)
 
-    said: list[str] = []
+    hints: list[str] = []
 
     async def work(store: Store) -> Correction:
         from abbe.service.cli.progress import display
@@ -207,9 +207,9 @@ def correct(
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink)
                 control = await check_preconditions(context)
-                said.append(control.hint)
+                hints.append(control.hint)
                 runs = await verification_before(session, store, site, before, sink)
-                async with taken_back_when_safe(session, store, site, wait_s):
+                async with rollback_when_safe(session, store, site, wait_s):
                     return await work_correct(context, campaign, runs, control)
 
     with Store.open(loaded.database_url) as store:
@@ -221,13 +221,13 @@ def correct(
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
     for line in found.not_for_tables:
         typer.echo(f"not in the tables: {line}")
-    for line in filter(None, said):
+    for line in filter(None, hints):
         typer.echo(line)
     raise typer.Exit(0 if found.decision.keep else 1)
 
 
 async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[dict[str, Any]]:
-    """Runs of a verification with the present table: of a campaign in the store, or measured now where none is named."""
+    """Return the runs of a verification with the present table: of a campaign in the store, or measured now if none is named."""
     from abbe.service.campaigns.measure import measure as work_measure
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposals import load_runs
@@ -244,7 +244,7 @@ async def verification_before(session: Session, store: Store, site: Site, campai
 
 @asynccontextmanager
 async def ready_session(store: Store, site: Site, *, accept_table: bool = False) -> AsyncIterator[Session]:
-    """The machine's devices, after what an interrupted push may have left active was taken back: nothing is measured with it.
+    """Open the machine's devices, after an interrupted push was rolled back: nothing is measured with its table.
 
     ``accept_table``: the person at the console vouches for a table in force that this database did not push.
     """
@@ -253,18 +253,18 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
     from abbe.service.compensation.recovered_session import recovered_session
     from abbe.service.devices.machine_lock import lock_machine
 
-    def told(text: str) -> None:
+    def report(text: str) -> None:
         typer.echo(text, err=True)
 
     with lock_machine(site.urls.cnc):
         accept_by = by_whom() if accept_table else ""
-        async with recovered_session(store, site, ask=person_at_console(), accept_by=accept_by, report=told) as session:
+        async with recovered_session(store, site, ask=person_at_console(), accept_by=accept_by, report=report) as session:
             yield session
 
 
 def warn_of_open_push(url: str, site: Site) -> None:
-    """Without a connection: say on standard error what the journals know of a push that has not come to its end, into this control, or into
-    another one that may be this one under another address (`open_pushes`).
+    """Warn on stderr, without a connection, of unfinished pushes in the journals: into this control, or into another that may be this one
+    under another address (`open_pushes`).
     """
     from abbe.service.cli.common import open_store
     from abbe.service.errors import StoreError
@@ -275,6 +275,6 @@ def warn_of_open_push(url: str, site: Site) -> None:
     except StoreError:  # no database yet: there is no journal
         return
     with store:
-        said = open_pushes(store, site.name, site.control)
-    for line in said:
+        warnings = open_pushes(store, site.name, site.control)
+    for line in warnings:
         typer.echo(f"warning: {line}", err=True)

@@ -1,4 +1,4 @@
-"""`abbe papers`: every printed number of the four papers beside ours."""
+"""`abbe papers`: every printed number of the four papers beside the computed one."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from abbe.service.papers.run import PaperResult
 
 WIDTH = 120
-"""Columns of piped output; a terminal has its own."""
+"""Width of piped output, columns; a terminal has its own."""
 
 HEADINGS = ("where", "quantity", "printed", "computed", "off by", "within", "status", "note")
 CHECK_HEADINGS = ("check", "given", "came back", "off by", "bound", "status", "note")
 FOLDED = frozenset({"quantity", "check"})
-"""Columns that may take more lines; the others hold one word or number."""
+"""Columns that may wrap; the others hold one word or number."""
 
 DROPPED = (("within", 112), ("off by", 100), ("note", 76), ("where", 72), ("given", 72))
-"""Columns that go first, and the width below which they do: a status must stay in one piece."""
+"""Columns to drop first, each with the width below which it is dropped: a status must stay in one piece."""
 
 NAME = 12
-"""Least width of a column of names."""
+"""Minimum width of a column of names."""
 
 LEGEND = (
     "reproduced: computed from independent inputs and equal to the last printed digit; consistent: apart by no more than what rounded"
@@ -58,7 +58,7 @@ def papers(
         Path | None, typer.Option("--html", metavar="FILE", help="Also write a report with the papers' pictures.", show_default=False)
     ] = None,
 ) -> None:
-    """Compute what the four papers print, side by side with the printed numbers, and say for each other one why it cannot be."""
+    """Compute the numbers that the four papers print, beside the printed ones, and state why some cannot be computed."""
     from abbe.service.papers.run import TITLES, document, results
 
     found = results(TITLES if paper is None else (paper.value,))
@@ -77,14 +77,7 @@ def papers(
 
 
 def show(found: Sequence[PaperResult], console: Console) -> None:
-    """Write the tables, their notes and their counts.
-
-    Parameters
-    ----------
-    found : sequence of PaperResult
-    console : Console
-        Its width decides what is folded and which columns are left out.
-    """
+    """Write the tables, their notes and their counts; the console's width decides which columns wrap or are dropped."""
     for result in found:
         notes: dict[str, int] = {}
         _numbers(console, result.title, [r for r in result.rows if r.source == "paper"], notes)
@@ -127,8 +120,8 @@ def _table(console: Console, title: str, headings: Sequence[str], rows: Iterable
     from rich.table import Table
     from rich.text import Text
 
-    gone = {name for name, width in DROPPED if console.width < width}
-    kept = [i for i, name in enumerate(headings) if name not in gone]
+    dropped = {name for name, width in DROPPED if console.width < width}
+    kept = [i for i, name in enumerate(headings) if name not in dropped]
     table = Table(title=title, box=SIMPLE_HEAD, title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
     for i in kept:
         folds = headings[i] in FOLDED

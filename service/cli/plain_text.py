@@ -1,4 +1,4 @@
-"""What a terminal or a pipe cannot show is written in letters that it can: an answer must not fail for its µ."""
+"""Replace characters that a terminal or pipe cannot encode: an answer must not fail because of its µ."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PLAIN = {
 
 
 def degrade() -> None:
-    """From now on stdout and stderr write whatever their encoding has, and the rest in plain letters; ``?`` where there are none."""
+    """Make stdout and stderr replace characters missing in their encoding: by plain letters, or ``?`` where there are none."""
     codecs.register_error(NAME, _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -53,7 +53,7 @@ def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
         raise error
     out = []
     for one in error.object[error.start : error.end]:
-        if 0xDC80 <= ord(one) <= 0xDCFF:  # a byte of a file's name that was no text: so it was escaped, so it is shown
+        if 0xDC80 <= ord(one) <= 0xDCFF:  # a byte of a file name that is no text: show its escape
             out.append(f"\\x{ord(one) - 0xDC00:02x}")
             continue
         text = PLAIN.get(one, "?")

@@ -1,4 +1,4 @@
-"""`abbe plan`: which measurements are worth the minutes there are, as a recipe that `abbe measure` runs."""
+"""`abbe plan`: the measurements worth the available minutes, as a recipe that `abbe measure` runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "me
 
 def plan(
     machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
-    minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help="Minutes there are, set-ups included.")] = 60.0,
+    minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help="Available minutes, set-ups included.")] = 60.0,
     goal_um: Annotated[
         float | None, typer.Option(min=0.001, help="Wanted worst U = 2u of the deviation, µm; the plan ends when it is reached.")
     ] = None,
@@ -43,7 +43,7 @@ def plan(
     tools = read_instruments(instruments)
     _check_targets((out, picture), (machine, instruments))
     if picture is not None:
-        form_of(picture)  # before the work
+        form_of(picture)  # refuse a wrong suffix before the work
     with display() as sink:
         planned = plan_for(site, minutes=minutes, goal_um=goal_um, tools=tools, progress=sink)
     if out is not None:
@@ -57,7 +57,7 @@ def plan(
 
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
-    """Before half a minute of planning: no folder, nothing that is read here, no file twice."""
+    """Refuse a target that is a folder, an input of this command, or used twice: before half a minute of planning."""
     from abbe.service.errors import ConfigError
 
     taken = [p.resolve() for p in sources if p is not None]

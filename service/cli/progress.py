@@ -1,4 +1,4 @@
-"""Progress with ETA on a terminal, one line per stage elsewhere."""
+"""Progress display: with ETA on a terminal, one line per stage elsewhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def display() -> Iterator[ProgressSink]:
-    """A progress bar with ETA on a terminal; one line per stage elsewhere."""
+    """Yield a sink for progress: a bar with ETA on a terminal, one line per stage elsewhere."""
     from rich.console import Console
 
     log = Console(stderr=True)
@@ -53,5 +53,5 @@ def display() -> Iterator[ProgressSink]:
 
 
 def _waits(p: Progress) -> str:
-    """What a measurement waits for; empty while it goes on."""
+    """Return what a measurement waits for; empty while it runs."""
     return f"{p.state}: {p.why}" if p.state in ("paused", "suspended") else ""

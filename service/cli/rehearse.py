@@ -1,4 +1,4 @@
-"""What `abbe measure` does without a machine: say it, draw it, or write it as an NC program."""
+"""`abbe measure` without a machine: print the dry run, draw it, or write an NC program."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 HAIR = 1e-6
-"""mm; a position that is whole but for the arithmetic is whole."""
+"""Tolerance, mm: a position this close to a whole number counts as whole."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What is wanted: a dry run (with every position, with a picture), or an NC program in a dialect."""
+    """The request: a dry run (with every position, with a picture), or an NC program in a dialect."""
 
     dry_run: bool
     path: bool
@@ -31,12 +31,12 @@ class Rehearsal:
     out: Path | None
 
     def check(self, sources: tuple[Path, ...]) -> bool:
-        """Whether anything is wanted instead of a measurement.
+        """Return whether anything is requested instead of a measurement.
 
         Raises
         ------
         ConfigError
-            Options that do not go together, or a file that would overwrite what it is made of.
+            Options that do not go together, or an output file that would overwrite an input.
         """
         from abbe.service.errors import ConfigError
         from abbe.service.rendering.document_page import form_of
@@ -57,7 +57,7 @@ class Rehearsal:
         return self.dry_run or bool(self.nc)
 
     def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> None:
-        """Print, draw or write it."""
+        """Print or draw the dry run, or write the NC program."""
         from abbe.service.rendering.document_page import write_document
         from abbe.service.rendering.page_file import write_page
         from abbe.service.report.dry_run_page import dry_run_report
@@ -77,7 +77,7 @@ class Rehearsal:
 
 
 def print_path(plan: CampaignPlan) -> None:
-    """Every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
+    """Print every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
     from abbe.service.sequences.check import positions
 
     typer.echo("test,x_mm,y_mm,z_mm")
@@ -88,12 +88,12 @@ def print_path(plan: CampaignPlan) -> None:
 
 HEADINGS = ("test", "kind", "s", "mm", "X", "Y", "Z", "mm/min", "points")
 NAMES = 2
-"""So many columns hold names, which fold; the others hold numbers, which stay whole however narrow the terminal is."""
+"""Number of leading columns that hold names, which wrap; the others hold numbers, which stay whole at any width."""
 NARROWEST = 8
 
 
 def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
-    """One line a test: time, path, extent, largest speed, readings."""
+    """Print one line a test: time, path, extent, largest speed, readings."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -118,5 +118,5 @@ def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
 
 
 def _extent(run: DryRun) -> tuple[str, ...]:
-    """Lowest and highest position of each axis, rounded outwards to whole mm."""
+    """Return lowest and highest position of each axis, rounded outwards to whole mm."""
     return tuple(f"{math.floor(lo + HAIR)}..{math.ceil(hi - HAIR)}" for lo, hi in zip(run.lowest_mm, run.highest_mm, strict=True))

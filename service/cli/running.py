@@ -1,4 +1,4 @@
-"""Running a job that moves axes: whatever asks this process to end, the job is cancelled first, so that the axes stop."""
+"""Run a job that moves axes: any signal that ends this process first cancels the job, so that the axes stop."""
 
 from __future__ import annotations
 
@@ -25,14 +25,9 @@ def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
     Parameters
     ----------
     job : coroutine
-        Motion guards and clean-up inside it do the stopping.
+        Stops the axes by its own motion guards and clean-up.
     control : Control, optional
-        Of a measurement: then the first Ctrl-C only asks it to stop at a safe place, and SIGUSR1 pauses it or lets it go on.
-
-    Returns
-    -------
-    T
-        What the job returned.
+        Of a measurement: the first Ctrl-C only asks it to stop at a safe place, and SIGUSR1 pauses or resumes it.
 
     Raises
     ------
@@ -49,10 +44,10 @@ def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
             sys.stderr.write(f"stopped: {error.remedy}\n")
         raise SystemExit(128 + received[0]) from None
     except (asyncio.CancelledError, OSError) as error:
-        # A closed terminal also ends the display's last words with EIO; what a device has to say (some are OSErrors) must not get lost.
+        # A closed terminal also fails the display's last output with EIO; a device's error (some are OSErrors) must not get lost.
         if not received or (isinstance(error, OSError) and error.errno != errno.EIO):
             raise
-        with suppress(OSError):  # the terminal may be what has gone
+        with suppress(OSError):  # the terminal may be gone
             for text in getattr(error, "__notes__", []):
                 sys.stderr.write(f"stopped: {text}\n")
         raise SystemExit(128 + received[0]) from None
@@ -66,7 +61,7 @@ async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int],
         # A second signal cancels once more: what must reach the machine is shielded from it (abbe.drivers.links.shielded).
         received.append(number)
         gently = control is not None and number == signal.SIGINT and len(received) == 1
-        if control is not None:  # whatever takes a cancellation for something else still sees what was asked for
+        if control is not None:  # code that mistakes the cancellation for something else still sees the request
             loop.call_soon_threadsafe(control.stop if gently else control.abort)
         if not gently:
             loop.call_soon_threadsafe(task.cancel)
@@ -85,7 +80,7 @@ def _handled(stop: Handler, names: tuple[str, ...]) -> Iterator[None]:
     for name in names:
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number is None or (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
-            continue  # whoever started this with nohup wants it to survive the terminal
+            continue  # started with nohup: it must survive the terminal
         before[number] = signal.signal(number, stop)
     try:
         yield

@@ -1,4 +1,4 @@
-"""`abbe vectors`: independent vector files through the public functions."""
+"""`abbe vectors`: check independent vector files against the public functions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def vectors(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with vector files (*.json).")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compute every number of the vector files anew from the files' own inputs and compare. Exit 1: one is off; 2: a file is unusable."""
+    """Compute every number of the vector files from the files' own inputs and compare. Exit 1: one is off; 2: a file is unusable."""
     from abbe.service.vectors.run import READERS, examine, vector_files
 
     files = vector_files(folder)
@@ -86,7 +86,7 @@ def _notes(c: Checks) -> list[str]:
 
 
 def _last(checked: list[Checks], missing: list[str], known: int) -> str:
-    """The verdict: how much of the whole was there, how much of that was computed, and whether it holds."""
+    """Return the verdict: how much was there, how much of that was computed, and whether it holds."""
     bad = [c for c in checked if c.error]
     usable = len(checked) - len(bad)
     computed = sum(q.values for c in checked for q in c.quantities.values())

@@ -1,4 +1,4 @@
-"""A job ends with an unverified table still active, and a person is at the console: wait with them until the machine is safe."""
+"""Wait at the console for a safe machine when a job ends with an unverified table still active."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 @asynccontextmanager
-async def taken_back_when_safe(session: Session, store: Store, site: Site, wait_s: float) -> AsyncIterator[None]:
-    """Where a job ends in `StillActive`, wait at the console and take the old table back as soon as that is safe (exit code 1).
+async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s: float) -> AsyncIterator[None]:
+    """If a job ends in `StillActive`, wait at the console and roll back as soon as that is safe (exit code 1).
 
-    Without a console, or with ``wait_s`` 0, the error goes on as it is: the next start of any command takes the table back first. Ctrl-C
-    ends the waiting, with the same consequence.
+    Without a console, or with ``wait_s`` 0, the error is raised: the next start of any command rolls back first. Ctrl-C ends the wait with
+    the same consequence.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.deferred_rollback import finish_when_safe
@@ -35,9 +35,7 @@ async def taken_back_when_safe(session: Session, store: Store, site: Site, wait_
             raise
         notes = list(getattr(error, "__notes__", []))
         say("; ".join([str(error), *notes]) + "\a")
-        say(
-            "make the machine ready: it is watched, and the old table comes back by itself as soon as that is safe; Ctrl-C ends the waiting"
-        )
+        say("make the machine ready: Abbe restores the old table as soon as that is safe; Ctrl-C ends the wait")
         try:
             done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), notify=say)
         except asyncio.CancelledError as ended:
@@ -48,11 +46,11 @@ async def taken_back_when_safe(session: Session, store: Store, site: Site, wait_
                 ended.add_note(note)
             raise
         say(f"rolled back: {done or 'nothing was left to take back'}")
-        for note in notes:  # cup and bar may still hang in
+        for note in notes:  # cup and bar may still be mounted
             say(note)
         raise typer.Exit(1) from None
 
 
 def say(text: str) -> None:
-    """One line on standard error."""
+    """Print one line on stderr."""
     typer.echo(text, err=True)

@@ -1,1 +1,1 @@
-"""What the core process does besides measuring: jobs that people start, the web process, and what an earlier end has left open."""
+"""The core process besides measuring: jobs that people start, the web process, and recovery of what an earlier end left open."""

@@ -1,4 +1,4 @@
-"""What the core knows of the moment: the running check, the devices, the broker. Kept in memory; results live in the store."""
+"""Current state known to the core: the running check, the devices, the broker. Kept in memory; results are in the store."""
 
 from __future__ import annotations
 
@@ -14,19 +14,11 @@ from abbe.service.scheduler.ports import Doc
 
 
 class Board:
-    """Listens to the job and to the publisher.
-
-    Parameters
-    ----------
-    devices : mapping of str to str
-        Role and URL of each device of the machine file.
-    clock : Clock
-        When something was heard.
-    """
+    """Current state, reported by the job and the publisher; ``devices``: role and URL of each device of the machine file."""
 
     def __init__(self, devices: Mapping[str, str], clock: Clock) -> None:
         self._clock = clock
-        self._before: list[DeviceStatus] = []
+        self._devices_before: list[DeviceStatus] = []
         self.devices = [DeviceStatus(role=role, url=url, state="not used yet") for role, url in devices.items()]
         self.job: RunningCheck | None = None
         self.mqtt_connected = False
@@ -38,21 +30,21 @@ class Board:
         """Note that a check begins."""
         self.changes += 1
         self.job = RunningCheck(schedule=schedule.name, recipe=schedule.recipe, since_utc=at_utc)
-        self._before = self.devices
+        self._devices_before = self.devices
         self.devices = [replace(device, state="in use", at_utc=at_utc, text="") for device in self.devices]
 
     def job_progress(self, progress: Progress) -> None:
-        """Note how far it is."""
+        """Note the progress of the check."""
         if self.job is not None:
             self.job = replace(self.job, **{field.name: getattr(progress, field.name) for field in fields(Progress)})
 
     def job_ended(self, doc: Doc | None) -> None:
-        """Note how it ended. A check that was stopped or failed says nothing about the devices it does not name."""
+        """Note how the check ended. A check that was stopped or failed proves nothing about the devices that it does not name."""
         self.changes += 1
         self.job = None
         cause = doc["cause"] if doc is not None else None
         if doc is None or cause is not None:
-            self.devices = [self._blamed(device, cause) for device in self._before]
+            self.devices = [self._blamed(device, cause) for device in self._devices_before]
         else:
             now = self._clock.utc()
             self.devices = [replace(device, state="answered", at_utc=now, text="") for device in self.devices]
@@ -63,16 +55,16 @@ class Board:
         return replace(device, state="fault", at_utc=self._clock.utc(), text=cause["what"])
 
     def changed(self) -> None:
-        """Note that something else has changed, such as what needs a person."""
+        """Note another change, such as in what needs a person."""
         self.changes += 1
 
     def broker(self, connected: bool) -> None:
-        """Note whether the broker is there."""
+        """Note whether the broker is connected."""
         if connected != self.mqtt_connected:
             self.changes += 1
             self.mqtt_connected = connected
 
     def messages_dropped(self, count: int) -> None:
-        """Note that waiting messages were dropped, because the broker was away for too long."""
+        """Note that waiting messages were dropped because the broker was away for too long."""
         self.changes += 1
         self.mqtt_dropped += count

@@ -1,8 +1,8 @@
 """The jobs since the service began, by number, and how people start and steer them.
 
-A job is a check of the timetable, a check or full campaign that a person starts, what follows from an alarm (an investigation or a push),
-or an order for the tables (`abbe.service.core.orders`). Rights are decided here, not where a request comes from: the web process says who
-asks, and the table of users says what this person may do.
+A job is a check of the timetable, a check or full campaign that a person starts, the consequence of an alarm (an investigation or a push),
+or an order for the tables (`abbe.service.core.orders`). Rights are decided here, not where a request comes from: the web process names the
+user, and the table of users decides what this user may do.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ log = structlog.get_logger("abbe.jobs")
 MOST_KEYS = 1000
 BY_HAND = "by hand"
 AGAIN = "asked for before, with this key"
-"""Text of the answer to what was done before."""
+"""Text of the answer to a repeated request."""
 ASKING = "asking"
-"""State of a job that waits until a person has done something by hand."""
+"""State of a job that waits for a person to do something by hand."""
 
 
 def by_hand(recipe: str) -> Schedule:
-    """The terms of a job that a person starts: at once."""
+    """Return the schedule of a job that a person starts: at once."""
     return Schedule(BY_HAND, "", "UTC", recipe)
 
 
@@ -49,9 +49,9 @@ async def deny(_: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class FullCampaigns:
-    """What a person may start besides checks: names, and ``of(recipe, who)``, the job of one for a user; None: the recipe is no campaign.
+    """Full campaigns that a person may start: their names, and ``of(recipe, who)``, the job for a user (None: not a campaign).
 
-    ``may``: whether a user may propose tables, by the table of users as it is now: a full campaign ends with this user's proposal.
+    ``may``: whether a user may propose tables, by the current table of users: a full campaign ends with this user's proposal.
     """
 
     names: tuple[str, ...] = ()
@@ -61,7 +61,7 @@ class FullCampaigns:
 
 @dataclass(frozen=True, slots=True)
 class JobRequest:
-    """Who asks, in which request; ``what``: the one thing that ``key`` stands for, when the same user sends it again."""
+    """A request for a job. ``what``: what ``key`` stands for; the same user may repeat the key only for the same thing."""
 
     request: int
     who: str
@@ -70,21 +70,21 @@ class JobRequest:
 
 
 class MachineClaim(Protocol):
-    """Makes sure that one job runs at a time."""
+    """Ensures that only one job uses the machine."""
 
     def take(self, name: str) -> str:
-        """Take the machine; return what runs on it instead, or nothing."""
+        """Take the machine; return the name of the job that has it instead, or an empty string."""
         ...
 
     def give_back(self) -> None:
-        """The machine is free again."""
+        """Release the machine."""
         ...
 
 
 @dataclass
 class _Entry:
     job: Job[Any]
-    seen: JobState
+    record: JobState
     control: Control = field(default_factory=Control)
     task: asyncio.Task[SlotState] | None = None
 
@@ -95,13 +95,11 @@ class JobRegistry:
     Parameters
     ----------
     checks : callable
-        ``checks(schedule, slot)``: the check of a slot.
+        ``checks(schedule, slot)`` makes the check of a slot.
     recipes : sequence of str
-        What a person may start.
+        Recipes that a person may start.
     may : callable
-        ``await may(who)``: whether a user may start and steer measurements, by the table of users as it is now.
-    clock : Clock
-        Times of jobs.
+        ``await may(who)``: whether a user may start and steer measurements, by the current table of users.
     changed : callable
         Called whenever a job begins, changes or ends.
     watchers : sequence of JobWatcher
@@ -122,33 +120,33 @@ class JobRegistry:
         self._jobs: OrderedDict[str, _Entry] = OrderedDict()
         self._keys: OrderedDict[tuple[str, str], tuple[str, str]] = OrderedDict()
         self._now: _Entry | None = None
-        self.place: MachineClaim | None = None
-        """Where a job by hand is started; None: nowhere (``--once``, or not yet)."""
+        self.claim: MachineClaim | None = None
+        """The claim on the machine for jobs by hand; None: no jobs are taken (``--once``, or not yet started)."""
         self.full = FullCampaigns()
         """The full campaigns; by default there are none."""
         self._tasks: asyncio.TaskGroup | None = None
 
-    def open(self, place: MachineClaim, tasks: asyncio.TaskGroup) -> None:
-        """Let people start jobs from now on; they run in ``tasks``."""
-        self.place, self._tasks = place, tasks
+    def open(self, claim: MachineClaim, tasks: asyncio.TaskGroup) -> None:
+        """Accept jobs from people from now on; they run in ``tasks``."""
+        self.claim, self._tasks = claim, tasks
 
     async def close(self) -> None:
-        """Start nothing more, and stop what was started by hand: the devices hold the motion."""
-        self.place = None
+        """Accept no more jobs, and cancel those started by hand: the devices hold the motion."""
+        self.claim = None
         running = [entry.task for entry in self._jobs.values() if entry.task is not None and not entry.task.done()]
         for task in running:
             task.cancel()
         if running:
             await asyncio.wait(running)
 
-    # ---- what runs --------------------------------------------------------------------------------------------------
+    # ---- running ----------------------------------------------------------------------------------------------------
 
     async def __call__(self, schedule: Schedule, slot_utc: datetime) -> SlotState:
-        """Run the check of a slot; return the slot's state. The scheduler calls this."""
+        """Run the check of a slot for the scheduler; return the slot's state."""
         return await self.run(self._checks(schedule, slot_utc))
 
     async def run(self, job: Job[Any]) -> SlotState:
-        """Run a job that the service starts by itself; return how it ended."""
+        """Run a job that the service starts by itself; return its final state."""
         return await self._run(self._new(job, ""))
 
     def _new(self, job: Job[Any], who: str) -> _Entry:
@@ -176,11 +174,11 @@ class JobRegistry:
         self._now = entry
         self._changed()
         try:
-            end = await carry_out(entry.job, entry.seen.begun_utc, entry.control, self._watchers)
+            end = await carry_out(entry.job, entry.record.begun_utc, entry.control, self._watchers)
         finally:
             self._now = None
-            entry.seen = replace(
-                entry.seen,
+            entry.record = replace(
+                entry.record,
                 state=str(end),
                 text=end.reason[:TEXT],
                 ended_utc=self._clock.utc(),
@@ -191,40 +189,40 @@ class JobRegistry:
             self._changed()
         return end
 
-    async def _run_by_hand(self, entry: _Entry, place: MachineClaim) -> SlotState:
+    async def _run_by_hand(self, entry: _Entry, claim: MachineClaim) -> SlotState:
         try:
             return await self._run(entry)
         finally:
-            place.give_back()
+            claim.give_back()
 
-    # ---- what is seen -----------------------------------------------------------------------------------------------
+    # ---- state -----------------------------------------------------------------------------------------------------
 
     @property
     def running(self) -> JobState | None:
-        """The job that runs, with the state of its measurement."""
-        return None if self._now is None else self._look(self._now)
+        """The running job, with the state of its measurement; None: none."""
+        return None if self._now is None else self._state_of(self._now)
 
-    def seen(self) -> tuple[JobState, ...]:
+    def latest(self) -> tuple[JobState, ...]:
         """The latest jobs, newest first."""
-        return tuple(self._look(entry) for entry in reversed(self._jobs.values()))
+        return tuple(self._state_of(entry) for entry in reversed(self._jobs.values()))
 
-    def _look(self, entry: _Entry) -> JobState:
-        if entry.seen.ended_utc is not None:
-            return entry.seen
+    def _state_of(self, entry: _Entry) -> JobState:
+        if entry.record.ended_utc is not None:
+            return entry.record
         control, now, prompt = entry.control, entry.control.progress, entry.control.prompts.now
         state = control.state
-        if state is State.READY:  # the work has not reported yet; what a person has asked for waits for it
+        if state is State.READY:  # the work has not reported yet; a person's request waits for it
             asked = ((State.ABORTING, control.aborting), (State.STOPPING, control.stopping), (State.PAUSING, control.pausing))
             state = next((one for one, is_asked in asked if is_asked), State.RUNNING)
         if prompt is None:
-            return replace(entry.seen, state=state, text=now.why)
+            return replace(entry.record, state=state, text=now.why)
         shown = ASKING if state is State.RUNNING else state
-        return replace(entry.seen, state=shown, text=now.why, prompt=prompt.number, ask=prompt.text[:WORD])
+        return replace(entry.record, state=shown, text=now.why, prompt=prompt.number, ask=prompt.text[:WORD])
 
-    # ---- what is asked for ------------------------------------------------------------------------------------------
+    # ---- requests ---------------------------------------------------------------------------------------------------
 
     async def start(self, asked: StartJob) -> Answer:
-        """Start a declared recipe or a full campaign, once for each key."""
+        """Start a recipe or a full campaign, once for each key."""
         refused = await self._refused(asked.who)
         if refused:
             return _answer(asked.request, "forbidden", refused)
@@ -232,9 +230,9 @@ class JobRegistry:
         if campaign is not None and not await self.full.may(asked.who):
             return _answer(asked.request, "forbidden", f"{asked.who} may not propose tables here, and {asked.recipe} ends with a proposal")
         requested = JobRequest(asked.request, asked.who, asked.key, asked.recipe)
-        again = self.again(requested)
-        if again is not None:
-            return again
+        earlier = self.earlier_answer(requested)
+        if earlier is not None:
+            return earlier
         if campaign is not None:
             return self.begin(requested, campaign)
         if split_recipe_name(asked.recipe)[0] not in self._recipes:
@@ -242,8 +240,8 @@ class JobRegistry:
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")
         return self.begin(requested, self._checks(by_hand(asked.recipe), self._clock.utc()))
 
-    def again(self, requested: JobRequest) -> Answer | None:
-        """Return the answer that this key was given before; None: it is new."""
+    def earlier_answer(self, requested: JobRequest) -> Answer | None:
+        """Return the earlier answer to this key; None: the key is new."""
         known = self._keys.get((requested.who, requested.key)) if requested.key else None
         if known is None:
             return None
@@ -252,29 +250,29 @@ class JobRegistry:
         return _answer(requested.request, "done", AGAIN, known[0])
 
     def begin(self, requested: JobRequest, job: Job[Any]) -> Answer:
-        """Begin a job that a person asks for, if nothing else has the machine. The caller has checked the person's rights."""
-        if self.place is None or self._tasks is None:
+        """Begin a requested job if the machine is free. The caller has checked the user's rights."""
+        if self.claim is None or self._tasks is None:
             return _answer(requested.request, "busy", "the service starts, ends, or runs its timetable once; it takes no jobs")
-        other = self.place.take(f"{BY_HAND}: {job.terms.recipe}")
+        other = self.claim.take(f"{BY_HAND}: {job.terms.recipe}")
         if other:
             return _answer(requested.request, "busy", f"the machine measures: {other}")
         entry = self._new(job, requested.who)
         if requested.key:
-            self._keys[requested.who, requested.key] = (entry.seen.id, requested.what)
+            self._keys[requested.who, requested.key] = (entry.record.id, requested.what)
             while len(self._keys) > MOST_KEYS:
                 self._keys.popitem(last=False)
-        entry.task = self._tasks.create_task(self._run_by_hand(entry, self.place), name=f"job {entry.seen.id}")
-        log.info("job started", job=entry.seen.id, kind=job.kind, recipe=job.terms.recipe, who=requested.who)
-        return _answer(requested.request, "done", "", entry.seen.id)
+        entry.task = self._tasks.create_task(self._run_by_hand(entry, self.claim), name=f"job {entry.record.id}")
+        log.info("job started", job=entry.record.id, kind=job.kind, recipe=job.terms.recipe, who=requested.who)
+        return _answer(requested.request, "done", "", entry.record.id)
 
     async def steer(self, asked: SteerJob) -> Answer:
-        """Stop, abort, pause or go on with the job that runs."""
+        """Stop, abort, pause or resume the running job."""
         entry = await self._asked_of(asked)
         if isinstance(entry, Answer):
             return entry
         control = entry.control
         if control.state is State.ENDED:
-            return _answer(asked.request, "conflict", "the measurement of this job is over; its figures are judged now", asked.job)
+            return _answer(asked.request, "conflict", "the measurement of this job has ended; its figures are being judged", asked.job)
         if asked.how == "pause" and control.no_pause_reason:
             return _answer(asked.request, "conflict", f"it cannot be paused now: {control.no_pause_reason}", asked.job)
         {"stop": control.stop, "abort": control.abort, "pause": control.pause, "resume": control.resume}[asked.how]()
@@ -283,26 +281,26 @@ class JobRegistry:
         return _answer(asked.request, "done", "", asked.job)
 
     async def done_by_hand(self, asked: ConfirmPrompt) -> Answer:
-        """Confirm that what a job asks for is done; only for the prompt that is open."""
+        """Confirm that a person has done what the open prompt of a job asks for."""
         entry = await self._asked_of(asked)
         if isinstance(entry, Answer):
             return entry
         if not entry.control.prompts.answer(asked.prompt):
-            return _answer(asked.request, "conflict", f"prompt {asked.prompt} is not what this job waits for: look at it again", asked.job)
+            return _answer(asked.request, "conflict", f"this job does not wait for prompt {asked.prompt}; look at it again", asked.job)
         log.info("done by hand", job=asked.job, prompt=asked.prompt, who=asked.who)
         self._changed()
         return _answer(asked.request, "done", "", asked.job)
 
     async def _asked_of(self, asked: SteerJob | ConfirmPrompt) -> _Entry | Answer:
-        """The running job that a user may steer, or the answer why not."""
+        """Return the running job if the user may steer it, else the refusal."""
         refused = await self._refused(asked.who)
         if refused:
             return _answer(asked.request, "forbidden", refused)
         entry = self._jobs.get(asked.job)
         if entry is None:
             return _answer(asked.request, "unknown", f"there is no job {asked.job!r} since the service began")
-        if entry.seen.ended_utc is not None:
-            return _answer(asked.request, "conflict", f"this job has ended: {entry.seen.state}", asked.job)
+        if entry.record.ended_utc is not None:
+            return _answer(asked.request, "conflict", f"this job has ended: {entry.record.state}", asked.job)
         return entry
 
     async def _refused(self, who: str) -> str:

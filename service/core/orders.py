@@ -1,7 +1,7 @@
-"""What a person can order as a job: a full campaign, a rollback to the table before, or the push of an approved proposal.
+"""Orders of people, run as jobs: a full campaign, a rollback to the previous table, or the push of an approved proposal.
 
-Rights are decided here. The audit records who ordered it and why before anything is done, and afterwards how it ended. How a push ended is
-what the push journal says, whatever was reported.
+Rights are decided here. The audit records who ordered and why before anything is done, and afterwards how it ended. The end of a push is
+read from the push journal, whatever was reported.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from typing import Final, Literal
 import structlog
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import Answer, PushNow, RollBack
-from abbe.service.channel.messages import Outcome as Word
+from abbe.service.channel.messages import Answer, Outcome, PushNow, RollBack
 from abbe.service.clock import Clock
 from abbe.service.compensation.ordered_rollback import RollbackOrder
 from abbe.service.compensation.proposal_doc import load
@@ -45,15 +44,15 @@ PUSH: Final = "push"
 NO_PAUSE = "a table is being changed: stop it, or let it end"
 
 OrderedRollback = Callable[[RollbackOrder], Awaitable[JobOutcome]]
-"""``await rollback(order)``: restores the table before; returns what it learned of the end."""
+"""``await rollback(order)``: restores the previous table; returns the outcome as far as it learned it."""
 Push = Callable[[PushOrder], Awaitable[JobOutcome]]
-"""``await push(order)``: pushes what is approved; returns what it learned of the end."""
-BY_ITSELF = "this service pushes what is approved by itself ([alarm] push), or has no controller"
+"""``await push(order)``: pushes the approved proposal; returns the outcome as far as it learned it."""
+BY_ITSELF = "this service pushes approved proposals by itself ([alarm] push), or has no controller"
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignOrder:
-    """A full campaign that a person started: its recipe, who proposes, where progress goes, and what pauses and stops it."""
+    """A full campaign that a person started: its recipe, the proposer, the sink for progress, and the control that pauses and stops it."""
 
     recipe: str
     by: str
@@ -67,7 +66,7 @@ MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
 
 @dataclass(frozen=True, slots=True)
 class OrderActions:
-    """What can be ordered: a rollback, a push of what is approved. None: it cannot be ordered here."""
+    """The possible orders: a rollback, a push of an approved proposal. None: not possible here."""
 
     ordered_rollback: OrderedRollback | None = None
     push: Push | None = None
@@ -75,7 +74,7 @@ class OrderActions:
 
 @dataclass(frozen=True, slots=True)
 class OrderContext:
-    """The machine's name, who may give orders (``await may(who)``), the audit, and the identity of the machine's control."""
+    """The machine's name, ``await may(who)`` for the right to order, the audit, and the identity of the machine's control."""
 
     machine: str
     may: Callable[[str], Awaitable[bool]]
@@ -84,18 +83,18 @@ class OrderContext:
 
 
 Action = Callable[[ProgressSink, Control], Awaitable[JobOutcome]]
-"""``await act(progress, control)``: does what was ordered."""
+"""``await act(progress, control)``: carries out the order."""
 
 
 @dataclass(frozen=True, slots=True)
 class _AuditTrail:
-    """The records of one order. ``begun``: the first of them."""
+    """The audit records of one order; ``begun``: the first of them."""
 
     audit: AuditBook
     begun: AuditEvent
 
     async def write(self, outcome: str, text: str = "") -> None:
-        """Write how far the order is."""
+        """Write a record of the order's state."""
         doc = self.begun.doc | ({"text": text} if text else {})
         await asyncio.to_thread(self.audit.write, replace(self.begun, outcome=outcome, doc=doc))
 
@@ -112,31 +111,31 @@ class _OrderJob(Job[JobOutcome]):
 
     async def do(self, progress: ProgressSink, control: Control) -> JobOutcome:
         control.now(State.RUNNING)
-        control.no_pause_reason = NO_PAUSE if self.kind == ROLLBACK else ""  # a push measures first, and that can be held
+        control.no_pause_reason = NO_PAUSE if self.kind == ROLLBACK else ""  # a push measures first, and that can be paused
         return await self._act(progress, control)
 
     async def failed(self, error: Exception) -> JobOutcome:
         return failure(error)
 
     async def end(self, outcome: JobOutcome) -> SlotState:
-        log.warning("an order has ended", kind=self.kind, who=self._trail.begun.who, word=outcome.word, text=outcome.text)
+        log.warning("order ended", kind=self.kind, who=self._trail.begun.who, word=outcome.word, text=outcome.text)
         try:
             await self._trail.write(outcome.word, outcome.text)
-        except AbbeError as error:  # what was done is in the store; a service that ended here would do nothing more
-            log.error("not in the audit", cause=error.detail)
+        except AbbeError as error:  # what was done is in the store; a service that ended here would do no more work
+            log.error("audit record failed", cause=error.detail)
         return SlotState.of(outcome)
 
     async def interrupted(self) -> None:
-        await self._trail.write(STOPPED, "stopped with the service; what is complete stays")
+        await self._trail.write(STOPPED, "stopped with the service; completed runs are kept")
 
 
 Look = Callable[[], JobOutcome | None]
-"""How the push of an order stands, by the journal; None: nothing was written."""
+"""Return the state of an order's push by the journal; None: nothing was written."""
 RetryingLook = Callable[[Look], Awaitable[JobOutcome | None]]
 
 
 class _TableOrderJob(_OrderJob):
-    """An order for the tables: its end is what the push journal says. ``retrying``: looks until the database answers."""
+    """An order for the tables; its outcome is read from the push journal. ``retrying``: reads until the database answers."""
 
     def __init__(self, kind: JobKind, recipe: str, trail: _AuditTrail, act: Action, look: Look, retrying: RetryingLook) -> None:
         super().__init__(kind, recipe, trail, act)
@@ -146,9 +145,9 @@ class _TableOrderJob(_OrderJob):
         return await super().end(reconciled(await self._retrying(self._look), outcome))
 
     async def interrupted(self) -> None:
-        """Record where it stands by the journal; the next start takes back what is open."""
+        """Record its state by the journal; the next start rolls back an open push."""
         done = await asyncio.to_thread(self._look) or JobOutcome("failed", "the service ended before anything was written")
-        log.warning("an order was interrupted by the end of the service", kind=self.kind, word=done.word, text=done.text)
+        log.warning("order interrupted by the end of the service", kind=self.kind, word=done.word, text=done.text)
         await self._trail.write(done.word, f"{done.text} (stopped with the service)")
 
 
@@ -160,11 +159,11 @@ def full_campaigns(
     Parameters
     ----------
     context : OrderContext
-        Machine and audit; its ``may`` is not asked.
+        Machine and audit; its ``may`` is not used.
     names : tuple of str
-        What can be started.
+        Campaigns that can be started.
     measure : callable
-        Does it.
+        Measures, solves and proposes.
     may : callable
         ``await may(who)``: whether a user may propose tables.
     """
@@ -183,28 +182,14 @@ def full_campaigns(
 
 
 class Orders(RetryingStore):
-    """Takes orders for the tables and runs them as jobs.
-
-    Parameters
-    ----------
-    store : Store
-        Holds the push journal.
-    clock : Clock
-        Now.
-    jobs : JobRegistry
-        Runs them.
-    context : OrderContext
-        Machine, rights, audit.
-    actions : OrderActions
-        What can be ordered.
-    """
+    """Takes orders for the tables and runs them as jobs. ``store`` holds the push journal."""
 
     def __init__(self, store: Store, clock: Clock, jobs: JobRegistry, context: OrderContext, actions: OrderActions) -> None:
         super().__init__(store, clock)
         self._jobs, self._context, self._actions = jobs, context, actions
 
     async def rollback(self, asked: RollBack) -> Answer:
-        """Begin a rollback, once for each key; not if another table is in force than the user saw, or none was before it."""
+        """Begin a rollback, once for each key; refused if another table is in force than the user saw, or there is no previous table."""
         requested = JobRequest(asked.request, asked.who, asked.key, f"{ROLLBACK} of push {asked.push}, {asked.crc:08X}: {asked.reason}")
         refused = await self._refused(
             requested, "order a table back", self._actions.ordered_rollback is None and "this service has no controller"
@@ -216,7 +201,7 @@ class Orders(RetryingStore):
         except TableRefused as no:
             return _answer(asked.request, "conflict", str(no))
         if (now.push, now.crc) != (asked.push, asked.crc):
-            what = f"meanwhile another table is in force: {now.crc:08X} of push {now.push}; look at it first"
+            what = f"meanwhile another table is in force: {now.crc:08X} of push {now.push}; check it first"
             return _answer(asked.request, "conflict", what)
         return self._jobs.begin(requested, self._rollback_job(asked))
 
@@ -240,7 +225,7 @@ class Orders(RetryingStore):
         return _TableOrderJob(ROLLBACK, f"{ROLLBACK} of push {asked.push}", self._trail(begun), act, look, self._read)
 
     async def push(self, asked: PushNow) -> Answer:
-        """Begin to push a proposal whose approval holds, once for each key; its verification before is measured first."""
+        """Begin to push an approved proposal, once for each key; the job first measures its verification before the push."""
         requested = JobRequest(asked.request, asked.who, asked.key, f"{PUSH} of proposal {asked.proposal}")
         refused = await self._refused(requested, "order a push", self._actions.push is None and BY_ITSELF)
         if refused is not None:
@@ -254,7 +239,7 @@ class Orders(RetryingStore):
         return self._jobs.begin(requested, self._push_job(asked, after))
 
     def _not_approved(self, proposal: int) -> tuple[str, int]:
-        """Why a proposal cannot be pushed as it stands, and the number of the last push."""
+        """Return why a proposal cannot be pushed now (empty: it can), and the number of the last push."""
         machine, found = self._context.machine, load(self._store, proposal)
         journal = JournalView.read(self._store, machine)
         after = journal.last_push
@@ -268,7 +253,7 @@ class Orders(RetryingStore):
         assert push is not None
 
         async def in_audit() -> None:
-            """Record nothing: the audit has it already."""
+            """Do nothing: the audit has the begin already."""
 
         async def act(progress: ProgressSink, control: Control) -> JobOutcome:
             return await push(PushOrder(asked.proposal, in_audit, progress, control))
@@ -282,16 +267,16 @@ class Orders(RetryingStore):
         return _TableOrderJob(PUSH, f"{PUSH} of proposal {asked.proposal}", self._trail(begun), act, look, self._read)
 
     async def _refused(self, requested: JobRequest, order: str, missing: str | Literal[False]) -> Answer | None:
-        """Return the answer if the user has no right, has asked before, or something runs; None: go on."""
+        """Return the refusal if the user has no right, repeats a request, or another job runs; None: proceed."""
         if not await self._context.may(requested.who):
             return _answer(requested.request, "forbidden", f"{requested.who} may not {order} here")
-        again = self._jobs.again(requested)
-        if again is not None:
-            return again
+        earlier = self._jobs.earlier_answer(requested)
+        if earlier is not None:
+            return earlier
         if missing:
             return _answer(requested.request, "conflict", missing)
         running = self._jobs.running
-        if running is not None:  # before the journal is read: a running push would look like one that was left open
+        if running is not None:  # before reading the journal: a running push would look like an interrupted one
             return _answer(requested.request, "busy", f"the machine measures: {running.schedule or running.recipe}")
         return None
 
@@ -299,5 +284,5 @@ class Orders(RetryingStore):
         return _AuditTrail(self._context.audit, begun)
 
 
-def _answer(request: int, outcome: Word, text: str) -> Answer:
+def _answer(request: int, outcome: Outcome, text: str) -> Answer:
     return Answer("answer", request, outcome, text[:4000], "")

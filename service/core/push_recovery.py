@@ -1,6 +1,6 @@
-"""Recovery of what an earlier end left open - runs in segments, a push under way: at start, and reported until it is closed.
+"""Recover what an earlier end of the service left open - runs in segments, a push under way: at start, and reported until it is closed.
 
-A push of the running service can be left open too, with a table in force that nobody has verified: it is gone back to in the same way.
+A push of the running service can be left open too, with an unverified table in force: it is recovered in the same way.
 """
 
 from __future__ import annotations
@@ -20,35 +20,33 @@ log = structlog.get_logger("abbe.recovery")
 
 AGAIN_S = 30.0
 LOOK_S = 5.0
-"""So often the journal is asked whether a push is open; the controller is not asked for that."""
+"""Time between two looks at the journal for an open push, s; the controller is not asked."""
 BUSY_S = 1.0
-NAME = "taking back what an earlier end has left open"
+NAME = "recovery of an interrupted run or push"
 
 Recover = Callable[[], Awaitable[str | None]]
-"""``await recover()``: closes what is open; returns what was done, or nothing. Opens the controller only if a push is open."""
+"""``await recover()``: closes what is open; returns a text of what was done, or None. Opens the controller only if a push is open."""
 
 
 IsOpen = Callable[[], Awaitable[bool]]
-"""Whether the last push of the machine is open by its journal: also one that is under way now, or that a person has to look at."""
+"""Return whether the machine's last push is open by its journal: also one under way now, or one that needs a person."""
 
 
 class PushRecovery:
-    """Tries until nothing is open, and begins again when something is.
+    """Tries until nothing is open, and starts again when something is.
 
     Parameters
     ----------
     recover : callable
         One try.
     is_open : callable
-        Asked after all was closed.
-    place : MachineClaim
-        The machine is ours during a try: no check starts meanwhile.
+        Asked after everything was closed.
+    claim : MachineClaim
+        Claims the machine during a try, so that no check starts.
     alarms : Alarms
-        Gets each new reason why it is not possible.
+        Gets each new reason for a failure.
     attention : list of str
-        What the page shows until it is done.
-    clock : Clock
-        Pauses between tries.
+        Texts on the page until the recovery succeeds.
     changed : callable
         Called when ``attention`` has changed.
     """
@@ -57,18 +55,18 @@ class PushRecovery:
         self,
         recover: Recover,
         is_open: IsOpen,
-        place: MachineClaim,
+        claim: MachineClaim,
         alarms: Alarms,
         attention: MutableSequence[str],
         clock: Clock,
         changed: Callable[[], None],
     ) -> None:
-        self._recover, self._is_open, self._place, self._alarms = recover, is_open, place, alarms
+        self._recover, self._is_open, self._claim, self._alarms = recover, is_open, claim, alarms
         self._attention, self._clock, self._changed = attention, clock, changed
-        self._told: str | None = None
+        self._reported: str | None = None
 
     async def run(self) -> None:
-        """Work for ever: close what is open, then look whether a push of any process was left open since."""
+        """Work forever: close what is open, then watch for a push that any process leaves open."""
         while True:
             while not await self._try():
                 await self._clock.sleep(AGAIN_S)
@@ -76,15 +74,15 @@ class PushRecovery:
                 await self._clock.sleep(LOOK_S)
 
     async def _left_open(self) -> bool:
-        """Look at the journal alone: the machine is not locked where there is nothing to take back."""
+        """Look at the journal only: the machine is not locked if there is nothing to roll back."""
         try:
             return await self._is_open()
-        except AbbeError as trouble:  # a push or a check needs the same database: the next look is soon
-            log.warning("whether a push is open cannot be read now", cause=trouble.detail)
+        except AbbeError as trouble:  # a push or a check may lock the database: the next look is soon
+            log.warning("push journal unreadable; retry", cause=trouble.detail)
             return False
 
     async def _try(self) -> bool:
-        while self._place.take(NAME):  # a check runs, which has closed what was open before it moved anything; or the push itself
+        while self._claim.take(NAME):  # a check runs, and has closed what was open before it moved; or the push itself runs
             await self._clock.sleep(BUSY_S)
         try:
             done = await self._recover()
@@ -92,28 +90,28 @@ class PushRecovery:
             if isinstance(trouble, MachineInUse):
                 log.info("waiting for another process", cause=str(trouble))
             else:
-                await self._tell(trouble)
+                await self._report(trouble)
             return False
         finally:
-            self._place.give_back()
+            self._claim.give_back()
         if done:
-            log.warning("what an earlier end had left open is closed", what=done)
+            log.warning("recovery done: what was left open is closed", what=done)
         self._show(None)
         return True
 
-    async def _tell(self, trouble: Exception) -> None:
+    async def _report(self, trouble: Exception) -> None:
         cause = record.cause_of(trouble)
         text = f"{cause['code']}: {cause['what']}" + (f" - {cause['remedy']}" if cause["remedy"] else "")
-        if text == self._told:
+        if text == self._reported:
             return
         self._show(text)
-        log.error("what an earlier end has left open cannot be closed", **cause)
+        log.error("recovery failed: what was left open cannot be closed", **cause)
         await self._alarms.alarm({**cause, "at_utc": self._clock.utc().isoformat()})
 
     def _show(self, text: str | None) -> None:
-        if self._told is not None:
-            self._attention.remove(self._told)
+        if self._reported is not None:
+            self._attention.remove(self._reported)
         if text is not None:
             self._attention.append(text)
-        self._told = text
+        self._reported = text
         self._changed()

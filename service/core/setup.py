@@ -1,4 +1,4 @@
-"""What the service is to do, taken from the machine file: everything that `abbe.service.serve` is wired from."""
+"""Setup of the service, from the machine file: all that `abbe.service.serve` is built from."""
 
 from __future__ import annotations
 
@@ -26,54 +26,54 @@ from abbe.service.tables.in_force import LookAtTable
 
 @dataclass(frozen=True, slots=True)
 class ServiceSetup:
-    """What the service is to do, taken from the machine file.
+    """Setup of the service, from the machine file. Callables that take a store get the open store of the service.
 
     Parameters
     ----------
     machine : str
         Name of the machine.
     doc : dict
-        Its description as the store keeps it.
+        The machine object that the store keeps.
     devices : mapping of str to str
         Role and URL.
     schedules : tuple of Schedule
         The timetable.
     store_url : str
-        Where everything is kept.
+        URL of the database.
     broker : Broker or None
-        Where results are published.
+        The MQTT broker.
     topics : Topics
-        Under which names.
+        Topics of the published messages.
     web : Web
-        Where the page is served, to whom, with which certificate: the section of the machine file, its files with their whole paths.
+        The machine file's section, with absolute paths of its files.
     check : callable
-        Given the open store, returns ``check(recipe, progress)``.
+        Given the store, returns ``check(recipe, progress, control)``.
     maintenance : tuple of Window
-        Nothing starts by itself in these.
+        Windows in which nothing starts by itself.
     ready : callable
-        Given the clock, returns who knows the preconditions.
+        Given the clock, returns the check of preconditions.
     opcua : OpcUa or None
-        Where OPC UA clients may read; checked.
+        The OPC UA server's section, checked.
     recipes : tuple of str
-        What a person may start at any time, besides those of the timetable.
+        Recipes that a person may start at any time, besides those of the timetable.
     recover : callable, optional
-        Given the open store, returns how what an earlier end has left open is closed.
+        Given the store, returns the recovery of what an earlier end left open.
     rules : Rules
         Limits, certificates and temperatures that reports add to the data.
     duties : callable, optional
-        Given the open store, what is done about alarms; None: none are raised.
+        Given the store, returns what the service does about alarms; None: it raises none.
     table : callable, optional
-        Given the open store, how the table in force is looked at; None: it is not watched.
+        Given the store, returns how to look at the table in force; None: it is not watched.
     live : LiveFeed, optional
-        What ``check`` shows of its paths, for the page.
+        Samples of the running path, for the page.
     summary : MachineSummary, optional
-        What the page calculates dry runs from.
+        The page's data for dry runs.
     actions : callable, optional
-        Given the open store, what a person can order of tables; None: nothing.
+        Given the store, returns the orders for tables that a person can give; None: none.
     campaigns : tuple of str
-        Full campaigns that a person may start, if ``campaign`` is there.
+        Full campaigns that a person may start, if ``campaign`` is given.
     campaign : callable, optional
-        Given the open store, how one is measured, solved and proposed.
+        Given the store, returns how to measure, solve and propose one.
     """
 
     machine: str
@@ -99,9 +99,9 @@ class ServiceSetup:
     campaigns: tuple[str, ...] = ()
     campaign: Callable[[Store], MeasureCampaign] | None = None
     warnings: tuple[str, ...] = ()
-    """What the machine file says that is possible and rarely meant: logged once the service serves."""
+    """Unusual but possible values of the machine file: logged once the service is up."""
 
     @property
     def control(self) -> str:
-        """Identity of the machine's control (`control_of`); empty where there is none."""
+        """Identity of the machine's control (`control_of`); empty without a control."""
         return control_of(self.devices.get("cnc"))

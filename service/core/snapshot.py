@@ -1,4 +1,4 @@
-"""How things stand, as one message: what the board has heard, which job runs, what is due, what needs a person."""
+"""The state of the service as one message: board, running job, due slots, what needs a person."""
 
 from __future__ import annotations
 
@@ -18,31 +18,19 @@ from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 
 AGAIN = timedelta(minutes=1)
-"""The timetable is looked at no more often than this, unless a slot has come: it changes only then."""
+"""The timetable is evaluated at most this often, unless a slot has come due: it changes only then."""
 
 
 class SnapshotSource:
-    """Makes messages of what is known.
+    """Makes snapshots from the board, the registry of jobs (``jobs``), the timetable (``next_due``) and the clock."""
 
-    Parameters
-    ----------
-    board : Board
-        Devices, broker, the running check.
-    book : JobRegistry
-        Which job that is.
-    next_due : callable
-        The timetable.
-    clock : Clock
-        Now.
-    """
-
-    def __init__(self, board: Board, book: JobRegistry, next_due: Callable[[], Sequence[tuple[Schedule, datetime]]], clock: Clock) -> None:
-        self._board, self._book, self._next_due, self._clock = board, book, next_due, clock
+    def __init__(self, board: Board, jobs: JobRegistry, next_due: Callable[[], Sequence[tuple[Schedule, datetime]]], clock: Clock) -> None:
+        self._board, self._jobs, self._next_due, self._clock = board, jobs, next_due, clock
         self._due: tuple[DueSlot, ...] = ()
         self._looked: datetime | None = None
 
     def now(self, web_restarts: int) -> Snapshot:
-        """How things stand."""
+        """Return the present state of the service."""
         board = self._board
         devices = tuple(replace(d, role=d.role[:WORD], url=d.url[:TEXT], text=d.text[:TEXT]) for d in board.devices)
         attention = tuple(text[:TEXT] for text in board.attention)
@@ -60,7 +48,7 @@ class SnapshotSource:
         )
 
     def _check(self) -> RunningCheck | None:
-        check, job = self._board.job, self._book.running
+        check, job = self._board.job, self._jobs.running
         if check is None:
             return None
         if job is not None:
@@ -87,7 +75,7 @@ class SnapshotSource:
 
 
 def rss_bytes() -> int:
-    """Resident memory of this process; 0 where the system does not tell."""
+    """Return the resident memory of this process, bytes; 0 where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError, AttributeError):

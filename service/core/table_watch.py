@@ -1,7 +1,7 @@
-"""Watches for a table in force that Abbe did not push and verify: seen within seconds, reported once, shown until a person has looked.
+"""Watch for an active table that Abbe did not push and verify: detected within seconds, reported once, shown until a person has acted.
 
-Modbus asks nobody for a password: whoever is in the machine's network can put any table into force. Nothing here writes to the
-controller or takes anything back: which table is right is a person's word (``abbe accept-table``).
+Modbus has no passwords: any computer in the machine's network can activate any table. Nothing here writes to the controller or rolls
+back: which table is right is a person's decision (``abbe accept-table``).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ log = structlog.get_logger("abbe.table")
 
 LOOK_S = 10.0
 AGAIN_S = 1.0
-"""A first difference is looked at once more after this: a push of another process may have ended between both readings."""
+"""A first difference is checked once more after this time, s: another process's push may have ended between two readings."""
 CODE = STRANGE_TABLE_CODE
 REMEDY = "find out who wrote it; restore the right table at the controller, or, if this one is right: abbe accept-table MACHINE.toml"
-"""Neither a rollback nor a push: both are refused while such a table is in force (`abbe.service.tables.table_gate`)."""
+"""Neither a rollback nor a push: both are refused while such a table is active (`abbe.service.tables.table_gate`)."""
 
 
 class TableWatch:
@@ -34,13 +34,11 @@ class TableWatch:
     Parameters
     ----------
     look : LookAtTable
-        One look; it raises what devices and store raise.
+        One look; raises errors of devices and store.
     alarms : Alarms
-        Gets each strange table once.
+        Gets each unknown table once.
     attention : list of str
-        What the page shows until the table is one that Abbe knows.
-    clock : Clock
-        Pauses.
+        Texts on the page until the table is one that Abbe knows.
     changed : callable
         Called when ``attention`` has changed.
     """
@@ -51,59 +49,59 @@ class TableWatch:
         self._look, self._alarms, self._attention = look, alarms, attention
         self._clock, self._changed = clock, changed
         self._first: int | None = None
-        """CRC that stands for the journal's while there is none: that of the first look at a table with which nothing was wrong."""
-        self._told: tuple[int, str] | None = None
+        """CRC expected while the journal has none: that of the first table found without a problem."""
+        self._reported: tuple[int, str] | None = None
 
     async def run(self) -> None:
-        """Look for ever. A controller that does not answer says nothing about its table: others tell that."""
+        """Watch forever. A controller that does not answer says nothing about its table; other parts report that."""
         while True:
-            seen = await self._one()
-            if seen is not None and self._strange(seen):
+            in_force = await self._read()
+            if in_force is not None and self._problem(in_force):
                 await self._clock.sleep(AGAIN_S)
-                again = await self._one()
-                seen = again if again is not None and again.crc == seen.crc else None
-            if seen is not None:
-                await self._judge(seen)
+                again = await self._read()
+                in_force = again if again is not None and again.crc == in_force.crc else None
+            if in_force is not None:
+                await self._judge(in_force)
             await self._clock.sleep(LOOK_S)
 
-    async def _one(self) -> InForce | None:
+    async def _read(self) -> InForce | None:
         try:
-            seen = await self._look()
+            in_force = await self._look()
         except (AbbeError, DriverError, OSError):  # in use, out of reach, restarting: the next look is soon
             return None
-        if seen.wanted is None and self._first is None and not seen.strange and not seen.unverified:
-            self._first = seen.crc
-        return seen if seen.settled else None
+        if in_force.wanted is None and self._first is None and not in_force.strange and not in_force.unverified:
+            self._first = in_force.crc
+        return in_force if in_force.settled else None
 
-    def _strange(self, seen: InForce) -> str:
-        """What is wrong with the table in force; empty: nothing."""
-        wanted = seen.wanted if seen.wanted is not None else self._first
-        here = f"bank {seen.bank} has CRC {seen.crc:08X}"
-        whose = f"that of {seen.unverified}, which was never verified" if seen.unverified else ""
-        if wanted is not None and seen.crc != wanted:
+    def _problem(self, in_force: InForce) -> str:
+        """Return what is wrong with the table in force; empty: nothing."""
+        wanted = in_force.wanted if in_force.wanted is not None else self._first
+        here = f"bank {in_force.bank} has CRC {in_force.crc:08X}"
+        whose = f"that of {in_force.unverified}, which was never verified" if in_force.unverified else ""
+        if wanted is not None and in_force.crc != wanted:
             text = f"somebody else changed the compensation in force: {here}, expected is {wanted:08X}"
             return f"{text}; it is {whose}" if whose else text
         if whose:
             return f"the compensation in force is unverified: {here}, {whose}"
-        return f"{STRANGE_TABLE} is in force: {here}" if seen.strange else ""
+        return f"{STRANGE_TABLE} is in force: {here}" if in_force.strange else ""
 
-    async def _judge(self, seen: InForce) -> None:
-        text = self._strange(seen)
+    async def _judge(self, in_force: InForce) -> None:
+        text = self._problem(in_force)
         if not text:
             self._show(None)
             return
-        if self._told is not None and self._told[0] == seen.crc:
+        if self._reported is not None and self._reported[0] == in_force.crc:
             return
-        log.error("the table in force is not ours", bank=seen.bank, crc=f"{seen.crc:08X}", why=text)
-        self._show((seen.crc, f"{CODE}: {text} - {REMEDY}"))
+        log.error("the table in force is not ours", bank=in_force.bank, crc=f"{in_force.crc:08X}", why=text)
+        self._show((in_force.crc, f"{CODE}: {text} - {REMEDY}"))
         await self._alarms.alarm({"code": CODE, "what": text, "remedy": REMEDY, "at_utc": self._clock.utc().isoformat()})
 
-    def _show(self, told: tuple[int, str] | None) -> None:
-        if told == self._told:
+    def _show(self, report: tuple[int, str] | None) -> None:
+        if report == self._reported:
             return
-        if self._told is not None:
-            self._attention.remove(self._told[1])
-        if told is not None:
-            self._attention.append(told[1])
-        self._told = told
+        if self._reported is not None:
+            self._attention.remove(self._reported[1])
+        if report is not None:
+            self._attention.append(report[1])
+        self._reported = report
         self._changed()

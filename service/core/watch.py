@@ -1,4 +1,4 @@
-"""Watchers of the running job: the board, and with it the page; and the broker."""
+"""Watchers of the running job: the board (and with it the page) and the broker."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOOK_S = 5.0
 
 
 class BoardWatch:
-    """Writes on the board, and says that there is something to tell."""
+    """Updates the board, and reports the change."""
 
     def __init__(self, board: Board, changed: Callable[[], None]) -> None:
         self._board, self._changed = board, changed
@@ -42,30 +42,30 @@ class BoardWatch:
 
 
 class VerifiedWatch:
-    """Looks what measured the table in force, and tells the broker and the page when that has changed: any process may roll back."""
+    """Watches which measurement verified the table in force, and updates broker and page when that changes: any process may roll back."""
 
     def __init__(self, look: Callable[[], VerifiedBy], publisher: Publisher | None, clock: Clock, changed: Callable[[], None]) -> None:
         self._look, self._publisher, self._clock, self._changed = look, publisher, clock, changed
-        self._told: VerifiedBy | None = None
+        self._published: VerifiedBy | None = None
 
     async def run(self) -> None:
-        """Look for ever. A database that does not answer is asked again."""
+        """Watch forever. A database that does not answer is asked again."""
         while True:
             with suppress(StoreError):
-                self._tell(await asyncio.to_thread(self._look))
+                self._publish(await asyncio.to_thread(self._look))
             await self._clock.sleep(LOOK_S)
 
-    def _tell(self, known: VerifiedBy) -> None:
-        if known == self._told:
+    def _publish(self, known: VerifiedBy) -> None:
+        if known == self._published:
             return
-        self._told = known
+        self._published = known
         if self._publisher is not None:
             self._publisher.set_verified(known.as_doc())
         self._changed()
 
 
-class StateTeller:
-    """Keeps the retained state message true."""
+class StatePublisher:
+    """Keeps the retained state message up to date."""
 
     def __init__(self, publisher: Publisher, clock: Clock) -> None:
         self._publisher = publisher
@@ -76,7 +76,7 @@ class StateTeller:
         self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
 
     def job_progress(self, progress: Progress) -> None:
-        """Nothing: the state is retained, so every change is a write in the broker. Progress is for the page."""
+        """Do nothing: the state is retained, so every change is a write in the broker. Progress is for the page."""
 
     def job_ended(self, doc: Doc | None) -> None:
         """The check ended."""

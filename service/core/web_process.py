@@ -1,6 +1,6 @@
-"""The web process as the core sees it: started, informed, heard, ended; and started again when it is gone or hangs.
+"""The web process from the core's side: start it, send it updates, receive requests, end it; restart it when it has ended or hangs.
 
-Nothing that happens to it may hold up or end the core: it is told without waiting, and what it says is checked before it is believed.
+Nothing in it may block or end the core: messages are sent without waiting, and what it sends is checked before use.
 """
 
 from __future__ import annotations
@@ -36,57 +36,57 @@ from abbe.service.channel.messages import (
     from_web,
 )
 from abbe.service.channel.wire import Wire
-from abbe.service.children import python_words
+from abbe.service.children import python_command
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Orders
 from abbe.service.domain.recorded_path import RecordedPath
 from abbe.service.errors import AbbeError, ChannelBroken
 
-# Shows the web process what the running path reads, twenty times a second, and never waits for it.
+# Sends the web process the samples of the running path, twenty times a second, and never waits for it.
 
 
 FRAME_S = 0.05
-"""Between two messages: 20 Hz, about 50 samples each at 1 kHz."""
+"""Time between two messages, s: 20 Hz, about 50 samples each at 1 kHz."""
 NO_PATH = LivePath("path", RecordedPath())
 
 
 async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
-    """Tell every path and what it reads, until cancelled. A web process that does not read in time misses samples, and the disk none."""
-    live.stretches()  # what came in without a listener is old: it would be seconds of samples at once
-    told = 0
+    """Send every path and its samples, until cancelled. A web process that reads too slowly misses samples; the disk misses none."""
+    live.stretches()  # samples without a listener are old: seconds of them at once
+    sent = 0
     while True:
         await live.active.wait()
         while live.path is not None:
             if not wire.is_full:
-                told = _told(wire, live, told)
+                sent = _send_path(wire, live, sent)
                 for part in live.stretches():
                     wire.send(_message(part, clock))
             await asyncio.sleep(FRAME_S)
-        if told:
+        if sent:
             wire.send(NO_PATH)
-            told = 0
+            sent = 0
 
 
-def _told(wire: Wire, live: LiveFeed, told: int) -> int:
+def _send_path(wire: Wire, live: LiveFeed, sent: int) -> int:
     path = live.path
-    if path is None or path.number == told:
-        return told
+    if path is None or path.number == sent:
+        return sent
     wire.send(LivePath("path", path))
     return path.number
 
 
 def _message(part: Stretch, clock: Clock) -> LiveSamples:
-    # The instant at which the samples came in was read off the monotonic clock; a browser knows only the calendar's.
+    # The samples are stamped by the monotonic clock; a browser knows only the wall clock.
     ago_s = clock.monotonic_s() - part.host_s
     arrived_ms = clock.utc().timestamp() * 1e3 - ago_s * 1e3
     return LiveSamples("samples", part.path, part.first, arrived_ms, b64encode(part.values_um.astype("<f4").tobytes()).decode("ascii"))
 
 
-# How much memory the page's process gets: a page that grows without end must not take the process with it that moves the machine.
+# Memory limit of the page's process: a page that grows without bound must not take down the process that moves the machine.
 #
-# Kept by the kernel for that process alone, from outside: the page cannot lift it. Should the whole service run into its own limit
-# (``MemoryMax`` of the unit), or the computer out of memory, the kernel takes the page first.
+# The kernel enforces it from outside: the page cannot lift it. If the whole service reaches its own limit (``MemoryMax`` of the unit),
+# or the computer runs out of memory, the kernel kills the page first.
 
 
 try:
@@ -95,28 +95,23 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 
-FIRST_TO_GO = 900
-"""As ``/proc/PID/oom_score_adj`` has it: 0 is the core's, 1000 the most there is."""
+OOM_SCORE_ADJ = 900
+"""Value of ``/proc/PID/oom_score_adj``: 0 is the core's, 1000 the maximum."""
 
 
-def keep_within(pid: int, memory_mb: int) -> None:
-    """Bound what a process can allocate.
+def limit_memory(pid: int, memory_mb: int) -> None:
+    """Limit the memory that a child process can allocate.
 
-    Parameters
-    ----------
-    pid : int
-        A child of ours.
-    memory_mb : int
-        Writable private memory that it may ask for, MiB; beyond it gets none.
+    ``memory_mb``: writable private memory, MiB; beyond it allocations fail.
     """
-    with suppress(OSError):  # not everywhere there is such a file
-        Path(f"/proc/{pid}/oom_score_adj").write_text(f"{FIRST_TO_GO}\n", encoding="ascii")
+    with suppress(OSError):  # the file does not exist everywhere
+        Path(f"/proc/{pid}/oom_score_adj").write_text(f"{OOM_SCORE_ADJ}\n", encoding="ascii")
     if not hasattr(resource, "prlimit"):
         return
     try:
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory_mb << 20, memory_mb << 20))
     except ProcessLookupError:
-        pass  # gone already, as its end will tell
+        pass  # gone already; its end is handled elsewhere
     except (OSError, ValueError) as error:
         log.warning("the page's memory has no limit of its own", cause=str(error))
 
@@ -124,11 +119,11 @@ def keep_within(pid: int, memory_mb: int) -> None:
 log = structlog.get_logger("abbe.web")
 
 PERIOD_S, SHORTEST_S = 1.0, 0.2
-"""The page hears of the core so often at least, and of its progress no more often."""
+"""Longest and shortest time between two messages to the page, s."""
 PAUSE_S, LONGEST_PAUSE_S, GOOD_LIFE_S = 0.1, 30.0, 30.0
-"""Before the next start, doubled each time up to the longest; after a good life from the beginning."""
+"""Pause before a restart, doubled each time up to the longest; a process that lived this long resets it, s."""
 START_S, HANG_S = 60.0, 20.0
-"""A process that does not serve after this, or says nothing for this long, is ended."""
+"""Time limits to start serving, and without any message, s: after them the process is ended."""
 GOODBYE_S = 1.2
 PASSED_ON = frozenset({"ABBE_AUDIT_FOLDER"})
 WITHHELD = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"})
@@ -140,33 +135,33 @@ class WebProcess:
     Parameters
     ----------
     begin : Begin
-        What it has to know.
+        Its first message.
     listening : socket
-        Where it answers; it stays open here, so that a request waits while the process is started again.
-    moment : callable
-        How things stand, given the number of restarts.
-    book : JobRegistry
-        Is asked for what people want.
+        The bound socket; it stays open here, so that requests wait while the process restarts.
+    snapshot : callable
+        Returns the snapshot to send, given the number of restarts.
+    jobs : JobRegistry
+        Takes requests for jobs.
     clock : Clock
         Monotonic time.
     live : LiveFeed, optional
-        What the running path reads.
+        Samples of the running path.
     orders : Orders, optional
-        Is asked for what people order of tables; None: nothing can be ordered.
+        Takes orders for tables; None: there are none.
     """
 
     def __init__(
         self,
         begin: Begin,
         listening: socket.socket,
-        moment: Callable[[int], Snapshot],
-        book: JobRegistry,
+        snapshot: Callable[[int], Snapshot],
+        jobs: JobRegistry,
         clock: Clock,
         live: LiveFeed | None = None,
         orders: Orders | None = None,
     ) -> None:
         self._live, self._orders = live, orders
-        self._begin, self._listening, self._moment, self._book, self._clock = begin, listening, moment, book, clock
+        self._begin, self._listening, self._snapshot, self._jobs, self._clock = begin, listening, snapshot, jobs, clock
         self.restarts = 0
         self._changed, self._ending = asyncio.Event(), asyncio.Event()
         self._child: asyncio.subprocess.Process | None = None
@@ -178,7 +173,7 @@ class WebProcess:
         self._changed.set()
 
     def stop(self) -> None:
-        """`run` ends now, and the process with it."""
+        """End the process and let `run` return."""
         self._ending.set()
 
     async def run(self) -> None:
@@ -187,9 +182,9 @@ class WebProcess:
         while not self._ending.is_set():
             begun_s = self._clock.monotonic_s()
             try:
-                await self._one_life()
+                await self._run_once()
             except (ChannelBroken, OSError) as trouble:
-                log.error("the web process is ended", cause=str(trouble))
+                log.error("web process failed", cause=str(trouble))
             if self._ending.is_set():
                 return
             pause_s = PAUSE_S if self._clock.monotonic_s() - begun_s > GOOD_LIFE_S else pause_s
@@ -200,7 +195,7 @@ class WebProcess:
                     await self._ending.wait()
             pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
-    async def _one_life(self) -> None:
+    async def _run_once(self) -> None:
         ours, theirs = socket.socketpair()
         try:
             self._up, self._heard_s = False, self._clock.monotonic_s()
@@ -211,7 +206,7 @@ class WebProcess:
         finally:
             theirs.close()
         wire = await Wire.over(ours)
-        tasks = [asyncio.create_task(work, name=f"web {name}") for name, work in self._works(wire)]
+        tasks = [asyncio.create_task(work, name=f"web {name}") for name, work in self._loops(wire)]
         ending = asyncio.create_task(self._ending.wait(), name="web ending")
         try:
             wire.send(self._begin)
@@ -225,21 +220,21 @@ class WebProcess:
             if task.done() and not task.cancelled():
                 task.result()
 
-    def _works(self, wire: Wire) -> list[tuple[str, Coroutine[None, None, None]]]:
+    def _loops(self, wire: Wire) -> list[tuple[str, Coroutine[None, None, None]]]:
         show = [] if self._live is None else [("show", show_live(wire, self._live, self._clock))]
-        return [("tell", self._tell(wire)), ("hear", self._hear(wire)), *show]
+        return [("send", self._send_updates(wire)), ("receive", self._receive(wire)), *show]
 
     async def _started(self, theirs: socket.socket) -> asyncio.subprocess.Process:
-        # Nothing secret on the command line; and in its environment neither the broker's password nor systemd's address.
+        # No secrets on the command line; in its environment neither the broker's password nor systemd's address.
         env = {k: v for k, v in os.environ.items() if k in PASSED_ON or not (k.startswith("ABBE_") or k in WITHHELD)}
         ends = (theirs.fileno(), self._listening.fileno())
-        words = python_words("abbe.service.web.process", *ends)
-        child = await asyncio.create_subprocess_exec(*words, stdin=subprocess.DEVNULL, pass_fds=ends, env=env)
-        keep_within(child.pid, self._begin.memory_mb)
+        command = python_command("abbe.service.web.process", *ends)
+        child = await asyncio.create_subprocess_exec(*command, stdin=subprocess.DEVNULL, pass_fds=ends, env=env)
+        limit_memory(child.pid, self._begin.memory_mb)
         return child
 
     async def _end(self, child: asyncio.subprocess.Process) -> None:
-        """It has read the end of the channel, and ends by itself; one that does not is killed. It holds nothing that could be lost."""
+        """Wait for the process to end, since its channel has closed; kill it after `GOODBYE_S`. It holds nothing that could be lost."""
         if self._up:
             with suppress(TimeoutError):
                 async with asyncio.timeout(GOODBYE_S):
@@ -249,25 +244,25 @@ class WebProcess:
                 child.kill()
         await child.wait()
 
-    async def _tell(self, wire: Wire) -> None:
-        told: tuple[object, ...] | None = None
+    async def _send_updates(self, wire: Wire) -> None:
+        sent: tuple[object, ...] | None = None
         while True:
             self._changed.clear()
             if not wire.is_full:
-                jobs = self._book.seen()
-                if jobs != told:
-                    told = jobs
+                jobs = self._jobs.latest()
+                if jobs != sent:
+                    sent = jobs
                     wire.send(Jobs("jobs", jobs))
-                wire.send(self._moment(self.restarts))
+                wire.send(self._snapshot(self.restarts))
             silent_s = self._clock.monotonic_s() - self._heard_s
             if silent_s > (HANG_S if self._up else START_S):
-                raise ChannelBroken(f"the web process has said nothing for {silent_s:.0f} s")
+                raise ChannelBroken(f"the web process has been silent for {silent_s:.0f} s")
             await asyncio.sleep(SHORTEST_S)
             with suppress(TimeoutError):
                 async with asyncio.timeout(PERIOD_S - SHORTEST_S):
                     await self._changed.wait()
 
-    async def _hear(self, wire: Wire) -> None:
+    async def _receive(self, wire: Wire) -> None:
         while (body := await wire.receive()) is not None:
             message = from_web(body)
             self._heard_s = self._clock.monotonic_s()
@@ -279,7 +274,7 @@ class WebProcess:
                     log.info("page up", restarts=self.restarts)
                 case StartJob() | SteerJob() | ConfirmPrompt() | RollBack() | PushNow():
                     answer = await self._answered(message)
-                    wire.send(Jobs("jobs", self._book.seen()))  # first: who gets the number of a job can ask for it
+                    wire.send(Jobs("jobs", self._jobs.latest()))  # first: a client that gets a job's number can ask for it
                     wire.send(answer)
                 case Heartbeat():
                     pass
@@ -288,13 +283,13 @@ class WebProcess:
         try:
             match message:
                 case StartJob():
-                    return await self._book.start(message)
+                    return await self._jobs.start(message)
                 case SteerJob():
-                    return await self._book.steer(message)
+                    return await self._jobs.steer(message)
                 case ConfirmPrompt():
-                    return await self._book.done_by_hand(message)
+                    return await self._jobs.done_by_hand(message)
             if self._orders is None:
                 return Answer("answer", message.request, "conflict", "this service takes no orders of tables", "")
             return await (self._orders.rollback(message) if isinstance(message, RollBack) else self._orders.push(message))
-        except AbbeError as error:  # the store does not answer: then no user is known
+        except AbbeError as error:  # the store does not answer, so no user is known
             return Answer("answer", message.request, "busy", str(error)[:1000], "")

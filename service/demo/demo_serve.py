@@ -18,7 +18,7 @@ from typing import TypeVar
 
 from abbe.drivers.links.shielded import run_to_end
 from abbe.service.campaigns.measure import measure
-from abbe.service.children import python_words
+from abbe.service.children import python_command
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import commission
 from abbe.service.compensation.commission_levels import commission_levels
@@ -166,7 +166,7 @@ async def served(
     log = machine_file.with_name("service.log")
     with log.open("wb") as out_log:
         process = await asyncio.create_subprocess_exec(
-            *python_words("abbe.service.cli", "serve", machine_file),
+            *python_command("abbe.service.cli", "serve", machine_file),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=out_log,
             stderr=out_log,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.drivers.links.shielded import run_to_end
-from abbe.service.children import python_words
+from abbe.service.children import python_command
 from abbe.service.errors import AbbeError
 
 READY_S = 30.0
@@ -48,7 +48,7 @@ async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]
         They did not start; the message quotes the child's last line.
     """
     process = await asyncio.create_subprocess_exec(
-        *python_words("abbe.simulators", *args, "--watch-stdin"),
+        *python_command("abbe.simulators", *args, "--watch-stdin"),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
@@ -101,7 +101,7 @@ async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
     SimulatorError
         The command failed; the message quotes its output.
     """
-    command = python_words("abbe.simulators", "truth", *args, "--arrows")
+    command = python_command("abbe.simulators", "truth", *args, "--arrows")
     if bank is not None:
         command += ["--bank", str(bank)]
     process = await asyncio.create_subprocess_exec(

@@ -1,1 +1,1 @@
-"""What the service does as a job: a check, a guided campaign, an investigation, and what it looks for at start."""
+"""Work of the service as jobs: a check, a guided campaign, an investigation, and the recovery at start."""

@@ -1,4 +1,4 @@
-"""Recovery before the first check, and whenever a push was left open: interrupted runs, an unfinished push."""
+"""Recovery before the first check, and whenever a push was left open: close interrupted runs, finish an open push."""
 
 from __future__ import annotations
 
@@ -14,29 +14,24 @@ from abbe.service.storage.store import Store
 
 
 async def recover_at_start(store: Store, site: Site) -> str | None:
-    """Take over interrupted runs; finish a push that is open, for which the controller is needed, and only for that.
-
-    Returns
-    -------
-    str or None
-        What was done; None if nothing was open.
+    """Close interrupted runs; finish an open push, the only case that opens the controller. Return what was done; None: nothing was open.
 
     Raises
     ------
     AbbeError, DriverError
-        As of `abbe.service.compensation.recover.recover`: the controller cannot be reached, or a person has to look.
+        As `abbe.service.compensation.recover.recover`: the controller cannot be reached, or a person has to look.
     """
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
-    told = [run.text for run in runs]
+    done = [run.text for run in runs]
     if await push_is_open(store, site.name, site.control):
         with lock_machine(site.urls.cnc):
-            async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), report=told.append):
+            async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), report=done.append):
                 pass
-    return "; ".join(told) or None
+    return "; ".join(done) or None
 
 
 async def push_is_open(store: Store, machine: str, control: str = "") -> bool:
-    """Whether the last push into a machine's control is on its way, waits for its way back, or needs a person: by its journal alone.
+    """Return whether the last push into a control is under way, waits for its rollback, or needs a person: by its journal alone.
 
     Raises
     ------

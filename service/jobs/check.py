@@ -1,4 +1,4 @@
-"""The unattended check: measure a recipe, judge its figures against the machine file's limits with their uncertainty."""
+"""The unattended check: measure a recipe, and judge its figures with their uncertainty against the machine file's limits."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ async def run_check(
 ) -> CheckResult:
     """Open the devices, measure the recipe, close them, judge.
 
-    ``control`` pauses, resumes, stops or aborts the measurement; ``live`` is shown what its paths read.
+    ``control`` pauses, resumes, stops or aborts the measurement; ``live`` gets the samples of its paths.
 
     Raises
     ------
     AbbeError, DriverError
-        One cause, one remedy; the run in hand is closed as failed and the axes are stopped.
+        One cause, one remedy; the current run is closed as failed and the axes are stopped.
     """
     clock = clock or SystemClock()
     started, start_s = clock.utc(), clock.monotonic_s()
     site = site_of(config)
     plan = recipe_plan(recipe, site.machine)
-    # With the machine: services that share a database check at the same second, and a campaign's name is there once.
+    # With the machine's name: services that share a database may check in the same second, and campaign names are unique.
     plan = CampaignPlan(f"{plan.name} {config.name} {started:%Y-%m-%d %H:%M:%S}", plan.tests)
     with lock_machine(site.urls.cnc):
         async with recovered_session(store, site) as session:
@@ -69,7 +69,7 @@ def judged(config: MachineFile, runs: list[dict[str, Any]], campaign: str, start
     Raises
     ------
     MeasurementFault
-        They are none: a body diagonal is missing, a run was not measured to its end.
+        The runs are no complete check: a body diagonal is missing, or a run was not measured to its end.
     """
     rows = figure_rows(figures(runs))
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
@@ -98,7 +98,7 @@ def _name(key: str) -> str:
 
 
 def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:
-    """Instruments of these figures that no certificate carried when the check began: they cannot say what is within limits."""
+    """Return a sentence for each instrument of these figures whose certificate had ended: it cannot prove that they are within limits."""
     roles = {MEASURED_WITH[name] for name in names if name in MEASURED_WITH}
     ended = ended_certificates(site_of(config), started.astimezone(UTC).date(), roles)
     return [f"the certificate of the {INSTRUMENTS[role]} ended on {day}" for role, day in ended.items()]
@@ -110,8 +110,8 @@ def _air(runs: list[dict[str, Any]], window: tuple[float, float]) -> list[str]:
 
 
 def _outside(runs: list[dict[str, Any]], window: tuple[float, float]) -> float | None:
-    """The air temperature farthest outside of the window, None if all are inside or none was measured."""
+    """Return the air temperature farthest outside the window; None if all are inside or none was measured."""
     low, high = window
-    seen = [float(t) for r in runs for t in r["columns"].get("temp_air_C", [])]
-    worst = max(seen, key=lambda t: max(low - t, t - high), default=None)
+    temperatures = [float(t) for r in runs for t in r["columns"].get("temp_air_C", [])]
+    worst = max(temperatures, key=lambda t: max(low - t, t - high), default=None)
     return worst if worst is not None and not low <= worst <= high else None

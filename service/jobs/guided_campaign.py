@@ -1,6 +1,6 @@
-"""The full campaign for a person who is led through its set-ups: measured, solved, proposed.
+"""The guided full campaign: it leads a person through its set-ups, measures, solves, proposes.
 
-Never approves, and writes no table but what an interrupted push left to be taken back.
+It never approves, and writes a table only to roll back an interrupted push.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import Session
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.jobs.investigate import NO, InvestigationContext, made_of, promise_words
+from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, make_proposal, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.needed import check_devices, needed_by
@@ -29,29 +29,29 @@ SOLVING = "all is measured, and nothing moves while it is solved"
 
 
 def is_full(recipe: str, names: tuple[str, ...]) -> bool:
-    """Whether a recipe is one of these full campaigns; with a rate of the ball-bar only the shipped one: a file has its own."""
+    """Return whether a recipe is one of these full campaigns. Only the built-in one takes a rate of the ball-bar: a file has its own."""
     name, rate_hz = split_recipe_name(recipe)
     return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
 
 
 async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str) -> JobOutcome:
-    """Measure the plan under its name, solve it and propose. ``context.control.prompts`` asks a person at the console to mount.
+    """Measure the plan under its name, solve it and propose. ``context.control.prompts`` asks the person at the console to mount.
 
     Parameters
     ----------
     source : RecipeSource
-        What the plan can be made from again.
+        Source of the plan, stored for a resumption.
     by : str
-        Who proposes: where two people are needed another one has to approve.
+        The proposer: where two people are required, another person has to approve.
 
     Raises
     ------
     Stopped, Aborted
-        Asked for. What is complete stays; a note says how to go on.
+        A person asked for it. Completed runs are kept; a note says how to resume.
     TableMismatch
-        The runs would be measured without the table in force, or it cannot be read; nothing was measured.
+        The table in force is switched off or unreadable; nothing was measured.
     AbbeError, DriverError, OSError, ArithmeticError, ValueError
-        A device or the measurement failed; the same.
+        A device or the measurement failed; completed runs are kept.
     """
     name = context.plan.name
     context.control.now(State.RUNNING)
@@ -59,12 +59,12 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
     try:
         check_certificates(context.site)
         _check_not_ended(context)
-    except NO as no:
+    except REFUSALS as no:
         return JobOutcome("ended", f"no proposal: {no}")
     await _measured(context, source)
     try:
         return await _proposed(context, by)
-    except NO as no:
+    except REFUSALS as no:
         return JobOutcome("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
     except BaseException as error:
         error.add_note(f"campaign {name!r} is measured: `abbe comp propose MACHINE.toml {name!r}` solves it and proposes")
@@ -87,7 +87,7 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
                 await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options)
             except BaseException as error:
                 error.add_note(
-                    f"what is complete of campaign {name!r} stays: `abbe measure MACHINE.toml --resume {name!r}` goes on, then "
+                    f"completed runs of campaign {name!r} are kept: `abbe measure MACHINE.toml --resume {name!r}` resumes, then "
                     f"`abbe comp propose MACHINE.toml {name!r}`"
                 )
                 raise
@@ -101,22 +101,22 @@ async def _proposed(context: InvestigationContext, by: str) -> JobOutcome:
         context.control.check()
         check_promise(promised, context.site.limits)
 
-    made = await made_of(context, context.plan.name, agree, by)
+    made = await make_proposal(context, context.plan.name, agree, by)
     solution, against = made.proposed.solution_id, made.proposed.reasons
     if against:
         return JobOutcome("ended", f"proposal {made.number} cannot be approved: {'; '.join(against)}", solution, made.number)
-    return JobOutcome("proposed", await asyncio.to_thread(promise_words, context.store, made), solution, made.number)
+    return JobOutcome("proposed", await asyncio.to_thread(promise_text, context.store, made), solution, made.number)
 
 
 def _check_not_ended(context: InvestigationContext) -> None:
-    """No hour is measured for a table that no certificate carries any more."""
+    """Refuse to measure for a table if a certificate has ended."""
     ended = certificates(context.site, context.clock.utc().date(), needed_by(context.plan).first)
     if ended:
         raise TableRefused("; ".join(ended), "have it calibrated, then start again; nothing was measured")
 
 
 async def _check_table_acts(session: Session) -> None:
-    """The same of a table in force that is switched off: nothing could be proposed from what is measured then."""
+    """Refuse to measure if the table in force is switched off: no proposal could follow from the runs."""
     base = await read_base(session.controller)
     status = await session.controller.status()
     if base.tables is not None and not status.compensation_on:
@@ -125,7 +125,7 @@ async def _check_table_acts(session: Session) -> None:
 
 
 class _PromptedPerson:
-    """Passes on what the fixture at the console asks, with the place where the spindle stands; a stop ends the wait."""
+    """Forwards the fixture's prompts, with the spindle's position; a stop ends the wait."""
 
     def __init__(self, control: Control) -> None:
         self._control = control
@@ -139,5 +139,5 @@ class _PromptedPerson:
 
 
 def named_now(context: InvestigationContext, recipe: str) -> InvestigationContext:
-    """The bench with its plan named as campaigns of this recipe are: recipe, machine, and when."""
+    """Return the context with its plan named as campaigns of this recipe are: recipe, machine, and time."""
     return replace(context, plan=replace(context.plan, name=f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"))

@@ -1,7 +1,7 @@
-"""What the service does about an alarm by itself: measure the full campaign, solve, look for the effect, propose. Never approve or write.
+"""The service's own work for an alarm: measure the full campaign, solve, search for the effect, propose. It never approves or writes.
 
-Each step is a line of the alarm before the next begins, so that an interrupted investigation goes on where its lines end. What speaks
-against tables - an effect that no table takes out, nothing that the catalogue knows, too little to gain - is its text, no error.
+Each step becomes a line of the alarm before the next begins, so that an interrupted investigation resumes after its last line. Reasons
+against tables - an effect that no table corrects, an unknown cause, too small a gain - end it with a text, not with an error.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import TRIES, Alarm, AlarmKind, Doc, next_step
 
 BESIDE = 0.5
-"""What is left for another remedy than a table may be at most this share of what tables promise; above it that remedy comes first."""
-NO = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
-"""Answers, not faults: they are the alarm's text, and trying again would give the same."""
+"""Largest share of the tables' promised gain that may need another remedy; above it that remedy comes first."""
+REFUSALS = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
+"""Answers, not faults: they become the alarm's text, and another try would give the same."""
 
 Note = Callable[[AlarmKind, Doc], Awaitable[Alarm]]
-"""Writes a line of the alarm; gives the alarm with it."""
+"""Writes a line of the alarm; returns the alarm including it."""
 
 
 @dataclass(frozen=True)
 class InvestigationContext:
-    """What an investigation works with. ``plan``: the full campaign, named anew for each try; ``live``: is shown what its paths read."""
+    """Context of an investigation. ``plan``: the full campaign, renamed for each try; ``live``: gets the samples of its paths."""
 
     site: Site
     store: Store
@@ -63,28 +63,28 @@ class InvestigationContext:
     clock: Clock
     progress: ProgressSink
     control: Control = field(default_factory=Control)
-    """Who may pause and stop it."""
+    """Pauses and stops the investigation."""
     live: LiveFeed | None = None
 
 
 async def investigate(context: InvestigationContext, alarm: Alarm, note: Note) -> None:
-    """Take an alarm as far as it goes: to a proposal that waits for approval, or to the reason why there is none.
+    """Take an alarm as far as possible: to a proposal that waits for approval, or to the reason why there is none.
 
     Raises
     ------
     MachineInUse
-        Another process has the machine: no line was written for that, and the try does not count.
+        Another process has the machine: no line was written, and the try does not count.
     Stopped, Aborted
-        Asked for.
+        A person asked for it.
     AbbeError, DriverError, OSError, ArithmeticError, ValueError
-        A device or the measurement failed. Lines that were written stay; the next call goes on behind them.
+        A device or the measurement failed. Written lines stay; the next call resumes after them.
     """
     context.control.now(State.RUNNING)
     try:
         while (step := next_step(alarm)) is not None:
             await context.control.gate()
             alarm = await _STEPS[step](context, alarm, note)
-    except NO as no:
+    except REFUSALS as no:
         await note(AlarmKind.ENDED, {"text": f"no proposal: {no}", "code": no.code})
 
 
@@ -92,12 +92,12 @@ async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> 
     tries = sum(s.kind is AlarmKind.BEGUN for s in alarm.work) + 1
     if tries > TRIES:
         return await note(AlarmKind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
-    again = "" if tries == 1 else ", anew: the last try was not completed"
+    again = "" if tries == 1 else " again: the last try was not completed"
     plan = replace(context.plan, name=f"alarm {alarm.number} {context.clock.utc():%Y-%m-%d %H:%M:%S}")
     site, options = context.site, MeasureOptions(control=context.control, part=True, live=context.live)
     with lock_machine(site.urls.cnc):
         async with recovered_session(context.store, site) as session:
-            # Only now: while another process has the machine nothing of this try has begun.
+            # Only now: while another process has the machine, this try has not begun.
             await note(AlarmKind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
             plan = paced(plan, site.max_feed_mm_min)
             ids = await measure(session, context.store, site, plan, progress=context.progress, clock=context.clock, options=options)
@@ -107,21 +107,21 @@ async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> 
 async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     stopped = threading.Event()
 
-    def tell(progress: Progress) -> None:
+    def report(progress: Progress) -> None:
         if stopped.is_set() or context.control.stopping:
-            raise Stopped("the search was stopped", "it is begun anew")
+            raise Stopped("the search was stopped", "it will start again")
         context.progress(progress)
 
     try:
-        number, finding = await asyncio.to_thread(_search, replace(context, progress=tell), _campaign(alarm))
+        number, finding = await asyncio.to_thread(_search, replace(context, progress=report), _campaign(alarm))
     except asyncio.CancelledError:
-        stopped.set()  # the thread ends at its next word: a service that stops does not wait for the rest of the search
+        stopped.set()  # the thread ends at its next report: a service that stops does not wait for the rest of the search
         raise
     _, word, text = verdict_of(finding)
     names = ", ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
     changes = changed_words(finding.changed)
     doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {text}", changes) if t), "discovery": number}
-    return await note(AlarmKind.DISCOVERED, doc | _against(finding, context.store, context.site.name))
+    return await note(AlarmKind.DISCOVERED, doc | _objections(finding, context.store, context.site.name))
 
 
 def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, Finding]:
@@ -133,10 +133,10 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, F
     return journal.id, discover(job, journal, search, context.progress)
 
 
-def _against(finding: Finding, store: Store, machine: str) -> Doc:
-    """Why a table could be the wrong answer to a finding (``against``, empty: it is not), and how much that is (``rms_um``, of readings).
+def _objections(finding: Finding, store: Store, machine: str) -> Doc:
+    """Return why a table could be the wrong answer to a finding (``against``; empty: it is not), and by how much (``rms_um``, of readings).
 
-    What entered the machine's model is taken out of the readings before tables are made; what is named without that proof is in them.
+    Effects of the machine's model are removed from the readings before tables are made; effects named without that proof remain in them.
     """
     gap = finding.gaps.get("identify")
     rms_um = 0.0 if gap is None else math.sqrt(max(gap.before_um**2 - gap.floor_um**2, 0.0))
@@ -160,17 +160,17 @@ async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> 
         check_promise(promised, context.site.limits)
         check_cause(promised, known.doc["against"], float(known.doc["rms_um"]))
 
-    made = await made_of(context, _campaign(alarm), agree)
-    doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_words, context.store, made)}
+    made = await make_proposal(context, _campaign(alarm), agree)
+    doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_text, context.store, made)}
     if made.proposed.reasons:
         return await note(AlarmKind.ENDED, doc | {"text": f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"})
     return await note(AlarmKind.PROPOSED, doc | {"beside": known.doc["against"]})
 
 
-async def made_of(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
-    """Solve a measured campaign and store what follows as a proposal, on the table that the controller has in force.
+async def make_proposal(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
+    """Solve a measured campaign and store the result as a proposal, based on the controller's table in force.
 
-    ``agree`` and ``by`` as in `proposals.make`, whose errors are raised as well as those of a device.
+    ``agree`` and ``by``, and the errors besides a device's, are those of `proposals.make`.
     """
     site, store = context.site, context.store
     with lock_machine(site.urls.cnc):
@@ -181,20 +181,20 @@ async def made_of(context: InvestigationContext, campaign: str, agree: Callable[
 
 
 def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
-    """Refuse tables where what no table takes out is not small beside what they promise.
+    """Refuse tables if the part that no table can correct is not small against their promised gain.
 
     Raises
     ------
     TableRefused
-        The readings hold more than `BESIDE` of the promised gain that the tables' model does not explain.
+        More than `BESIDE` of the promised gain in the readings is not explained by the tables' model.
     """
     gain_um = (promised.before_mm - promised.after_mm) * 1e3
     if against and rms_um > BESIDE * gain_um:
         raise TableRefused(f"{rms_um:.1f} µm rms of the readings are no matter for tables, which promise {gain_um:.1f} µm", against)
 
 
-def promise_words(store: Store, made: StoredProposal) -> str:
-    """A proposal that waits, as a sentence: what it promises with U (k = 2), its largest change, and what is not in the tables."""
+def promise_text(store: Store, made: StoredProposal) -> str:
+    """Return a proposal as a sentence: its promise with U (k = 2), its largest change, and what is not in the tables."""
     p = made.proposed.predicted
     gain, expanded = (p.before_mm - p.after_mm) * 1e3, 2e3 * p.u_model_mm
     left_out = "".join(f"; not in the tables: {line}" for line in made.proposed.not_for_tables)

@@ -1,4 +1,4 @@
-"""Where the broker is: ``mqtt://host:port`` or ``mqtts://host:port``, with ``user:password@`` if the broker wants to know."""
+"""Address of the MQTT broker: ``mqtt://host:port`` or ``mqtts://host:port``, with ``user:password@`` if the broker requires it."""
 
 from __future__ import annotations
 
@@ -15,20 +15,16 @@ class Broker:
 
     Parameters
     ----------
-    host : str
-        Name or address.
-    port : int
-        TCP port.
     tls : bool
         Whether to encrypt, and to check the broker's certificate.
     username : str or None
-        User name, if the broker wants one.
+        User name, if the broker requires one.
     password : str or None
         Never shown in a ``repr`` or in an error.
     ca : str
-        PEM file of the authority that signed the broker's certificate; empty: those this computer trusts.
+        PEM file of the authority that signed the broker's certificate; empty: those that this computer trusts.
     certificate, key : str
-        PEM files by which we prove who we are, if the broker asks for a certificate; empty: none.
+        PEM files of the client's certificate, if the broker requires one; empty: none.
     """
 
     host: str
@@ -47,12 +43,12 @@ class Broker:
         return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}"
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """Return what the broker is checked by: authority, host name, TLS 1.2 or newer. None without TLS.
+        """Return the TLS context that checks the broker: authority, host name, TLS 1.2 or newer. None without TLS.
 
         Raises
         ------
         ConfigError
-            A file cannot be read, or is not what it should be.
+            A file cannot be read or has the wrong content.
         """
         if not self.tls:
             return None
@@ -76,7 +72,7 @@ def parse(url: str) -> Broker:
     Raises
     ------
     ConfigError
-        The URL is not one of a broker.
+        The URL is not the address of a broker.
     """
     try:
         parts = urlsplit(url)

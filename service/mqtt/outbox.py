@@ -1,4 +1,4 @@
-"""Messages on their way out: in the database until the broker has said that it has them."""
+"""Outgoing messages: in the database until the broker has acknowledged them."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from abbe.service.clock import Clock
 from abbe.service.mqtt.topics import Topics
 
 KEPT_DELIVERED = 1000
-"""Delivered messages that stay in the database, to be looked at."""
+"""Number of delivered messages that stay in the database, for inspection."""
 MOST_ALARMS, DOWN_TO_ALARMS = 10_000, 9_000
-"""When more alarms than the first figure wait, the oldest are dropped until so many as the second are left. Results are never dropped:
-they are one message for each check, which the database keeps for ever anyway."""
+"""If more alarms than the first number wait, the oldest are dropped down to the second. Results are never dropped:
+they are one message for each check, which the database keeps anyway."""
 PRUNED_AT_ONCE = 1000
 DROPPED = "MQT-001"
 
 
 class OutboxRow(Protocol):
-    """A message that waits."""
+    """A waiting message."""
 
     @property
     def id(self) -> int:
-        """Number; never used again for another message."""
+        """Number; never reused for another message."""
         ...
 
     @property
     def topic(self) -> str:
-        """Where it goes."""
+        """Topic of the message."""
         ...
 
     @property
@@ -39,18 +39,18 @@ class OutboxRow(Protocol):
 
 
 class Outbox(Protocol):
-    """What the publisher takes messages from."""
+    """Source of the publisher's messages."""
 
     async def pending(self) -> Sequence[OutboxRow]:
-        """Return the oldest messages that no broker has acknowledged, oldest first."""
+        """Return the oldest unacknowledged messages, oldest first."""
         ...
 
     async def done(self, number: int) -> None:
-        """Note that the broker has this one."""
+        """Note that the broker has acknowledged a message."""
         ...
 
     async def tidy(self) -> int:
-        """Forget what was delivered long ago; return how many waiting messages had to be dropped, because too many wait."""
+        """Delete old delivered messages; return how many waiting messages had to be dropped because too many wait."""
         ...
 
 
@@ -62,11 +62,11 @@ class OutboxStore(Protocol):
         ...
 
     def done(self, outbox_id: int, /) -> None:
-        """Note that the broker has this one."""
+        """Note that the broker has acknowledged a message."""
         ...
 
     def prune(self, keep: int, at_most: int = ..., /) -> int:
-        """Forget delivered messages but the newest; return how many."""
+        """Delete delivered messages except the newest; return how many."""
         ...
 
     def shed(
@@ -81,16 +81,12 @@ class StoreOutbox:
 
     Parameters
     ----------
-    store : OutboxStore
-        Where the messages are.
     topics : Topics
-        Of this machine: alarms may be dropped when too many wait, results never.
-    clock : Clock
-        The time in the message that tells of dropped ones.
+        Topics of this machine: alarms may be dropped when too many wait, results never.
     kept : int
-        Delivered messages that stay.
+        Number of delivered messages that stay.
     most, down_to : int
-        More waiting alarms than the first are cut down to the second.
+        If more alarms than ``most`` wait, they are cut down to ``down_to``.
     """
 
     def __init__(
@@ -110,11 +106,11 @@ class StoreOutbox:
         return await asyncio.to_thread(self._store.pending, 100)
 
     async def done(self, number: int) -> None:
-        """Note that the broker has this one."""
+        """Note that the broker has acknowledged a message."""
         await asyncio.to_thread(self._store.done, number)
 
     async def tidy(self) -> int:
-        """Forget what was delivered long ago; drop the oldest alarms when too many wait, and queue a message that says so."""
+        """Delete old delivered messages; drop the oldest alarms when too many wait, and queue a message about that."""
         while await asyncio.to_thread(self._store.prune, self._kept, PRUNED_AT_ONCE) == PRUNED_AT_ONCE:
             pass
         return await asyncio.to_thread(self._store.shed, (self._topics.alarm,), self._most, self._down_to, self._notice)
@@ -131,5 +127,5 @@ def encode(doc: dict[str, Any]) -> bytes:
 
 
 def with_id(row: OutboxRow) -> bytes:
-    """Return the payload with the row's number in it: at least once is what MQTT promises, and a receiver drops what it has seen."""
+    """Return the payload with the row's number: MQTT delivers at least once, and a receiver drops numbers that it has already seen."""
     return encode({"id": row.id, **json.loads(row.payload)})

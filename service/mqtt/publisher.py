@@ -1,7 +1,7 @@
-"""Keeps one connection to the broker and empties the outbox through it. Without a broker everything waits, and nothing else notices.
+"""Keep one connection to the broker and empty the outbox through it. Without a broker messages wait, and nothing else is affected.
 
 A message leaves the outbox only after the broker's acknowledgement (QoS 1). aiomqtt does not reconnect: every connection here is a new
-client, and the back-off is ours.
+client, and the back-off is implemented here.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ KEEPALIVE_S = 15
 REPLY_S = 10.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 STEADY_S = 5.0
-"""A connection that lived this long was a good one: the next pause is short again. A broker that accepts and closes is not."""
+"""A connection that lived this long resets the pause, s. A broker that accepts and closes does not."""
 LOOK_S = 30.0
-"""How often to look into the outbox without being woken: other processes write into it too."""
+"""Time between two looks into the outbox without a wake-up, s: other processes write into it too."""
 FAREWELL_S = 1.0
 TIDY_EVERY = 500
-"""Messages between two looks at what was delivered long ago."""
+"""Number of messages between two deletions of old delivered ones."""
 
 _TROUBLE = (aiomqtt.MqttError, StoreError, ConfigError, OSError)
 
@@ -42,18 +42,16 @@ class Publisher:
 
     Parameters
     ----------
-    broker : Broker
-        Where to connect to.
     topics : Topics
         Names the machine and its topics.
     outbox : Outbox
-        What to send.
+        Messages to send.
     clock : Clock
         Pauses, and the time in the state message.
     on_change : callable, optional
         Called with True when connected and with False when not.
     on_drop : callable, optional
-        Called with the number of waiting messages that were dropped, because the broker was away for too long.
+        Called with the number of waiting messages that were dropped because the broker was away for too long.
     """
 
     def __init__(
@@ -71,7 +69,7 @@ class Publisher:
         self._clock = clock
         self._on_change = on_change
         self._on_drop = on_drop
-        self._untidy = TIDY_EVERY  # the first look is at the start: an older version kept everything
+        self._untidy = TIDY_EVERY  # tidy at the start: older versions kept everything
         self._state: dict[str, Any] = {"state": "online"}
         self._verified: dict[str, Any] = {}
         self._wake = asyncio.Event()
@@ -80,7 +78,7 @@ class Publisher:
         self._warned = False
 
     def wake(self) -> None:
-        """Say that there is something in the outbox."""
+        """Report a new message in the outbox."""
         self._wake.set()
 
     def set_state(self, state: str, since_utc: datetime, **more: str) -> None:
@@ -88,14 +86,14 @@ class Publisher:
         self._state = {"state": state, "since_utc": since_utc.isoformat(), **more}
         self._wake.set()
 
-    def set_verified(self, told: dict[str, Any]) -> None:
-        """Change what the state message says of the table in force; it goes with every state but offline."""
-        if told != self._verified:
-            self._verified = told
+    def set_verified(self, verified: dict[str, Any]) -> None:
+        """Change the state message's part about the table in force; it goes with every state except offline."""
+        if verified != self._verified:
+            self._verified = verified
             self._wake.set()
 
     def stop(self) -> None:
-        """Say offline, if there is a broker to say it to, and let `run` return."""
+        """Publish offline, if a broker is connected, and let `run` return."""
         self._stopping.set()
         self._wake.set()
 
@@ -116,10 +114,10 @@ class Publisher:
             await self._pause()
 
     async def _connection(self) -> str:
-        """Connect and publish until the connection is lost or we stop; return what ended it."""
+        """Connect and publish until the connection is lost or `stop` is called; return what ended it."""
         ended = "stopped"
         try:
-            await self._knock()
+            await self._probe()
             async with self._client() as client, asyncio.TaskGroup() as tasks:
                 watch = tasks.create_task(_until_lost(client), name="mqtt watch")
                 await self._publish(client)
@@ -128,10 +126,10 @@ class Publisher:
             ended = _first(trouble)
         return ended
 
-    async def _knock(self) -> None:
-        """Fail early and cancellably if nobody listens, or somebody who is not our broker.
+    async def _probe(self) -> None:
+        """Fail early and cancellably if nothing listens, or something that is not our broker.
 
-        aiomqtt connects in a thread that nothing can interrupt, and leaves a socket open where the broker's certificate is refused.
+        aiomqtt connects in a thread that cannot be interrupted, and leaves a socket open if it refuses the broker's certificate.
         """
         tls = self._broker.tls_context()
         async with asyncio.timeout(REPLY_S / 2):
@@ -156,20 +154,20 @@ class Publisher:
 
     async def _publish(self, client: aiomqtt.Client) -> None:
         try:
-            await self._tell(client)
+            await self._publish_changes(client)
         finally:
-            # Also when we are cancelled: aiomqtt then says goodbye properly, and the broker would not send the last will.
+            # Also when cancelled: aiomqtt then disconnects properly, so the broker would not publish the last will.
             farewell = {"state": "offline", "since_utc": self._clock.utc().isoformat()}
             with suppress(aiomqtt.MqttError):
                 await client.publish(self._topics.state, self._state_payload(farewell), qos=1, retain=True, timeout=FAREWELL_S)
 
-    async def _tell(self, client: aiomqtt.Client) -> None:
-        told: tuple[dict[str, Any], dict[str, Any]] | None = None
+    async def _publish_changes(self, client: aiomqtt.Client) -> None:
+        published: tuple[dict[str, Any], dict[str, Any]] | None = None
         while not self._stopping.is_set():
-            self._wake.clear()  # before looking: what is put in while we look wakes us again
+            self._wake.clear()  # before looking: a message added meanwhile wakes this loop again
             now = (self._state, self._verified)
-            if told is None or any(a is not b for a, b in zip(now, told, strict=True)):
-                told = now
+            if published is None or any(a is not b for a, b in zip(now, published, strict=True)):
+                published = now
                 verified = {"verified": now[1]} if now[1] else {}
                 await client.publish(self._topics.state, self._state_payload(now[0] | verified), qos=1, retain=True)
                 self._connected()
@@ -219,7 +217,7 @@ class Publisher:
 
 
 async def _until_lost(client: aiomqtt.Client) -> None:
-    """Raise MqttError when the connection is lost. We subscribe to nothing, so no message ever comes."""
+    """Raise MqttError when the connection is lost. Nothing is subscribed, so no message ever arrives."""
     async for _ in client.messages:
         pass
 

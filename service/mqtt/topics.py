@@ -12,7 +12,7 @@ _FORBIDDEN = "+#\0"
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """Where the messages of one machine go.
+    """Topics of one machine's messages.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Topics:
 
     @property
     def state(self) -> str:
-        """Retained: online, measuring or offline. The broker itself says offline when we vanish (last will)."""
+        """Retained: online, measuring or offline. The broker itself publishes offline when the service vanishes (last will)."""
         return f"{self.prefix}/{level(self.machine)}/state"
 
     @property
@@ -43,7 +43,7 @@ class Topics:
 
     @property
     def alarm(self) -> str:
-        """One message for everything a person should look at."""
+        """One message for each event that a person should look at."""
         return f"{self.prefix}/{level(self.machine)}/alarm"
 
 
@@ -53,8 +53,9 @@ def level(name: str) -> str:
 
 
 def client_id(machine: str) -> str:
-    """Return the client identifier: always the same for a machine.
+    """Return the client identifier, always the same for a machine.
 
-    After a crash the broker must take the new connection for the old one, or the old one's last will would say offline over our head.
+    After a crash the broker must replace the old connection by the new one; otherwise the old one's last will would publish offline while
+    the new one is connected.
     """
     return f"abbe-{level(machine)}"

@@ -1,1 +1,1 @@
-"""What the plant's programs read: facts of the machine, an OPC UA server, MTConnect documents. Nothing comes in."""
+"""Read-only interfaces for the plant's programs: facts of the machine, an OPC UA server, MTConnect documents."""

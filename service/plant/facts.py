@@ -1,4 +1,4 @@
-"""What OPC UA and MTConnect show of the machine at one moment."""
+"""Facts of the machine that OPC UA and MTConnect show."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from abbe.service.verification.verified_by import VerifiedBy
 
 @dataclass(frozen=True, slots=True)
 class PlantUnit:
-    """A unit: how it is written, its UNECE code (OPC UA), and its name in MTConnect with the factor to it."""
+    """A unit: its symbol, its UNECE code (OPC UA), and its name in MTConnect with the conversion factor."""
 
     symbol: str
     unece: str
@@ -23,7 +23,7 @@ class PlantUnit:
 
     @property
     def number(self) -> int:
-        """UNECE code as OPC UA numbers it (Part 8, 5.6.3.3): its characters, one a byte."""
+        """UNECE code as a number of OPC UA (Part 8, 5.6.3.3): its characters, one a byte."""
         return int.from_bytes(self.unece.encode(), "big")
 
 
@@ -39,7 +39,7 @@ UNITS = {
 
 
 def unit_of(key: str) -> PlantUnit | None:
-    """PlantUnit of a figure, which stands at the end of its name; None: it has none."""
+    """Return the unit at the end of a figure's name; None: it has none."""
     return UNITS.get(key.rpartition("_")[2]) if "_" in key else None
 
 
@@ -55,7 +55,7 @@ class PlantAlarm:
 
 @dataclass(frozen=True, slots=True)
 class ActiveTable:
-    """Which compensation table the push journal knows to be active. It is what we last saw, not a question to the controller."""
+    """The active compensation table by the push journal: the last known one, the controller is not asked."""
 
     bank: int
     crc: int
@@ -65,8 +65,8 @@ class ActiveTable:
 
 @dataclass(frozen=True, slots=True)
 class PlantFacts:
-    """Everything at one moment; checks and alarms newest first. ``table``: None when the journal does not know; ``verified``: which
-    measurement stands behind it, None: not known here."""
+    """Facts of one instant; checks and alarms newest first. ``table``: None when the journal does not know; ``verified``: which
+    measurement verified it, None: unknown."""
 
     machine: str
     version: str
@@ -81,7 +81,7 @@ class PlantFacts:
 
     @property
     def verdict(self) -> str | None:
-        """Of the last check, where it is of the table in force; else whether anything measured that table. None: no check yet."""
+        """Verdict of the last check, if that is about the table in force; else the state of that table. None: no check yet."""
         if self.verified is not None and not self.verified.holds:
             return self.verified.state
         return self.checks[0].verdict if self.checks else None
@@ -93,10 +93,10 @@ class PlantFacts:
 
 
 class FactsSource(Protocol):
-    """Where the facts come from. Reads only."""
+    """Source of the facts. Reads only."""
 
     async def facts(self) -> PlantFacts:
-        """Return the facts of this moment.
+        """Return the current facts.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Puts the facts together from what the status page knows, the slots that were not run, and the journal of pushes."""
+"""Gather the facts from the status page's data, the slots that were not run, and the journal of pushes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _NOT_RUN = {"missed": "SCH-001", "skipped": "SCH-002", "interrupted": "SCH-007"}
 
 
 class Gatherer:
-    """Reads; never writes.
+    """Reads the facts; never writes.
 
     Parameters
     ----------
     status : callable
-        Gives what the status page shows : machine, job, devices, next due and last checks.
+        Returns the status page's data: machine, job, devices, next slots and last checks.
     store : Store, optional
         Slots and pushes. Without it there are only the alarms of failed checks, and no table.
     """
@@ -32,10 +32,10 @@ class Gatherer:
     def __init__(self, status: Callable[[], Awaitable[Status]], store: Store | None = None, control: str = "") -> None:
         self._status, self._store, self._control = status, store, control
         self._revision = ""
-        self._slow: tuple[tuple[PlantAlarm, ...], ActiveTable | None] = ((), None)
+        self._cached: tuple[tuple[PlantAlarm, ...], ActiveTable | None] = ((), None)
 
     async def facts(self) -> PlantFacts:
-        """Return the facts of this moment. Slots and pushes are read anew when the status has changed, or the minute.
+        """Return the current facts. Slots and pushes are read again when the status or the minute has changed.
 
         Raises
         ------
@@ -45,20 +45,22 @@ class Gatherer:
         status = await self._status()
         revision = f"{status.revision} {status.now_utc:%H:%M}"
         if self._store is not None and revision != self._revision:
-            self._slow = await asyncio.to_thread(self._read, self._store, status.machine)
+            self._cached = await asyncio.to_thread(self._read, self._store, status.machine)
             self._revision = revision
         failed = [_alarm_of(check, check.cause) for check in status.last if check.cause is not None]
-        alarms = sorted([*failed, *self._slow[0]], key=lambda alarm: alarm.at_utc, reverse=True)
+        alarms = sorted([*failed, *self._cached[0]], key=lambda alarm: alarm.at_utc, reverse=True)
         return PlantFacts(
             machine=status.machine,
             version=status.version,
             now_utc=status.now_utc,
             running=status.job,
             next_utc=min((due.due_utc for due in status.next_due), default=None),
-            checks=tuple(one for one in status.last if not one.push or one.verdict == "pass"),  # else of a table not in force
+            checks=tuple(
+                one for one in status.last if not one.push or one.verdict == "pass"
+            ),  # a failed check of a push is about a table that was rolled back
             alarms=tuple(alarms[:SHOWN_ALARMS]),
             devices=tuple(status.devices),
-            table=self._slow[1],
+            table=self._cached[1],
             verified=status.verified,
         )
 
@@ -79,10 +81,10 @@ def _slot_alarm(slot: SlotRecord) -> PlantAlarm:
 
 
 def table_in_force(journal: Sequence[PushEntryRecord]) -> ActiveTable | None:
-    """Which table is active after a push, as far as its journal knows.
+    """Return the active table, as far as the journal of the last push knows it.
 
-    Before activation and after one that came to nothing it is the old one, after KEEP the new one, after a person's word the one that
-    he vouched for. Between activation and the end, and where a person has to look, nobody knows: None.
+    Before activation and after a push that failed it is the old one, after KEEP the new one, after a person's acceptance the accepted one.
+    Between activation and the end, and where a person has to look, it is unknown: None.
     """
     if not journal:
         return None

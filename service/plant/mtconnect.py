@@ -1,8 +1,7 @@
-"""MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure but for the numbers it gives out.
+"""MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for its sequence numbers.
 
-In the manner of an agent; left out are assets, the agent as a device of its own, XPath (``path``) and streaming (``interval``).
-Observations are made when somebody asks: what a running check did between two questions is not seen, but every check that ended is, up
-to ten at once.
+It works like an agent, without assets, the agent as a device, XPath (``path``) and streaming (``interval``). Observations are made at each
+request: changes of a running check between two requests are not seen, but every check that ended is, up to ten at once.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _NAMES = {"result": "last_check", "table": "compensation_table"}
 
 
 class MtconnectRefusal(Exception):  # noqa: N818 - reads as what it is
-    """A request that cannot be answered: the code of the Error document, its text, and the HTTP status."""
+    """A refused request: the code of the Error document, its text, and the HTTP status."""
 
     def __init__(self, code: str, text: str, status: int = 400) -> None:
         self.code, self.text, self.status = code, text, status
@@ -54,7 +53,7 @@ class Observation:
     native: str = ""
 
     def same(self, other: Observation | None) -> bool:
-        """Whether another one says the same."""
+        """Return whether another observation has the same value."""
         return other is not None and (self.value, self.level, self.native) == (other.value, other.level, other.native)
 
 
@@ -64,13 +63,13 @@ class Agent:
     def __init__(self, instance: int, buffer: int = BUFFER) -> None:
         self._instance, self._size = instance, buffer
         self._buffer: deque[Observation] = deque()
-        self._before: dict[str, Observation] = {}  # what held when the oldest one in the buffer came
+        self._before: dict[str, Observation] = {}  # values before the oldest observation in the buffer
         self._latest: dict[str, Observation] = {}
         self._next = 1
-        self._seen = 0
+        self._last_check = 0
 
     def update(self, facts: PlantFacts) -> None:
-        """Take in what is new."""
+        """Add observations of everything that has changed."""
         now, job = facts.now_utc, facts.running
         self._put("avail", now, "AVAILABLE")
         self._put("exec", now, "ACTIVE" if job else "READY")
@@ -79,15 +78,15 @@ class Agent:
         if not facts.checks:
             self._put("result", now, UNAVAILABLE)
         for check in sorted(facts.checks[1:], key=lambda one: one.id):
-            if check.id > self._seen:
+            if check.id > self._last_check:
                 self._put("result", now, _result(check, check.verdict))
-        if facts.checks:  # an earlier table's verdict is none of the table in force
+        if facts.checks:  # a verdict about an earlier table does not hold for the table in force
             self._put("result", now, _result(facts.checks[0], facts.verdict or ""))
-            self._seen = facts.checks[0].id
+            self._last_check = facts.checks[0].id
         table = facts.table
         known = (("bank", str(table.bank)), ("crc32", f"{table.crc:08x}"), ("push", str(table.push))) if table else ()
-        told = () if facts.verified is None else (("verified", facts.verified.state), ("verified_text", facts.verified.text))
-        self._put("table", now, (*known, *told) if known else UNAVAILABLE)
+        verified = () if facts.verified is None else (("verified", facts.verified.state), ("verified_text", facts.verified.text))
+        self._put("table", now, (*known, *verified) if known else UNAVAILABLE)
         self._put("system", now, *_condition(facts))
 
     def _put(self, item: str, utc: datetime, value: str | Entries, level: str = "", native: str = "") -> None:
@@ -116,7 +115,7 @@ class Agent:
         return _bytes(root)
 
     def current(self, facts: PlantFacts, query: Mapping[str, str]) -> bytes:
-        """Return the Streams document of what holds now, or held when observation ``at`` was made."""
+        """Return the Streams document of the current values, or of those when observation ``at`` was made."""
         _only(query, {"at"})
         at = self._number(query, "at", self._next - 1, self._first, self._next - 1)
         held = self._before | {one.item: one for one in self._buffer if one.sequence <= at}
@@ -192,7 +191,7 @@ def _write(parent: ET.Element, one: Observation) -> None:
 
 
 def _result(check: Verification, verdict: str) -> Entries:
-    """Figures with their unit at the end of the key; beside each its expanded uncertainty (k = 2) and its limit."""
+    """Return the figures, with the unit at the end of the key; beside each its expanded uncertainty (k = 2) and its limit."""
     head = {"number": str(check.id), "verdict": verdict, "schedule": check.schedule, "recipe": check.recipe}
     for figure in check.figures:
         three = {figure.name: figure.value, f"{figure.name}.expanded": figure.expanded, f"{figure.name}.limit": figure.limit}
@@ -201,7 +200,7 @@ def _result(check: Verification, verdict: str) -> Entries:
 
 
 def _condition(facts: PlantFacts) -> tuple[str, str, str]:
-    """Text, level and code of what the last check says of the machine."""
+    """Return text, level and code of the machine's condition by the last check."""
     if facts.verified is not None and not facts.verified.holds:
         state = facts.verified.state
         return ("", "Normal", "") if state == "verified" else (facts.verified.text, "Warning", state)
@@ -233,10 +232,10 @@ def _bytes(root: ET.Element) -> bytes:
     return document
 
 
-def _stamp(moment: datetime) -> str:
-    return moment.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+def _stamp(time: datetime) -> str:
+    return time.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def _clean(text: str) -> str:
-    """XML has no control characters, and device strings may."""
+    """Replace control characters, which XML does not allow and device strings may contain; at most 500 characters."""
     return "".join(c if c.isprintable() else " " for c in text)[:500]

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run_file import Columns, RunFile, Setup
 from abbe.service.errors import FileFormatError
-from abbe.service.explain import expected, shown, where
+from abbe.service.explain import expected, location_text, short_repr
 from abbe.service.files import NotPlainError, read_plain
 from abbe.service.runs.json_text import strict_json
 
@@ -53,7 +53,7 @@ def read_json(path: Path) -> Doc:
     except UnicodeDecodeError as err:
         raise FileFormatError(f"{path}: byte {err.start} is not UTF-8", "save the file as UTF-8") from None
     if not isinstance(value, dict):
-        raise FileFormatError(f"{path}: expected a JSON object, got {shown(value)}", "see docs/schemas")
+        raise FileFormatError(f"{path}: expected a JSON object, got {short_repr(value)}", "see docs/schemas")
     return value
 
 
@@ -147,7 +147,7 @@ def _is_unit_like(text: str) -> bool:
 
 def _check_finite(path: Path, value: object, location: tuple[int | str, ...] = ()) -> None:
     if isinstance(value, float) and not math.isfinite(value):
-        raise FileFormatError(f"{path}: {where(location)}: expected a finite number, got {value}", "correct the file")
+        raise FileFormatError(f"{path}: {location_text(location)}: expected a finite number, got {value}", "correct the file")
     if isinstance(value, dict):
         for key, inner in value.items():
             _check_finite(path, inner, (*location, key))
@@ -165,8 +165,8 @@ def _format_error(path: Path, err: ValidationError) -> FileFormatError:
     )
     tail = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     if first["type"] == "missing":
-        return FileFormatError(f"{path}: key {where(location)!r} is missing{tail}", "see docs/schemas")
-    place = where(location)
+        return FileFormatError(f"{path}: key {location_text(location)!r} is missing{tail}", "see docs/schemas")
+    place = location_text(location)
     if location[:1] == ("columns",) and len(location) == 3 and isinstance(location[2], int):
         place = f"columns.{location[1]}, row {location[2] + 1}"
     prefix = f"{path}: {place}: " if place else f"{path}: "

@@ -22,7 +22,7 @@ from abbe.models.functions.table import Table
 from abbe.models.geometry.propagation import checked_covariance
 from abbe.service.domain import run_file as formats
 from abbe.service.errors import FileFormatError
-from abbe.service.explain import nearest, shown
+from abbe.service.explain import nearest, short_repr
 from abbe.service.runs.checks import check, read_json
 
 NOT_GIVEN = "no uncertainty given in the errors file"
@@ -119,7 +119,7 @@ def _covariance(path: Path, given: Mapping[str, Any] | None, motions: ErrorMotio
 
 def _names(path: Path, names: Any) -> tuple[str, ...]:
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise FileFormatError(f"{path}: covariance.parameters: expected a list of names, got {shown(names)}", 'e.g. ["C0Y", "EXX.1"]')
+        raise FileFormatError(f"{path}: covariance.parameters: expected a list of names, got {short_repr(names)}", 'e.g. ["C0Y", "EXX.1"]')
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise FileFormatError(f"{path}: covariance.parameters: {twice!r} stands there twice", "name each parameter once")
@@ -129,10 +129,10 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
 def _matrix(path: Path, rows: Any, size: int) -> F2:
     where = f"{path}: covariance.matrix"
     if not isinstance(rows, list) or not rows or not all(isinstance(row, list) for row in rows):
-        raise FileFormatError(f"{where}: expected rows of finite numbers, got {shown(rows)}")
+        raise FileFormatError(f"{where}: expected rows of finite numbers, got {short_repr(rows)}")
     strange = [value for row in rows for value in row if isinstance(value, bool) or not isinstance(value, int | float)]
     if strange or any(len(row) != len(rows[0]) for row in rows):
-        raise FileFormatError(f"{where}: expected rows of numbers, all equally long, got {shown(strange[0] if strange else rows)}")
+        raise FileFormatError(f"{where}: expected rows of numbers, all equally long, got {short_repr(strange[0] if strange else rows)}")
     if (len(rows), len(rows[0])) != (size, size):
         raise FileFormatError(f"{where}: expected {size} x {size} numbers, got {len(rows)} rows of {len(rows[0])}")
     try:
@@ -179,7 +179,7 @@ def _unused(path: Path, document: Mapping[str, Any]) -> list[str]:
 
 def _combination(one: Mapping[str, Any]) -> str:
     parts = one.get("combination")
-    text = shown(parts)
+    text = short_repr(parts)
     if isinstance(parts, dict) and parts and all(isinstance(factor, int | float) for factor in parts.values()):
         text = " + ".join(name if factor == 1 else f"{factor:g} {name}" for name, factor in parts.items()).replace("+ -", "- ")
     return f"{text} ({one['why']})" if one.get("why") else text

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
 from abbe.service.errors import FileFormatError
-from abbe.service.explain import nearest, shown
+from abbe.service.explain import nearest, short_repr
 
 POSITION = ("x_mm", "y_mm", "z_mm")
 DIRECTION = ("direction_x", "direction_y", "direction_z")
@@ -146,7 +146,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
     missing = next((name for name in needed if name not in header), None)
     if missing is not None:
         raise FileFormatError(
-            f"{path}: column {missing!r} is missing, got {shown(','.join(header))}", f"the header must name {','.join(needed)}"
+            f"{path}: column {missing!r} is missing, got {short_repr(','.join(header))}", f"the header must name {','.join(needed)}"
         )
 
 
@@ -172,7 +172,7 @@ class _Block:
             if not math.isfinite(value) or (sign and value not in (-1.0, 0.0, 1.0)):
                 wanted = "-1, 0 or 1" if sign else "a finite number"
                 raise FileFormatError(
-                    f"{self.path}: {name}, {self._place(index)}: expected {wanted}, got {shown(row[at])}", "correct the row"
+                    f"{self.path}: {name}, {self._place(index)}: expected {wanted}, got {short_repr(row[at])}", "correct the row"
                 )
             values[index] = value
         return values

@@ -1,1 +1,1 @@
-"""Unattended checks: when they are due, who may run, and what became of each slot."""
+"""Unattended checks: due slots, preconditions, and the outcome of each slot."""

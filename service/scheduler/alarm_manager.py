@@ -1,4 +1,4 @@
-"""Alarms: compares each check with the history, keeps the alarms, says what is to be done when the machine is free."""
+"""Manage alarms: compare each check with the history, store the alarms, offer their follow-up work when the machine is free."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ CODES = {
     AlarmKind.FAILED: "ALM-005",
     AlarmKind.PUSHED: "ALM-006",
 }
-"""Entries that are published, and the code of each message."""
-SAID = {OPEN: "is open", STOPPED: "was stopped"}
-"""Words of outcomes that make no sentence by themselves."""
+"""Published kinds of entries, and the code of their messages."""
+OUTCOME_TEXTS = {OPEN: "is open", STOPPED: "was stopped"}
+"""Text for outcome words that make no sentence by themselves."""
 NOTHING_YET = JobOutcome("failed", "the service ended before anything was written")
 WAITS = "waits"
 
@@ -54,13 +54,13 @@ class Duties:
     Parameters
     ----------
     warn_days : float
-        Alarm when a limit may be reached within so many days; 0: never.
+        Alarm when a limit may be reached within this many days; 0: never.
     campaign : str
-        What is measured for an alarm, for people.
+        Recipe of the full campaign that an investigation measures, for people.
     investigate : callable
         ``await investigate(alarm, note, progress, control)``.
     push : callable or None
-        ``await push(order)``, which returns what it learned of the end; None: the service pushes nothing.
+        ``await push(order)`` returns the outcome as far as it learned it; None: the service does not push by itself.
     """
 
     warn_days: float
@@ -71,7 +71,7 @@ class Duties:
 
 @dataclass(frozen=True, slots=True)
 class AlarmChannels:
-    """Where alarms go: their topic (None: no broker), what wakes the publisher, and the audit."""
+    """Recipients of alarms: their topic (None: no broker), the callback that wakes the publisher, and the audit."""
 
     topic: str | None
     posted: Callable[[], None]
@@ -79,22 +79,14 @@ class AlarmChannels:
 
 
 class AlarmManager(RetryingStore):
-    """Alarms of one machine: `checked` after each check, `due` whenever the machine is free.
+    """Alarms of one machine: call `checked` after each check, `due` whenever the machine is free.
 
     Parameters
     ----------
     store : Store
-        Where checks, alarms, proposals and pushes are.
-    clock : Clock
-        Now.
-    machine : str
-        Its name.
+        Holds checks, alarms, proposals and pushes.
     schedules : sequence of Schedule
-        The timetable: which schedules ask for proposals, and on which terms work may start.
-    duties : Duties
-        What is done.
-    channels : AlarmChannels
-        Where alarms go.
+        The timetable: which schedules ask for proposals, and the preconditions of follow-up work.
     """
 
     def __init__(
@@ -104,12 +96,12 @@ class AlarmManager(RetryingStore):
         self._machine = machine
         self._schedules = tuple(schedules)
         self.duties = duties
-        """What is done about alarms."""
+        """What the service does about alarms."""
         self._channels = channels
         self._checked_again: set[tuple[int, int]] = set()
 
     async def checked(self, doc: Doc, number: int) -> str:
-        """Compare a kept verification with those before it; raise, hold or clear the alarm of its recipe. Return that as a sentence."""
+        """Compare a stored verification with earlier ones; raise, keep or clear the alarm of its recipe. Return a sentence, or nothing."""
         recipe, warn_days = doc["recipe"], self.duties.warn_days
         records = await self._read(self._store.verifications.of_machine, self._machine, READ_CHECKS)
         looked = await self._read(evaluate_alarm, self._store, self._machine, recipe, records, warn_days)
@@ -120,20 +112,20 @@ class AlarmManager(RetryingStore):
         return f"alarm {entry.alarm} {looked.kind}: {looked.found.text}"
 
     async def due(self) -> FollowUp | None:
-        """Return what may start now: first the check after a push, then a push, then an investigation."""
+        """Return the work that may start now: first the check after a push, then a push, then an investigation."""
         try:
             entries = await asyncio.to_thread(self._store.alarms.entries, self._machine)
             entries = await self._pushes_settled(entries)
             alarms = [one for one in folded(entries) if one.active]
             return self._check_again(alarms) or await self._push(entries) or self._investigation(alarms)
         except StoreError as trouble:
-            log.warning("alarms cannot be read now", cause=trouble.detail)
+            log.warning("alarms unreadable; retry", cause=trouble.detail)
             return None
 
     async def _pushes_settled(self, entries: list[AlarmEntryRecord]) -> list[AlarmEntryRecord]:
-        """Record the end of pushes that were interrupted with the service, or that were open when last recorded.
+        """Record the end of pushes that the end of the service interrupted, or that were open when last recorded.
 
-        Which table is in force is read from the journal. No push is begun again here.
+        The table in force is read from the journal. No push is restarted here.
         """
         last = {e.alarm: e for e in entries if e.kind in (AlarmKind.PUSHING, AlarmKind.PUSHED)}
         changed = False
@@ -149,12 +141,12 @@ class AlarmManager(RetryingStore):
         return await asyncio.to_thread(self._store.alarms.entries, self._machine) if changed else entries
 
     async def note(self, number: int, kind: AlarmKind, doc: Doc) -> Alarm:
-        """Write an entry of an alarm; return the alarm with it."""
+        """Write an entry of an alarm; return the alarm including it."""
         await self.line(number, kind, doc)
         return await self._read(alarm_numbered, self._store, self._machine, number)
 
     async def settled(self, found: ApprovedProposal, after: int, reported: JobOutcome) -> JobOutcome:
-        """Record how a push later than ``after`` ended, by the journal; return that."""
+        """Record how a push later than ``after`` ended, by the journal; return the outcome."""
         done = reconciled(await self._read(self._of_proposal, found.proposal, after), reported)
         await self._record_pushed(found.alarm, found.proposal, after, done)
         return done
@@ -164,22 +156,22 @@ class AlarmManager(RetryingStore):
         return (await self._read(JournalView.read, self._store, self._machine)).last_push
 
     async def interrupted(self, found: ApprovedProposal, after: int) -> None:
-        """Record at once where a push stands that is interrupted by the end of the service."""
+        """Record the state of a push at once when the end of the service interrupts it."""
         done = await asyncio.to_thread(self._of_proposal, found.proposal, after) or NOTHING_YET
         log.warning("the push was interrupted by the end of the service", word=done.word, text=done.text)
         text = f"{done.text} (stopped with the service)"
         await self._record_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
 
     def _of_proposal(self, proposal: int, after: int) -> JobOutcome | None:
-        """How the last push of a proposal stands, by the journal as it is now."""
+        """Return the outcome of a proposal's last push by the current journal."""
         return JournalView.read(self._store, self._machine).of_proposal(proposal, after)
 
     async def _record_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
-        text = f"proposal {proposal} {SAID.get(done.word, done.word)}: {done.text}"
+        text = f"proposal {proposal} {OUTCOME_TEXTS.get(done.word, done.word)}: {done.text}"
         await self.line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
 
     def _check_again(self, alarms: Sequence[Alarm]) -> FollowUp | None:
-        """After a push that was kept the check that raised the alarm is made once at once: the trend begins anew with it."""
+        """Return the check to repeat after a kept push: the check that raised the alarm, once, with which its trend starts anew."""
         for one in alarms:
             pushed = one.last(AlarmKind.PUSHED)
             schedule = self._schedule_of(one)
@@ -212,13 +204,13 @@ class AlarmManager(RetryingStore):
         for one in alarms:
             schedule = self._schedule_of(one)
             if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
-                needs = replace(schedule.needs, idle=True)  # a machine at work, or in another process's hands, is waited for
+                needs = replace(schedule.needs, idle=True)  # wait for a machine that works or that another process has
                 terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self.duties.campaign, needs=needs)
                 return FollowUp(terms, _Investigation(self, one, terms))
         return None
 
     def _schedule_of(self, one: Alarm) -> Schedule | None:
-        """The schedule that raised an alarm; if it is gone, one of the same recipe."""
+        """Return the schedule that raised an alarm; if it no longer exists, one of the same recipe."""
         same = [s for s in self._schedules if s.recipe == one.recipe]
         return next((s for s in same if s.name == one.schedule), next(iter(same), None))
 
@@ -242,13 +234,13 @@ class AlarmManager(RetryingStore):
             try:
                 event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": doc["text"]})
                 await asyncio.to_thread(self._channels.audit.write, event)
-            except AbbeError as error:  # the entry itself is kept: a service that ended here would raise no more alarms
-                log.error("not in the audit", cause=error.detail)
+            except AbbeError as error:  # the entry itself is stored: a service that ended here would raise no more alarms
+                log.error("audit record failed", cause=error.detail)
         return entry
 
 
 class _AlarmJob(Job[JobOutcome]):
-    """Work for an alarm. While another process has the machine it waits, and no try is counted."""
+    """Work for an alarm. It waits while another process has the machine, and that does not count as a try."""
 
     def __init__(self, manager: AlarmManager, terms: Schedule) -> None:
         self._manager, self.terms = manager, terms
@@ -262,14 +254,14 @@ class _AlarmJob(Job[JobOutcome]):
 
     @abstractmethod
     async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
-        """Do what the alarm asks for, once the machine is free."""
+        """Do the work, once the machine is free."""
 
     async def end(self, outcome: JobOutcome) -> SlotState:
         return SlotState(WAITS, outcome.text) if outcome.word == WAITS else SlotState.of(outcome)
 
 
 class _Investigation(_AlarmJob):
-    """Takes an alarm to a proposal or to the reason why there is none. Each step is an entry of the alarm; the last one is the end."""
+    """Takes an alarm to a proposal or to the reason why there is none. Each step is an entry of the alarm; the last one is the outcome."""
 
     kind = "investigation"
 
@@ -283,12 +275,12 @@ class _Investigation(_AlarmJob):
 
     async def failed(self, error: Exception) -> JobOutcome:
         cause = record.cause_of(error)
-        how = "was ended by a person" if isinstance(error, Stopped | Aborted) else "could not go on"
+        how = "was ended by a person" if isinstance(error, Stopped | Aborted) else "failed"
         await self._note(AlarmKind.FAILED, {"text": f"the investigation {how}: {cause['what']}", "cause": cause})
         return self._last
 
     async def defect(self, error: Exception) -> None:
-        """Record it: the next service must not fail at the same alarm again."""
+        """Record the defect: the next service must not fail at the same alarm again."""
         await self.failed(error)
 
     async def _note(self, kind: AlarmKind, doc: Doc) -> Alarm:
@@ -297,7 +289,7 @@ class _Investigation(_AlarmJob):
 
 
 class _ApprovedPush(_AlarmJob):
-    """A push that a person approved. It counts as tried once its first entry is written; its end is what the push journal says."""
+    """A push that a person approved. It counts as a try once its first entry is written; its outcome is read from the push journal."""
 
     kind = "push"
 
@@ -330,6 +322,6 @@ class _ApprovedPush(_AlarmJob):
         return await super().end(outcome)
 
     async def interrupted(self) -> None:
-        """Record where it stands by the journal; if there is no time for it, the next start does."""
+        """Record its state by the journal; without enough time the next start does."""
         if self._is_begun:
             await self._manager.interrupted(self._found, self._after)

@@ -1,4 +1,4 @@
-"""All machines of a database at a glance: what each does, what its last check found, what is next, and which limit comes first."""
+"""All machines of a database: state, last check, next slot, and the limit that is reached first."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from abbe.service.verification.trend_table import FigureTrend, trends
 from abbe.service.verification.verified_by import LATEST_CHECKS, VerifiedBy, of_push_taken_back, verified_by
 
 CHECKS = 400
-"""So many checks of each machine are looked at for its trend, which uses no more (`abbe.models.trend.MOST_CHECKS`)."""
+"""Number of checks of each machine read for its trend, which uses no more (`abbe.models.trend.MOST_CHECKS`)."""
 NOT_RUNNING = "not running"
 NO_SERVICE = "no service"
 HEADINGS = (
@@ -32,7 +32,7 @@ HEADINGS = (
 
 @dataclass(frozen=True, slots=True)
 class FleetFigure:
-    """One figure of a check: value, expanded uncertainty (k = 2) and limit, in the unit at the end of its name; None: not known."""
+    """One figure of a check: value, expanded uncertainty (k = 2) and limit, in the unit at the end of its name; None: unknown."""
 
     name: str
     value: float
@@ -42,25 +42,23 @@ class FleetFigure:
 
 @dataclass(frozen=True, slots=True)
 class MachineStatus:
-    """Where one machine stands: what its service does, and what its last check found.
+    """Status of one machine: what its service does, and what its last check found. An empty text: there is none.
 
     Parameters
     ----------
-    machine : str
-        Name.
     state : str
-        ``measuring``, ``waiting``, ``not running`` (its service ended, or was not heard for minutes), ``no service`` (never was one).
+        ``measuring``, ``waiting``, ``not running`` (the service ended, or was silent for minutes), ``no service`` (there never was one).
     heard_utc : str
-        When its service said something last; empty without one.
+        Time of the service's last heartbeat.
     check_utc, verdict : str
-        The last check; empty without one. Where its verdict is not of the table in force: ``unverified``; ``verified`` by the push that
-        brought the table and was measured before and after; ``unknown``.
+        The last check. A verdict that is not about the table in force becomes ``unverified``, ``verified`` (by the push that activated the
+        table and was measured before and after) or ``unknown``.
     figures : tuple of FleetFigure
-        Those of the last check that are judged, in its order; none where its verdict is not of the table in force.
+        Judged figures of the last check, in its order; none if its verdict is not about the table in force.
     verified : VerifiedBy
-        What measured the table in force, or since what nothing has.
+        Which measurement verified the table in force, or since when none has.
     next_due_utc, next_recipe : str
-        What its service will do next; empty if it does not run or has no timetable.
+        The service's next slot; empty if it does not run or has no timetable.
     """
 
     machine: str
@@ -76,14 +74,14 @@ class MachineStatus:
 
 @dataclass(frozen=True, slots=True)
 class MachineLine(MachineStatus):
-    """What is known of one machine: where it stands, and what its checks say of the days ahead.
+    """Status of one machine with the trends of its figures.
 
     Parameters
     ----------
     drifting : tuple of str
         Figures that drift.
     limit_figure : str
-        The figure that reaches its limit first; empty if that is known of none.
+        The figure that reaches its limit first; empty if unknown for all.
     limit_days : tuple of float or None
         Days until then, and the 95 % interval.
     """
@@ -93,44 +91,41 @@ class MachineLine(MachineStatus):
     limit_days: tuple[float, float, float] | None = None
 
 
-def stands(store: Store, now: datetime) -> list[MachineStatus]:
-    """Where every machine of a database stands, by name. Only its last check is read, so that it costs the same after years.
-
-    Parameters
-    ----------
-    store : Store
-        SQLite or PostgreSQL; many services may write to it.
-    now : datetime
-        With time zone.
-    """
-    said = store.heartbeats.all()
+def machine_statuses(store: Store, now: datetime) -> list[MachineStatus]:
+    """Return the status of every machine, by name. Only the last checks are read, so that the cost does not grow with the years."""
+    heartbeats = store.heartbeats.all()
     return [
-        _stand(store, name, said.get(name), store.verifications.of_machine(name, LATEST_CHECKS), now) for name in store.machines.names()
+        _status(store, name, heartbeats.get(name), store.verifications.of_machine(name, LATEST_CHECKS), now)
+        for name in store.machines.names()
     ]
 
 
 def fleet(store: Store, now: datetime) -> list[MachineLine]:
-    """One line for each machine of a database, by name, with the trends of its figures; parameters as for `stands`."""
-    said = store.heartbeats.all()
-    return [_line(store, name, said.get(name), store.verifications.of_machine(name, limit=CHECKS), now) for name in store.machines.names()]
+    """Return the status and trends of every machine of a database, by name."""
+    heartbeats = store.heartbeats.all()
+    return [
+        _line(store, name, heartbeats.get(name), store.verifications.of_machine(name, limit=CHECKS), now) for name in store.machines.names()
+    ]
 
 
-def _line(store: Store, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
-    stand = _stand(store, name, said, checks, now)
-    found = trends(checks, stand.verified.since)
+def _line(store: Store, name: str, heartbeat: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineLine:
+    status = _status(store, name, heartbeat, checks, now)
+    found = trends(checks, status.verified.since)
     soonest = min((one for one in found if one.days_until_limit is not None), key=lambda one: one.days_until_limit or 0.0, default=None)
     return MachineLine(
-        **{one.name: getattr(stand, one.name) for one in fields(stand)},
+        **{one.name: getattr(status, one.name) for one in fields(status)},
         drifting=tuple(one.figure for one in found if one.state == "drifting"),
         limit_figure="" if soonest is None else soonest.figure,
         limit_days=None if soonest is None else _days(soonest),
     )
 
 
-def _stand(store: Store, name: str, said: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime) -> MachineStatus:
-    """``checks``: newest first."""
-    state = state_of(said, now)
-    due = said.doc.get("due", []) if said is not None and state not in {NOT_RUNNING, NO_SERVICE} else []
+def _status(
+    store: Store, name: str, heartbeat: HeartbeatRecord | None, checks: Sequence[VerificationRecord], now: datetime
+) -> MachineStatus:
+    """Return the status of one machine; ``checks``: newest first."""
+    state = state_of(heartbeat, now)
+    due = heartbeat.doc.get("due", []) if heartbeat is not None and state not in {NOT_RUNNING, NO_SERVICE} else []
     first: dict[str, str] = min(due, key=lambda one: datetime.fromisoformat(one["due_utc"]), default={})
     last = next((one for one in checks if not of_push_taken_back(one)), None)
     known = verified_by(store, name)
@@ -138,7 +133,7 @@ def _stand(store: Store, name: str, said: HeartbeatRecord | None, checks: Sequen
     return MachineStatus(
         machine=name,
         state=state,
-        heard_utc=said.seen_utc if said is not None else "",
+        heard_utc=heartbeat.seen_utc if heartbeat is not None else "",
         check_utc="" if last is None else str(last.doc.get("started_utc") or last.utc),
         verdict=verdict,
         figures=() if last is None or not known.holds else figures_of(last.doc),
@@ -148,17 +143,17 @@ def _stand(store: Store, name: str, said: HeartbeatRecord | None, checks: Sequen
     )
 
 
-def state_of(said: HeartbeatRecord | None, now: datetime) -> str:
-    """What a machine's service does, as far as it can be known from what it said last."""
-    if said is None:
+def state_of(heartbeat: HeartbeatRecord | None, now: datetime) -> str:
+    """Return what a machine's service does, as far as its last heartbeat shows."""
+    if heartbeat is None:
         return NO_SERVICE
-    if said.owner.is_gone() or now - datetime.fromisoformat(said.seen_utc) > SILENT_AFTER:
+    if heartbeat.owner.is_gone() or now - datetime.fromisoformat(heartbeat.seen_utc) > SILENT_AFTER:
         return NOT_RUNNING
-    return str(said.doc.get("state", NOT_RUNNING))
+    return str(heartbeat.doc.get("state", NOT_RUNNING))
 
 
 def figures_of(doc: Mapping[str, Any]) -> tuple[FleetFigure, ...]:
-    """The figures of a check that are judged; of a check that could not be completed there are none."""
+    """Return the judged figures of a check; none for a check that could not be completed."""
     values, expanded = doc.get("values", {}), doc.get("uncertainties", {})
     judged = {name: limit for name, limit in doc.get("limits", {}).items() if values.get(name) is not None}
     return tuple(FleetFigure(name, values[name], expanded.get(name), limit) for name, limit in judged.items())
@@ -172,19 +167,19 @@ def _days(one: FigureTrend) -> tuple[float, float, float] | None:
 
 def row(line: MachineLine) -> tuple[str, ...]:
     """Return the cells of `HEADINGS`."""
-    figures = ", ".join(_words(one) for one in line.figures)
+    figures = ", ".join(_figure_text(one) for one in line.figures)
     state = line.state if line.state != NOT_RUNNING else f"{NOT_RUNNING}, last heard {_minute(line.heard_utc)}"
     due = f"{_minute(line.next_due_utc)} {line.next_recipe}" if line.next_due_utc else ""
-    return (line.machine, state, _minute(line.check_utc), line.verdict, line.verified.text, figures, due, _limit_words(line))
+    return (line.machine, state, _minute(line.check_utc), line.verdict, line.verified.text, figures, due, _limit_text(line))
 
 
-def _words(one: FleetFigure) -> str:
+def _figure_text(one: FleetFigure) -> str:
     expanded = "" if one.expanded is None else f" ± {one.expanded:.1f}"
     limit = "" if one.limit is None else f" (limit {one.limit:g})"
     return f"{one.name} {one.value:.1f}{expanded}{limit}"
 
 
-def _limit_words(line: MachineLine) -> str:
+def _limit_text(line: MachineLine) -> str:
     if line.limit_days is None:
         return "not known" if line.figures else ""
     days, low, high = (f"{v:.1f}" if v < 10 else f"{v:.0f}" for v in line.limit_days)
@@ -196,7 +191,7 @@ def _minute(utc: str) -> str:
 
 
 def as_doc(lines: Sequence[MachineLine]) -> dict[str, Any]:
-    """Return everything as JSON value; what is not known is null or empty."""
+    """Return all lines as a JSON value; unknown values are null or empty."""
     return {"schema": 1, "machines": [_doc(one) for one in lines]}
 
 

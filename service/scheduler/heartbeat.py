@@ -1,4 +1,4 @@
-"""What a service says of itself in the database, so that others who read it know its machine: the fleet's list."""
+"""Heartbeat of a service in the database: its state, for the fleet's list and other readers."""
 
 from __future__ import annotations
 
@@ -18,36 +18,32 @@ from abbe.service.scheduler.ports import Doc
 log = structlog.get_logger("abbe.station")
 
 BEAT_S = 60.0
-"""One row is written anew so often."""
+"""Time between two heartbeats, s."""
 SILENT_AFTER = timedelta(seconds=3 * BEAT_S)
-"""A service on another computer that was not heard for so long does not run."""
+"""A service on another computer counts as not running after this silence."""
 MEASURING = "measuring"
 WAITING = "waiting"
 
 
 class HeartbeatSink(Protocol):
-    """The part of the store that is written here."""
+    """The part of the store that is used here."""
 
     def put(self, machine: str, doc: Doc) -> None:
-        """Write the present state of a machine's service."""
+        """Write the current state of a machine's service."""
         ...
 
 
 class Heartbeat:
-    """Keeps a machine's row true. A database that does not take it now gets the next one: nothing waits for this.
+    """Keeps a machine's row up to date. If the database does not accept a row now, the next one replaces it: nothing waits for this.
 
     Parameters
     ----------
-    machine, version : str
-        Name of the machine; version of this program.
-    store : HeartbeatDesk
-        Where to.
+    store : HeartbeatSink
+        Gets the rows.
     next_due : callable
         The timetable's next slots.
-    clock : Clock
-        Beats.
     attention : sequence of str
-        What needs a person now, kept by others.
+        What needs a person now, maintained by others.
     """
 
     def __init__(
@@ -63,45 +59,45 @@ class Heartbeat:
         self._store, self._next_due, self._clock, self._attention = store, next_due, clock, attention
         self._job: Doc | None = None
         self._began = clock.utc()
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
 
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
         """Note that a check begins."""
         self._job = {"schedule": schedule.name, "recipe": schedule.recipe, "since_utc": at_utc.isoformat()}
-        self._news.set()
+        self._changed.set()
 
     def job_progress(self, progress: Progress) -> None:
-        """Progress is for the machine's own page."""
+        """Do nothing: progress is for the machine's own page."""
 
-    def noted(self) -> None:
-        """Hear that what needs a person has changed."""
-        self._news.set()
+    def attention_changed(self) -> None:
+        """Note that what needs a person has changed."""
+        self._changed.set()
 
     def job_ended(self, doc: Doc | None) -> None:
-        """Note that it ended."""
+        """Note that the check ended."""
         self._job = None
-        self._news.set()
+        self._changed.set()
 
     def doc(self) -> Doc:
-        """What is said now."""
+        """Return the current row."""
         due = [{"schedule": one.name, "recipe": one.recipe, "due_utc": at.isoformat()} for one, at in self._next_due()]
         state = WAITING if self._job is None else MEASURING
-        told = {"schema": 1, "state": state, "job": self._job, "due": due, "version": self._version, "began_utc": self._began.isoformat()}
-        return told | {"attention": list(self._attention)}
+        row = {"schema": 1, "state": state, "job": self._job, "due": due, "version": self._version, "began_utc": self._began.isoformat()}
+        return row | {"attention": list(self._attention)}
 
     async def run(self) -> None:
-        """Write now, at every change, and once a beat; until cancelled."""
+        """Write now, at every change, and once every `BEAT_S`; until cancelled."""
         while True:
-            self._news.clear()
+            self._changed.clear()
             try:
                 await asyncio.to_thread(self._store.put, self._machine, self.doc())
             except StoreError as trouble:
-                log.warning("the fleet's list was not told", cause=trouble.detail)
+                log.warning("heartbeat not written", cause=trouble.detail)
             await self._beat()
 
     async def _beat(self) -> None:
-        """Until there is news, or a beat has passed."""
-        waits = {asyncio.ensure_future(self._news.wait()), asyncio.ensure_future(self._clock.sleep(BEAT_S))}
+        """Wait for a change, at most `BEAT_S`."""
+        waits = {asyncio.ensure_future(self._changed.wait()), asyncio.ensure_future(self._clock.sleep(BEAT_S))}
         try:
             await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         finally:

@@ -1,6 +1,6 @@
-"""How every job runs: watchers follow it, its begin and its end are recorded, and a stop of the service is recorded too.
+"""Run a job: watchers follow it, and its begin, its end, and an interruption by the end of the service are recorded.
 
-CheckJobs, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
+Checks, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ SHUTDOWN_RECORD_S = 1.0
 
 
 class Job(ABC, Generic[T]):
-    """Work that has the machine to itself, and the records of it.
+    """Work that has the machine to itself, and its records.
 
-    ``T`` is what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``: of `JobState`.
+    ``T``: what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``: of `JobState`.
     """
 
     kind: JobKind = "check"
     terms: Schedule
     handles_abort: ClassVar[bool] = False
-    """Whether the work ends by itself when it is aborted; otherwise it is cancelled."""
+    """Whether the work ends by itself when aborted; otherwise it is cancelled."""
 
     async def begin(self) -> None:
-        """Record that it begins. If this fails, the work is not started."""
+        """Record the begin. If this fails, the work is not started."""
 
     @abstractmethod
     async def do(self, progress: ProgressSink, control: Control) -> T:
@@ -54,26 +54,26 @@ class Job(ABC, Generic[T]):
 
     @abstractmethod
     async def failed(self, error: Exception) -> T:
-        """Return what a failure of devices, data or numerics means, as an outcome."""
+        """Return the outcome of a failure of devices, data or numerics."""
 
     async def defect(self, error: Exception) -> None:
         """Record a defect of this program before it ends the service."""
 
     @abstractmethod
     async def end(self, outcome: T) -> SlotState:
-        """Record how it ended."""
+        """Record the outcome."""
 
     async def interrupted(self) -> None:
-        """Record where it stands when the service stops, within `SHUTDOWN_RECORD_S`."""
+        """Record the state when the service stops, within `SHUTDOWN_RECORD_S`."""
 
     def document(self) -> Doc | None:
-        """Return what watchers get at the end."""
+        """Return the document that watchers get at the end."""
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class FollowUp:
-    """Work that no slot asks for: it has the machine to itself, as a check has, and starts on the terms of a schedule.
+    """Work outside the timetable: it has the machine to itself, as a check has, and starts under the preconditions of a schedule.
 
     ``job``: None: the schedule's check. ``begun``: called when it has the machine.
     """
@@ -84,12 +84,12 @@ class FollowUp:
 
     @property
     def name(self) -> str:
-        """What has the machine, for people."""
+        """Name of the work, for people."""
         return self.schedule.name
 
 
 class FollowUps(Protocol):
-    """Knows what else is to be done."""
+    """Source of work outside the timetable."""
 
     async def due(self) -> FollowUp | None:
         """Return what may start now, or None."""
@@ -101,23 +101,16 @@ RunJob = Callable[[Job[Any]], Awaitable[SlotState]]
 
 
 async def carry_out(job: Job[T], begun_utc: datetime, control: Control, watchers: Sequence[JobWatcher] = ()) -> SlotState:
-    """Run a job to its end.
+    """Run a job to its end; return its final state.
 
     Parameters
     ----------
-    job : Job
-        The work and its records.
     begun_utc : datetime
-        When it began.
+        When the job began.
     control : Control
-        Pauses and stops it.
+        Pauses and stops the job.
     watchers : sequence of JobWatcher
-        Called at its start, at each progress, and once its end is recorded.
-
-    Returns
-    -------
-    SlotState
-        How it ended.
+        Called at the start, at each progress, and once the end is recorded.
 
     Raises
     ------
@@ -166,7 +159,7 @@ async def _record_interruption(job: Job[T]) -> None:
 
 
 def is_defect(error: Exception) -> bool:
-    """Whether something other than devices, data and numerics failed.
+    """Return whether something other than devices, data and numerics failed.
 
     Devices that are watched side by side fail with a group; one unknown member makes the whole group a defect.
     """
@@ -174,7 +167,7 @@ def is_defect(error: Exception) -> bool:
 
 
 def failure(error: Exception) -> JobOutcome:
-    """Return the outcome of work that a person ended or that failed: cause, remedy, and the notes added on its way up."""
+    """Return the outcome of work that failed or that a person ended: cause, remedy, and the notes of the error."""
     ended, cause = isinstance(error, Stopped | Aborted), record.cause_of(error)
     parts = [cause["what"], "" if ended else cause["remedy"], *getattr(error, "__notes__", [])]
     return JobOutcome("stopped" if ended else "failed", "; ".join(filter(None, parts)))
@@ -191,11 +184,11 @@ class CheckJobs:
     check : callable
         ``await check(recipe, progress, control)``.
     shelf : Shelf
-        Keeps the documents.
+        Stores the documents.
     clock : Clock
         Times of failed checks.
     after : callable, optional
-        ``await after(doc, number)`` for every verification that was kept.
+        ``await after(doc, number)``, called for every stored verification.
     """
 
     machine: str
@@ -210,7 +203,7 @@ class CheckJobs:
 
 
 class _CheckJob(Job[Doc]):
-    """The check of one slot. What it found is kept, and if it failed, why; the timetable goes on either way."""
+    """The check of one slot. Its result, or the cause of its failure, is stored; the timetable continues either way."""
 
     handles_abort = True
 
@@ -221,23 +214,23 @@ class _CheckJob(Job[Doc]):
         self._doc: Doc | None = None
 
     async def do(self, progress: ProgressSink, control: Control) -> Doc:
-        return record.found(self._occasion, await self._checks.check(self.terms.recipe, progress, control))
+        return record.check_doc(self._occasion, await self._checks.check(self.terms.recipe, progress, control))
 
     async def failed(self, error: Exception) -> Doc:
         log.warning("check failed", schedule=self.terms.name, **record.cause_of(error), exc_info=_traceback(error))
-        return record.failed(self._occasion, error, self._started_utc, self._checks.clock.monotonic_s() - self._started_s)
+        return record.failed_doc(self._occasion, error, self._started_utc, self._checks.clock.monotonic_s() - self._started_s)
 
     async def end(self, outcome: Doc) -> SlotState:
         self._doc = outcome
         number = await self._checks.shelf.keep(outcome)
-        meaning = "" if self._checks.after is None else await self._checks.after(outcome, number)
+        consequence = "" if self._checks.after is None else await self._checks.after(outcome, number)
         log.info("check done", schedule=self.terms.name, verification=number, verdict=outcome["verdict"], text=outcome["text"])
-        return SlotState(f"done: {outcome['verdict']}", meaning, verification=number)
+        return SlotState(f"done: {outcome['verdict']}", consequence, verification=number)
 
     def document(self) -> Doc | None:
         return self._doc
 
 
 def _traceback(cause: Exception) -> Exception | None:
-    """The error, if its traceback helps; it does not for a cable that came off."""
+    """Return the error if its traceback helps; it does not for a disconnected cable."""
     return None if isinstance(cause, DriverError | AbbeError | OSError | ExceptionGroup) else cause

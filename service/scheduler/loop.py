@@ -1,7 +1,7 @@
-"""The timetable at work: each slot claimed once, one job at a time, nothing missed in silence.
+"""Run the timetable: each slot is claimed once, one job runs at a time, and every missed slot is reported.
 
-A slot that is due waits until it may start: no other check runs, no maintenance window, the machine as the schedule needs it. How long it
-may wait is the schedule's grace; a slot found later than that is a missed one. What a slot ends as is in `abbe.service.scheduler.outcomes`.
+A due slot waits until it may start: no other check runs, no maintenance window is open, the machine meets the schedule's preconditions. It
+waits at most for the schedule's grace; a slot found later than that is missed. `abbe.service.scheduler.outcomes` lists the outcomes.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from abbe.service.sequences.control import Control
 log = structlog.get_logger("abbe.scheduler")
 
 JUMP_S = 2.0
-"""Wall clock and monotonic clock may differ by this much over one wait before we say that somebody set the clock."""
+"""Wall clock and monotonic clock may differ by this much over one wait, s; beyond it the clock was set."""
 
 MAX_BACKLOG = 1000
-"""More missed slots than this are written down as one span: a clock set to next year must not fill the disk."""
+"""More missed slots than this are recorded as one span: a clock set to next year must not fill the disk."""
 
 ADOPT_S = 900.0
-"""How often slots are looked for that another service, which is gone, has left open."""
+"""Time between two searches for open slots of a service that is gone, s."""
 
 RunSlot = Callable[[Schedule, datetime], Awaitable[str]]
-"""``await run(schedule, slot)``: runs the check of a slot; returns the state to write for it."""
+"""``await run(schedule, slot)``: runs the check of a slot; returns the state to record for it."""
 
 
 class Alarms(Protocol):
-    """Where the scheduler's own alarms go."""
+    """Recipient of the scheduler's own alarms."""
 
     async def alarm(self, doc: Doc) -> None:
         """Queue an alarm."""
@@ -50,22 +50,22 @@ class Alarms(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LoopTerms:
-    """On what terms slots start.
+    """Conditions and pace of the scheduler.
 
     Parameters
     ----------
     maintenance : sequence of Window
-        Nothing starts in these.
+        Windows in which nothing starts.
     ready : Readiness
-        Knows the preconditions.
+        Checks the preconditions.
     poll_s : float
-        The longest wait: how soon a changed wall clock is noticed.
+        Longest wait, s: how soon a changed wall clock is noticed.
     recheck_s : float
-        The longest wait while a slot waits for its preconditions.
+        Longest wait while a slot waits for its preconditions, s.
     follow_ups : FollowUps, optional
-        What is to be done beside the timetable; slots go first.
+        Work outside the timetable; slots go first.
     run_job : callable, optional
-        Runs the jobs of follow-ups; default: without a way to steer them.
+        Runs the jobs of follow-ups; default: people cannot steer them.
     """
 
     maintenance: Sequence[Window] = ()
@@ -86,11 +86,9 @@ class Scheduler:
     ledger : SlotLedger
         Remembers slots across restarts; its ``claim`` makes each of them run once.
     run_slot : callable
-        ``await run_slot(schedule, slot)`` returns the state to write for the slot.
+        ``await run_slot(schedule, slot)`` returns the state to record for the slot.
     alarms : Alarms
         Gets missed and skipped slots and clock jumps.
-    clock : Clock
-        All waiting and all "now".
     terms : LoopTerms, optional
         Maintenance windows, preconditions, pace.
     """
@@ -119,16 +117,16 @@ class Scheduler:
         self._adopt_at_s = 0.0
 
     def next_due(self) -> list[tuple[Schedule, datetime]]:
-        """Return what comes next of each schedule, soonest first."""
+        """Return the next slot of each schedule, soonest first."""
         now = self._clock.utc()
         due = [(schedule, slot) for schedule in self._schedules if (slot := next_slot(schedule, now)) is not None]
         return sorted(due, key=lambda pair: pair[1])
 
     async def run(self) -> None:
-        """Work for ever. Cancelling stops a running job through its own cancellation, waits for it, and gives back what had to wait."""
+        """Work forever. Cancelling stops a running job by its own cancellation, waits for it, and releases the waiting slots."""
         now = self._clock.utc()
         for schedule in self._schedules:
-            # From the last slot we know of: what came due while the service was off is recorded, not forgotten.
+            # From the last known slot on: slots that came due while the service was off are recorded.
             last = await self._ledger.last_claimed(schedule.name)
             self._move_cursor(schedule, now if last is None else min(last, now))
         self._adopt_at_s = self._clock.monotonic_s()
@@ -138,8 +136,8 @@ class Scheduler:
                 while True:
                     await self._adopt()
                     for schedule in self._schedules:
-                        await self._deal_with_due(schedule)
-                    await self._start_what_may(tasks)
+                        await self._handle_due(schedule)
+                    await self._start_waiting(tasks)
                     await self._start_follow_up(tasks)
                     await self._wait()
         finally:
@@ -147,14 +145,14 @@ class Scheduler:
                 await self._ledger.release(waiting.schedule.name, waiting.slot)
 
     def take(self, name: str) -> str:
-        """Take the machine for a check that is not of the timetable; return what runs instead, or nothing. `give_back` it."""
+        """Take the machine for work outside the timetable; return the name of what has it instead, or nothing. `give_back` releases it."""
         if self._running is None:
             self._running = name
             return ""
         return self._running
 
     def give_back(self) -> None:
-        """The machine is free again: what waits for it may start."""
+        """Release the machine: waiting slots may start."""
         self._running = None
         self._ended.set()
 
@@ -164,7 +162,7 @@ class Scheduler:
         self._upcoming[schedule.name] = next(self._ahead[schedule.name], None)
 
     async def _adopt(self) -> None:
-        """Decide on what a service that is gone has left open: what ran was broken off, what waited waits on."""
+        """Take over the open slots of a service that is gone: a running check was interrupted, a waiting slot keeps waiting."""
         if self._clock.monotonic_s() < self._adopt_at_s:
             return
         self._adopt_at_s = self._clock.monotonic_s() + ADOPT_S
@@ -175,7 +173,7 @@ class Scheduler:
                 else:
                     await self._take(schedule, slot)
 
-    async def _deal_with_due(self, schedule: Schedule) -> None:
+    async def _handle_due(self, schedule: Schedule) -> None:
         now = self._clock.utc()
         upcoming = self._upcoming[schedule.name]
         if upcoming is None or upcoming > now:
@@ -186,7 +184,7 @@ class Scheduler:
             upcoming = next(self._ahead[schedule.name], None)
         self._cursor[schedule.name], self._upcoming[schedule.name] = due[-1], upcoming
         if len(due) > MAX_BACKLOG:
-            due = await self._write_down_span(schedule, due[0], now)
+            due = await self._record_span(schedule, due[0], now)
             self._move_cursor(schedule, due[-1])
         if schedule.catch_up == "once":
             await self._stand_for(schedule, due[:-1], due[-1])
@@ -195,22 +193,22 @@ class Scheduler:
             if await self._ledger.claim(schedule.name, slot):
                 await self._take(schedule, slot)
 
-    async def _write_down_span(self, schedule: Schedule, first: datetime, now: datetime) -> list[datetime]:
+    async def _record_span(self, schedule: Schedule, first: datetime, now: datetime) -> list[datetime]:
         last = previous_slot(schedule, now) or first
         if await self._ledger.claim(schedule.name, first):
             await self._end(schedule, first, outcomes.whole_span(schedule.name, first, last))
         return [last]
 
     async def _stand_for(self, schedule: Schedule, older: Sequence[datetime], by: datetime) -> None:
-        """Write down the older of several due slots: the run of the last one is for all of them, whichever service starts it."""
+        """Record the older of several due slots: the run of the last one stands for all of them, whichever service starts it."""
         ours = [slot for slot in older if await self._ledger.claim(schedule.name, slot)]
         for slot in ours:
-            await self._end(schedule, slot, outcomes.stood_for(schedule.name, slot, by), tell=False)
+            await self._end(schedule, slot, outcomes.stood_for(schedule.name, slot, by), alarm=False)
         if ours:
-            await self._tell(*outcomes.caught_up(schedule.name, ours, by))
+            await self._raise_alarm(*outcomes.caught_up(schedule.name, ours, by))
 
     async def _take(self, schedule: Schedule, slot: datetime) -> None:
-        """Decide on a slot that is ours: too late, or one that waits. Of one schedule no more than one waits."""
+        """Handle a claimed slot: it is too late, or it waits. At most one slot of a schedule waits."""
         late = self._clock.utc() - slot
         if schedule.catch_up == "skip" and late > timedelta(seconds=schedule.grace_s):
             await self._end(schedule, slot, outcomes.found_late(schedule, slot, late))
@@ -228,7 +226,7 @@ class Scheduler:
             self._waiting.remove(other)
         self._waiting.append(new)
 
-    async def _start_what_may(self, tasks: asyncio.TaskGroup) -> None:
+    async def _start_waiting(self, tasks: asyncio.TaskGroup) -> None:
         self._ended.clear()
         for waiting in sorted(self._waiting, key=lambda one: one.slot):
             now, until = self._clock.utc(), waiting.until
@@ -244,17 +242,17 @@ class Scheduler:
                 )
             elif hindrance is not None:
                 waiting.hindrance = hindrance
-                if now > waiting.grace_ends and not waiting.told:
-                    waiting.told = True
-                    await self._tell(*outcomes.still_waits(waiting, hindrance))
+                if now > waiting.grace_ends and not waiting.alarmed:
+                    waiting.alarmed = True
+                    await self._raise_alarm(*outcomes.still_waits(waiting, hindrance))
             else:
-                self._running = waiting.schedule.name  # before anything is awaited: nothing else takes the machine now
+                self._running = waiting.schedule.name  # before anything is awaited, so that nothing else takes the machine
                 await self._ledger.begin(waiting.schedule.name, waiting.slot)
                 self._waiting.remove(waiting)
                 tasks.create_task(self._run_check(waiting.schedule, waiting.slot), name=f"check {waiting.schedule.name}")
 
     async def _hindrance(self, schedule: Schedule) -> Hindrance | None:
-        """Return what keeps a schedule from starting now, the cheapest question first: devices are asked last."""
+        """Return what keeps a schedule from starting now. The cheapest question comes first; devices are asked last."""
         if self._running is not None:
             return busy(self._running)
         window = covering(self._terms.maintenance, self._clock.utc())
@@ -264,12 +262,12 @@ class Scheduler:
         return not_ready(lack) if lack else None
 
     async def _start_follow_up(self, tasks: asyncio.TaskGroup) -> None:
-        """Start what no slot asks for, on the terms of its schedule."""
+        """Start work outside the timetable, under the preconditions of its schedule."""
         if self._terms.follow_ups is None or self._running is not None:
             return
         due = await self._terms.follow_ups.due()
         if due is None or await self._hindrance(due.schedule) is not None or self._running is not None:
-            return  # the last: a person took the machine while the devices were asked
+            return  # the last condition: a person took the machine while the devices were asked
         self._running = due.name
         if due.begun is not None:
             due.begun()
@@ -293,31 +291,31 @@ class Scheduler:
             state = await self._run_slot(schedule, slot)
             ended = outcomes.SlotOutcome(state, "", state.reason if isinstance(state, SlotState) else "")
         except Exception:
-            ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and no person has stopped it
+            ended = outcomes.broken_off(schedule.name, slot)  # a defect: the service ends with it, and no person stopped it
             raise
         finally:
             self.give_back()
-            await self._end(schedule, slot, ended, tell=bool(ended.code))
+            await self._end(schedule, slot, ended, alarm=bool(ended.code))
             log.info("slot done", schedule=schedule.name, slot=slot.isoformat(), state=ended.state)
 
     async def _wait(self) -> None:
-        """Sleep to the next slot, or to the next look at the clock, and notice if somebody set the clock meanwhile."""
+        """Sleep until the next slot or the next look at the clock, and notice if the clock was set meanwhile."""
         utc, monotonic_s = self._clock.utc(), self._clock.monotonic_s()
-        moments = [slot for slot in self._upcoming.values() if slot is not None]
-        # Once a slot's time is up it is given up, so no moment of those that wait lies in the past for longer than one turn.
-        moments += [waiting.until for waiting in self._waiting if waiting.until is not None]
+        instants = [slot for slot in self._upcoming.values() if slot is not None]
+        # A slot whose time is up is dropped, so the deadline of a waiting slot lies in the past for at most one turn.
+        instants += [waiting.until for waiting in self._waiting if waiting.until is not None]
         longest_s = min(self._terms.poll_s, self._terms.recheck_s) if self._waiting else self._terms.poll_s
-        until_s = min(((moment - utc).total_seconds() for moment in moments), default=longest_s)
+        until_s = min(((instant - utc).total_seconds() for instant in instants), default=longest_s)
         await self._nap(min(max(until_s, 0.0), longest_s))
         now = self._clock.utc()
         jump_s = (now - utc).total_seconds() - (self._clock.monotonic_s() - monotonic_s)
         if abs(jump_s) <= JUMP_S:
             return
         if jump_s < 0:
-            # Slots already claimed stay claimed; without this a clock once set too far ahead would silence us until then.
+            # Claimed slots stay claimed; without this a clock once set too far ahead would stop the timetable until then.
             for schedule in self._schedules:
                 self._move_cursor(schedule, min(self._cursor[schedule.name], now))
-        await self._tell("SCH-003", f"the computer's clock jumped by {jump_s:+.0f} s to {now:%F %T} UTC")
+        await self._raise_alarm("SCH-003", f"the computer's clock jumped by {jump_s:+.0f} s to {now:%F %T} UTC")
 
     async def _nap(self, seconds: float) -> None:
         """Sleep, or, while a slot waits for the machine, until the running check has ended."""
@@ -331,11 +329,11 @@ class Scheduler:
             for nap in naps:
                 nap.cancel()
 
-    async def _end(self, schedule: Schedule, slot: datetime, outcome: outcomes.SlotOutcome, *, tell: bool = True) -> None:
+    async def _end(self, schedule: Schedule, slot: datetime, outcome: outcomes.SlotOutcome, *, alarm: bool = True) -> None:
         await self._ledger.finish(schedule.name, slot, outcome.state, outcome.text)
-        if tell:
-            await self._tell(outcome.code, outcome.text)
+        if alarm:
+            await self._raise_alarm(outcome.code, outcome.text)
 
-    async def _tell(self, code: str, what: str) -> None:
+    async def _raise_alarm(self, code: str, what: str) -> None:
         log.warning(what, code=code)
         await self._alarms.alarm({"code": code, "what": what, "at_utc": self._clock.utc().isoformat()})

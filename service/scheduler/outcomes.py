@@ -1,9 +1,9 @@
-"""What becomes of a slot that is not simply run, in words: state (at most 30 characters), code of the alarm, and the sentence to both.
+"""Outcomes of slots that are not simply run: state (at most 30 characters), code of the alarm, and the sentence for both.
 
-``done: <verdict>`` is written by the job, ``interrupted`` also when the service was stopped. All others are made here:
-``missed: <how> late`` (moving a machine hours after the planned time would surprise whoever stands there), ``skipped: busy``,
+The job writes ``done: <verdict>``; ``interrupted`` is also written when the service is stopped. All others are made here:
+``missed: <how> late`` (moving a machine hours after the planned time would surprise anyone next to it), ``skipped: busy``,
 ``missed: maintenance``, ``missed: not ready``, ``skipped: newer slot``, ``missed: see <slot>`` (one run stands for several slots),
-``missed: whole span`` (too many to be listed).
+``missed: whole span`` (too many to list).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class SlotOutcome(NamedTuple):
 
 
 def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutcome:
-    """No service was there to start it in time."""
+    """No service was running to start it in time."""
     allowed = span(timedelta(seconds=schedule.grace_s))
     how = span(late)
     return SlotOutcome(
@@ -34,19 +34,19 @@ def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutco
 
 
 def overrun(name: str, slot: datetime) -> SlotOutcome:
-    """The schedule's own check before it takes longer than the timetable has it."""
+    """The schedule's previous check still runs: it takes longer than the timetable allows."""
     return SlotOutcome("skipped: busy", "SCH-002", f"{_slot(name, slot)} was skipped: {name!r} was still running")
 
 
 def kept_from_starting(waiting: Waiting, hindrance: Hindrance) -> SlotOutcome:
-    """It waited as long as it may."""
+    """It waited until its grace ended."""
     verb = hindrance.state.partition(":")[0]
     code = "SCH-002" if verb == "skipped" else "SCH-001"
     return SlotOutcome(hindrance.state, code, f"{_slot(waiting.schedule.name, waiting.slot)} was {verb}: {hindrance.text}")
 
 
 def superseded(waiting: Waiting, newer: datetime) -> SlotOutcome:
-    """It still waited when the next slot of its schedule came due."""
+    """It was still waiting when the next slot of its schedule came due."""
     text = f"{_slot(waiting.schedule.name, waiting.slot)} was skipped: slot {newer:%F %R} UTC is due as well"
     why = f"; it had to wait because {waiting.hindrance.text}" if waiting.hindrance is not None else ""
     return SlotOutcome("skipped: newer slot", "SCH-002", text + why)
@@ -61,24 +61,24 @@ def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindra
 
 
 def broken_off(name: str, slot: datetime) -> SlotOutcome:
-    """The service ended, by a power cut say, while the check ran. It is not run again: how far it got is not known."""
+    """The service ended, for example by a power cut, while the check ran. The check is not repeated: how far it got is unknown."""
     return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
 
 
 def stopped(name: str, slot: datetime) -> SlotOutcome:
-    """The service was stopped while it was measured: said at once, or it would not be missed before the next start."""
+    """The service was stopped while the check ran: recorded at once, else it would only be missed at the next start."""
     return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service was stopped while it ran")
 
 
 def whole_span(name: str, first: datetime, last: datetime) -> SlotOutcome:
-    """Too many slots to write each of them down."""
+    """Too many slots to record each of them."""
     return SlotOutcome(
         "missed: whole span", "SCH-004", f"{name}: every slot from {first:%F %R} to {last:%F %R} UTC was missed; they are too many to list"
     )
 
 
 def caught_up(name: str, instead: Sequence[datetime], by: datetime) -> tuple[str, str]:
-    """Code and sentence of the one alarm for all slots that one run stands for."""
+    """Return code and sentence of the one alarm for all slots that one run stands for."""
     slots = (
         f"{len(instead)} slots from {instead[0]:%F %R} to {instead[-1]:%F %R} UTC were"
         if len(instead) > 1
@@ -88,7 +88,7 @@ def caught_up(name: str, instead: Sequence[datetime], by: datetime) -> tuple[str
 
 
 def still_waits(waiting: Waiting, hindrance: Hindrance) -> tuple[str, str]:
-    """Code and sentence for a slot that is to be caught up and cannot be yet."""
+    """Return code and sentence for a slot that must be caught up but cannot start yet."""
     return "SCH-006", f"{_slot(waiting.schedule.name, waiting.slot)} is late and waits: {hindrance.text}"
 
 
@@ -97,7 +97,7 @@ def _slot(name: str, slot: datetime) -> str:
 
 
 def span(length: timedelta) -> str:
-    """Return a length of time in words, coarsely."""
+    """Return a duration as text, coarsely."""
     seconds = length.total_seconds()
     if seconds < 120:
         return f"{seconds:.0f} s"

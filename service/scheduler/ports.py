@@ -1,4 +1,4 @@
-"""What the scheduler needs from the rest of the service, as small Protocols. Tests stand in for each with a few lines."""
+"""Protocols of what the scheduler needs from the rest of the service. Tests replace each with a few lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pauses, resumes, stops or aborts it."""
 
 
 class SlotState(str):
-    """What a slot or a job ended as, with the sentence to it, and the numbers of a solution, a proposal and a verification in the store."""
+    """Final state of a slot or a job, with its sentence, and the numbers of a solution, a proposal and a verification in the store."""
 
     reason: str
     solution: int | None
@@ -31,23 +31,23 @@ class SlotState(str):
     def __new__(
         cls, state: str, reason: str = "", solution: int | None = None, proposal: int | None = None, verification: int | None = None
     ) -> Self:
-        """Make one."""
+        """Make a state with its sentence and numbers."""
         made = super().__new__(cls, state)
         made.reason, made.solution, made.proposal, made.verification = reason, solution, proposal, verification
         return made
 
     @classmethod
     def of(cls, outcome: JobOutcome) -> Self:
-        """What a job ended as by its outcome."""
+        """Return the final state for a job's outcome."""
         return cls(f"done: {outcome.word}", outcome.text, outcome.solution, outcome.proposal)
 
 
 AfterCheck = Callable[[Doc, int], Awaitable[str]]
-"""``await after(doc, number)``: what a kept verification means beyond itself, as a sentence; empty: nothing."""
+"""``await after(doc, number)``: returns a sentence about further consequences of a stored verification; empty: none."""
 
 
 class OpenSlot(NamedTuple):
-    """A slot that a service which is gone left open. ``ran``: the machine had begun to move for it."""
+    """A slot left open by a service that is gone. ``ran``: the machine had begun to move for it."""
 
     slot_utc: datetime
     ran: bool
@@ -61,7 +61,7 @@ class SlotLedger(Protocol):
         ...
 
     async def begin(self, schedule: str, slot_utc: datetime) -> None:
-        """Note that the check of a claimed slot starts: it is not started again."""
+        """Note that the check of a claimed slot starts: it is never started again."""
         ...
 
     async def release(self, schedule: str, slot_utc: datetime) -> None:
@@ -69,11 +69,11 @@ class SlotLedger(Protocol):
         ...
 
     async def adopt(self, schedule: str) -> list[OpenSlot]:
-        """Take over the open slots whose service is gone, in order of time. Each is given to exactly one caller."""
+        """Take over the open slots of services that are gone, in order of time. Each goes to exactly one caller."""
         ...
 
     async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
-        """Write down what became of a claimed slot: state (30 characters) and the sentence to it."""
+        """Record the outcome of a claimed slot: state (30 characters) and its sentence."""
         ...
 
     async def last_claimed(self, schedule: str) -> datetime | None:
@@ -82,19 +82,19 @@ class SlotLedger(Protocol):
 
 
 class Readiness(Protocol):
-    """Knows whether the machine is as a schedule needs it."""
+    """Checks whether the machine meets a schedule's preconditions."""
 
     async def lack(self, schedule: Schedule) -> str:
-        """Return what is lacking as one sentence, or nothing."""
+        """Return the unmet precondition as one sentence, or nothing."""
         ...
 
     async def watch(self) -> None:
-        """Work for ever on what has to be seen over time, or return at once."""
+        """Observe forever what must be known over time, or return at once."""
         ...
 
 
 class Shelf(Protocol):
-    """Keeps results, and with each result the message that tells the world about it."""
+    """Stores results, each with the message that publishes it."""
 
     async def keep(self, doc: Doc) -> int:
         """Store a verification and queue its message, together; return its number."""
@@ -106,14 +106,14 @@ class Shelf(Protocol):
 
 
 class JobWatcher(Protocol):
-    """Follows the running job; its methods are called synchronously."""
+    """Follows the running job; the methods are called synchronously."""
 
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
         """A check begins."""
         ...
 
     def job_progress(self, progress: Progress) -> None:
-        """The check got further."""
+        """The check made progress."""
         ...
 
     def job_ended(self, doc: Doc | None) -> None:

@@ -1,4 +1,4 @@
-"""Preconditions of a scheduled check, as far as devices and machine file can tell. Nothing here moves the machine or writes to it."""
+"""Preconditions of a scheduled check, as far as devices and machine file show them. Nothing here moves or writes to the machine."""
 
 from __future__ import annotations
 
@@ -17,54 +17,52 @@ from abbe.service.scheduler.windows import covering
 from abbe.service.sequences.interlocks import person_may_be_inside, tripped
 
 LOOK_S = 60.0
-"""How often the controller is looked at where a schedule needs a warm machine."""
+"""Time between two looks at the controller if a schedule needs a warm machine, s."""
 HOUR_S = 3600.0
 WARMS = Condition.MOVING | Condition.PATH_RUNNING | Condition.NC_PROGRAM | Condition.SPINDLE
-"""What warms a machine."""
+"""Conditions in which the machine warms up."""
 MOVED_MM = 1e-4
-"""An axis that stands elsewhere than at the last look has moved in between."""
+"""An axis whose position differs by more than this from the last look has moved, mm."""
 
 
 @dataclass(frozen=True, slots=True)
-class SeenDevices:
-    """One look at the devices: the controller's status, and the air's temperature where there is a laser."""
+class DeviceReadings:
+    """One reading of the devices: the controller's status, and the air temperature if there is a laser."""
 
     status: ControllerStatus
     air_c: float | None = None
 
 
-Look = Callable[[bool], Awaitable[SeenDevices]]
+Look = Callable[[bool], Awaitable[DeviceReadings]]
 """``await look(with_air)``: opens the devices, reads, closes them."""
 
 
 def look_at(urls: DeviceUrls) -> Look:
-    """Return how to look at the devices behind ``urls``. It is refused while a job has the machine."""
+    """Return how to read the devices behind ``urls``. Reading is refused while a job has the machine."""
 
-    async def look(with_air: bool) -> SeenDevices:
+    async def look(with_air: bool) -> DeviceReadings:
         with lock_machine(urls.cnc):
-            pass  # not held: who comes to measure meanwhile must not be turned away by somebody who only looks
+            pass  # released at once: a job that starts meanwhile must not be refused because of a look
         async with open_session(DeviceUrls(cnc=urls.cnc, laser=urls.laser if with_air else None)) as session:
             air = (await session.laser.peek()).air_temp_c if session.laser is not None else None
-            return SeenDevices(await session.controller.status(), air)
+            return DeviceReadings(await session.controller.status(), air)
 
     return look
 
 
 class Ready:
-    """Says what a schedule lacks.
+    """Checks the preconditions of schedules.
 
     Parameters
     ----------
     look : Look
-        At the devices.
+        Reads the devices.
     schedules : sequence of Schedule
-        Those that may be asked for: the machine is only watched if one of them needs it warm.
+        All schedules: the machine is only watched if one of them needs it warm.
     air_c : tuple of float
-        Window of the air's temperature, degree C.
+        Window of the air temperature, degree C.
     staffed : sequence of Window
         When an operator is there.
-    clock : Clock
-        Now.
     """
 
     def __init__(
@@ -79,14 +77,14 @@ class Ready:
         self._position: tuple[float, ...] | None = None
 
     async def lack(self, schedule: Schedule) -> str:
-        """Return what is lacking as one sentence, or nothing. The devices are asked only for what needs them."""
+        """Return the unmet precondition as one sentence, or nothing. The devices are read only if a precondition needs them."""
         needs = schedule.needs
         if needs == Needs():
             return ""
-        there = covering(self._staffed, self._clock.utc()) is not None
-        if needs.operator == "present" and not there:
+        staffed = covering(self._staffed, self._clock.utc()) is not None
+        if needs.operator == "present" and not staffed:
             return "no operator is there at this hour"
-        if needs.operator == "absent" and there:
+        if needs.operator == "absent" and staffed:
             return "an operator is there at this hour"
         if needs.warm_min and (minutes := self.active_min()) < needs.warm_min:
             return f"the machine is not warm: it was seen at work for {minutes:.0f} of the last 60 min, needed are {needs.warm_min:g}"
@@ -97,31 +95,31 @@ class Ready:
         except (DriverError, AbbeError, OSError) as trouble:
             return f"the devices cannot be asked: {trouble}"
 
-    def _of_devices(self, needs: Needs, seen: SeenDevices) -> str:
-        if needs.operator == "absent" and person_may_be_inside(seen.status):
-            return "somebody is at the machine: the door is open, or the mode is not remote"
+    def _of_devices(self, needs: Needs, readings: DeviceReadings) -> str:
+        if needs.operator == "absent" and person_may_be_inside(readings.status):
+            return "a person is at the machine: the door is open, or the mode is not remote"
         if needs.idle:
-            trouble = tripped(seen.status)
+            trouble = tripped(readings.status)
             if trouble is not None:
                 return f"the machine is not idle: {trouble.detail}"
-            if seen.status.moving or seen.status.path_running:
+            if readings.status.moving or readings.status.path_running:
                 return "the machine is not idle: an axis moves"
         if needs.air:
             low, high = self._air_c
-            if seen.air_c is None:
-                return "nobody measures the air's temperature: there is no laser in the machine file"
-            if not low <= seen.air_c <= high:
-                return f"the air has {seen.air_c:.1f} C, allowed are {low:g}..{high:g} C"
+            if readings.air_c is None:
+                return "the air temperature is not measured: the machine file has no laser"
+            if not low <= readings.air_c <= high:
+                return f"the air has {readings.air_c:.1f} C, allowed are {low:g}..{high:g} C"
         return ""
 
     def active_min(self) -> float:
-        """Return in how many of the last 60 minutes the machine was seen at work."""
+        """Return the number of minutes of the last 60 in which the machine was seen at work."""
         while self._active and self._active[0] <= self._clock.monotonic_s() - HOUR_S:
             self._active.popleft()
         return len(self._active) * LOOK_S / 60.0
 
     async def watch(self) -> None:
-        """Look at the controller each minute, for ever, if a schedule needs a warm machine. What is not seen does not count as work."""
+        """Read the controller each minute, forever, if a schedule needs a warm machine. A failed reading does not count as work."""
         while self._watches:
             try:
                 self._note((await self._look(False)).status)
@@ -137,10 +135,10 @@ class Ready:
 
 
 class AlwaysReady:
-    """For timetables without preconditions."""
+    """Preconditions of timetables that have none."""
 
     async def lack(self, schedule: Schedule) -> str:
-        """Return nothing: nothing is lacking."""
+        """Return an empty sentence: every precondition is met."""
         return ""
 
     async def watch(self) -> None:

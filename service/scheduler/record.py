@@ -14,7 +14,7 @@ from abbe.service.errors import AbbeError
 from abbe.service.scheduler.ports import Doc
 
 SCHEMA = 1
-"""Version of the documents. Raised when a key changes its meaning or goes; new keys do not raise it."""
+"""Version of the documents. It rises when a key changes its meaning or disappears, not for new keys."""
 
 VERDICTS = ("pass", "fail", "cannot tell")
 
@@ -28,12 +28,12 @@ class Occasion:
     slot_utc: datetime
 
 
-def found(occasion: Occasion, result: CheckResult) -> Doc:
-    """Return the document of a check that came to an end."""
+def check_doc(occasion: Occasion, result: CheckResult) -> Doc:
+    """Return the document of a completed check."""
     return {
         **_head(occasion, result.started_utc),
         "duration_s": round(result.duration_s, 3),
-        # A verdict we do not know must not look like a pass.
+        # An unknown verdict must not look like a pass.
         "verdict": result.verdict if result.verdict in VERDICTS else "cannot tell",
         "values": _figures(result.values),
         "uncertainties": _figures(result.uncertainties),
@@ -46,8 +46,8 @@ def found(occasion: Occasion, result: CheckResult) -> Doc:
     }
 
 
-def failed(occasion: Occasion, cause: Exception, started_utc: datetime, duration_s: float) -> Doc:
-    """Return the document of a check that could not be completed: nothing is claimed, the cause is named."""
+def failed_doc(occasion: Occasion, cause: Exception, started_utc: datetime, duration_s: float) -> Doc:
+    """Return the document of a check that could not be completed: no verdict, but the cause."""
     reason = cause_of(cause)
     return {
         **_head(occasion, started_utc),
@@ -78,7 +78,7 @@ def alarm(doc: Doc) -> Doc:
 def cause_of(cause: Exception) -> Doc:
     """Return code, one line of cause, remedy and device of an error.
 
-    A group of errors is answered for by its first known member: with several devices going down together the first is the news.
+    The first known member represents a group of errors: if several devices fail together, the first failure matters.
     """
     known = _first(cause)
     if isinstance(known, DriverError):
@@ -108,10 +108,10 @@ def _head(occasion: Occasion, started_utc: datetime) -> Doc:
 
 
 def _figures(figures: Mapping[str, float]) -> dict[str, float | None]:
-    """JSON knows neither NaN nor infinity; a figure that is none becomes null."""
+    """Replace NaN and infinity, which JSON does not have, with null."""
     return {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
 
 
 def _line(text: str) -> str:
-    """Return ``text`` as one line of sane length: device strings end up in logs and pages."""
+    """Return ``text`` as one printable line of at most 500 characters: device strings end up in logs and pages."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:500]

@@ -1,4 +1,4 @@
-"""Ledger and shelf on top of the store, off the event loop, patient with a database that is locked or restarting for a while."""
+"""Ledger and shelf on top of the store, off the event loop; they retry while the database is locked or restarts."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PAUSES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-"""A minute altogether. A measurement takes minutes of machine time; it is not thrown away because of a backup run."""
+"""Pauses between tries, s: a minute in total. A measurement of minutes must not be lost because of a backup run."""
 
 
 class RetryingStore:
-    """Writes, and reads, again and again while the database does not take it."""
+    """Retries writes and reads while the database does not accept them."""
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self._store = store
@@ -43,13 +43,13 @@ class RetryingStore:
             try:
                 return await once()
             except StoreError as trouble:
-                log.warning("store does not take this now; trying again", cause=trouble.detail, pause_s=pause_s)
+                log.warning("store retry", cause=trouble.detail, pause_s=pause_s)
                 await self._clock.sleep(pause_s)
         return await once()
 
 
 class StoreLedger(RetryingStore):
-    """Slots in the store. Each key names the machine: one database may serve several services."""
+    """Slots in the store. Each key includes the machine's name: several services may share a database."""
 
     def __init__(self, store: Store, clock: Clock, machine: str) -> None:
         super().__init__(store, clock)
@@ -60,7 +60,7 @@ class StoreLedger(RetryingStore):
         return await self._write(self._store.slots.claim, self._key(schedule), slot_utc)
 
     async def begin(self, schedule: str, slot_utc: datetime) -> None:
-        """Note that the check of a claimed slot starts: it is not started again."""
+        """Note that the check of a claimed slot starts: it is never started again."""
         await self._write(self._store.slots.begin, self._key(schedule), slot_utc)
 
     async def release(self, schedule: str, slot_utc: datetime) -> None:
@@ -68,12 +68,12 @@ class StoreLedger(RetryingStore):
         await self._write(self._store.slots.release, self._key(schedule), slot_utc)
 
     async def adopt(self, schedule: str) -> list[OpenSlot]:
-        """Take over the open slots whose service is gone, in order of time. Each is given to exactly one caller."""
+        """Take over the open slots of services that are gone, in order of time. Each goes to exactly one caller."""
         found = await self._write(self._store.slots.adopt, self._key(schedule))
         return [OpenSlot(datetime.fromisoformat(one.slot_utc), one.state == RUNNING) for one in found]
 
     async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
-        """Write down what became of a claimed slot: state (30 characters) and the sentence to it."""
+        """Record the outcome of a claimed slot: state (30 characters) and its sentence."""
         await self._write(self._store.slots.finish, self._key(schedule), slot_utc, state[:30], reason)
 
     async def last_claimed(self, schedule: str) -> datetime | None:
@@ -89,16 +89,12 @@ class StoreShelf(RetryingStore):
 
     Parameters
     ----------
-    store : Store
-        Where to.
-    clock : Clock
-        Pauses while the store is not available.
     machine : tuple of str and int
         Name, and number in the store.
     topics : tuple of str
-        Where verifications and alarms are published; empty if there is no broker in the machine file.
+        Topics of verifications and of alarms; None if the machine file has no broker.
     posted : callable
-        Called when there is something new to publish.
+        Called when there is a new message to publish.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
-"""Cron expression and time zone, or an interval, to UTC slots. Pure: no clock, no state.
+"""Convert a cron expression with its time zone, or an interval, to UTC slots. Pure: no clock, no state.
 
-A slot is a UTC instant at which a schedule is due. Daylight saving is settled here and nowhere else: a time that does not
-exist (spring) fires once, at the first instant after the gap; a time that exists twice (autumn) fires once, at its first
-occurrence; expressions that run every so many minutes run through both hours. Intervals are counted in UTC from a fixed
-instant, so that every process and every restart finds the same slots.
+A slot is a UTC instant at which a schedule is due. Daylight saving is handled only here: a time that does not exist (spring) is due once,
+at the first instant after the gap; a time that exists twice (autumn) is due once, at its first occurrence; expressions that repeat every
+few minutes run through both hours. Intervals count in UTC from a fixed instant, so that every process and every restart finds the same
+slots.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def next_slot(schedule: Schedule, after_utc: datetime) -> datetime | None:
 
 
 def previous_slot(schedule: Schedule, until_utc: datetime) -> datetime | None:
-    """Return the last slot not later than ``until_utc``, or None if there never was one."""
+    """Return the last slot not later than ``until_utc``, or None if there was none."""
     until = until_utc.astimezone(UTC)
     if schedule.every_h:
         step = timedelta(hours=schedule.every_h)
         return (schedule.first + (until - schedule.first) // step * step).astimezone(UTC)
-    # Forward iteration defines the slots; walking backwards only finds a place to start from that is early enough.
+    # Forward iteration defines the slots; iterating backwards only finds an early enough start.
     zone = ZoneInfo(schedule.timezone)
     early = (until - wall.CLOCK_CHANGE).astimezone(zone).replace(tzinfo=None)
     before = next(CronSim(schedule.cron, early, reverse=True), None)
@@ -72,7 +72,7 @@ def slots_between(schedule: Schedule, after_utc: datetime, until_utc: datetime) 
 
 
 def cron_in_words(schedule: Schedule) -> str:
-    """Return the expression as a sentence, for people."""
+    """Return the schedule as a sentence, for people."""
     if schedule.every_h:
         return f"Every {schedule.every_h:g} hours, counted from {schedule.first.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
     return CronSim(schedule.cron, datetime(2026, 1, 1, tzinfo=UTC)).explain()

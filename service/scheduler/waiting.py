@@ -1,4 +1,4 @@
-"""A slot that is due and has not started yet, and what keeps it."""
+"""A due slot that has not started yet, and what keeps it from starting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from abbe.service.domain.schedule import Schedule
 
 
 class Hindrance(NamedTuple):
-    """What the slot ends as if this lasts too long, and the sentence to it."""
+    """What keeps a slot from starting: the state of the slot if this lasts too long, and its sentence."""
 
     state: str
     text: str
@@ -18,21 +18,21 @@ class Hindrance(NamedTuple):
 
 @dataclass(slots=True)
 class Waiting:
-    """One claimed slot on its way. ``told``: an alarm has said that it waits."""
+    """One claimed slot that waits to start. ``alarmed``: an alarm about the wait was raised."""
 
     schedule: Schedule
     slot: datetime
     hindrance: Hindrance | None = None
-    told: bool = False
+    alarmed: bool = False
 
     @property
     def grace_ends(self) -> datetime:
-        """When it is late."""
+        """When the slot is late."""
         return self.slot + timedelta(seconds=self.schedule.grace_s)
 
     @property
     def until(self) -> datetime | None:
-        """When it is given up; None: never, it is caught up some time."""
+        """When the slot is dropped; None: never, it will be caught up."""
         return self.grace_ends if self.schedule.catch_up == "skip" else None
 
 
@@ -47,5 +47,5 @@ def maintenance(name: str) -> Hindrance:
 
 
 def not_ready(text: str) -> Hindrance:
-    """The machine is not as the schedule needs it."""
+    """A precondition of the schedule is not met."""
     return Hindrance("missed: not ready", text)

@@ -22,13 +22,13 @@ _SECOND = timedelta(seconds=1)
 
 
 def runs_through(cron: str) -> bool:
-    """Tell whether an expression goes by what the clock shows, in both hours of autumn: its minute or its hour begins with a star."""
+    """Return whether an expression runs in both hours of the autumn change: its minute or its hour begins with a star."""
     minute, hour = cron.split()[-5:-3]
     return minute.startswith("*") or hour.startswith("*")
 
 
 def due_after(cron: str, zone: ZoneInfo, after: datetime) -> Iterator[datetime]:
-    """Yield UTC instants in order, from about ``after`` (UTC) on: some may lie before it, some may come twice."""
+    """Yield UTC instants in order, from about ``after`` (UTC) on: some may lie before it, some may be repeated."""
     return _by_the_clock(cron, zone, after) if runs_through(cron) else _fixed_times(cron, zone, after)
 
 
@@ -38,7 +38,7 @@ def _fixed_times(cron: str, zone: ZoneInfo, after: datetime) -> Iterator[datetim
 
 
 def _by_the_clock(cron: str, zone: ZoneInfo, after: datetime) -> Iterator[datetime]:
-    """Between two changes of the clocks wall time is UTC plus a constant: cronsim counts there, and begins anew at each change."""
+    """Between two clock changes, wall time is UTC plus a constant: cronsim counts there, and restarts at each change."""
     while True:
         offset = after.astimezone(zone).utcoffset() or timedelta(0)
         change: datetime | None = None
@@ -58,13 +58,13 @@ def _by_the_clock(cron: str, zone: ZoneInfo, after: datetime) -> Iterator[dateti
 
 
 def instant_shown(cron: str, zone: ZoneInfo, at: datetime) -> datetime | None:
-    """Return ``at`` if the expression matches what the clock shows then, else None."""
+    """Return ``at`` if the expression matches the wall time then, else None."""
     local = at.astimezone(zone).replace(tzinfo=None)
     return at if next(iter(CronSim(cron, local - _SECOND)), None) == local else None
 
 
 def instant(local: datetime, zone: ZoneInfo) -> datetime:
-    """Return when a clock of the zone shows ``local`` for the first time; for a time that is skipped, the first instant after the gap."""
+    """Return when the zone's wall clock first shows ``local``; for a skipped time, the first instant after the gap."""
     found = local.replace(tzinfo=zone).astimezone(UTC)
     if found.astimezone(zone).replace(tzinfo=None) == local:
         return found

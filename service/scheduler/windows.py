@@ -1,4 +1,4 @@
-"""Windows in time: maintenance, in which nothing starts, and staffed hours. Pure, in the wall time of their zone."""
+"""Time windows: maintenance, in which nothing starts, and staffed hours. Pure, in the wall time of their zone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DAYS = get_args(Day)
 
 
 def covers(window: Window, at_utc: datetime) -> bool:
-    """Tell whether an instant lies in the window. Its first instant does, its end does not."""
+    """Return whether an instant lies in the window: the start is inside, the end is not."""
     if window.cron:
         begun = _begun(window.cron, window.timezone, at_utc)
         return begun is not None and at_utc < begun + timedelta(hours=window.hours)
@@ -28,7 +28,7 @@ def covers(window: Window, at_utc: datetime) -> bool:
 
 
 def _begun(cron: str, timezone: str, at_utc: datetime) -> datetime | None:
-    """Return the last time of a cron expression. It is asked for far more often than it changes."""
+    """Return the last match of a cron expression, cached: it changes far less often than it is asked for."""
     known = _known(cron, timezone)
     if not known or not known[0] <= at_utc < known[1]:
         schedule = Schedule("", cron, timezone, "")

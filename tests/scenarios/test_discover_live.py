@@ -121,4 +121,4 @@ def test_what_cannot_go_on_live_is_refused_before_anything_moves(run, tmp_path):
     (tmp_path / "c1").mkdir()
     strokes = "".join(f"{axis} = [0, 400]\n" for axis in "XYZ")
     (tmp_path / "m.toml").write_text(f'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\n{strokes}')
-    assert "not with a folder" in run("discover", tmp_path / "c1", "--live", "--machine", tmp_path / "m.toml")[2]
+    assert "not a folder" in run("discover", tmp_path / "c1", "--live", "--machine", tmp_path / "m.toml")[2]

@@ -299,7 +299,7 @@ def test_a_scheduled_check_is_reported_with_the_limits_it_was_judged_by(stored, 
     found = CheckResult(
         "cannot tell", rows, {"body_diagonal_um": 3.0, "helix_rms_um": 0.4}, limits, ["h1"], "small", when, 9.0, "too close"
     )
-    doc = record.found(record.Occasion("sim", Schedule("nightly", "0 6 * * *", "UTC", "quick-check", 600.0), when), found)
+    doc = record.check_doc(record.Occasion("sim", Schedule("nightly", "0 6 * * *", "UTC", "quick-check", 600.0), when), found)
     copied = tmp_path / "other.sqlite3"
     shutil.copy(stored / "abbe.sqlite3", copied)
     with Store.open(f"sqlite:///{copied}") as store:

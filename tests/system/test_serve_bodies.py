@@ -16,7 +16,7 @@ import httpx
 import pytest
 
 from abbe.service.channel.messages import PAGE_MEMORY_MB
-from abbe.service.core.web_process import FIRST_TO_GO
+from abbe.service.core.web_process import OOM_SCORE_ADJ
 from abbe.service.users.roles import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 
@@ -103,7 +103,7 @@ def test_a_page_without_memory_is_replaced_and_the_core_stays(tmp_path: Path) ->
     with bench(tmp_path, YEARLY) as made:
         page, core = made.web, made.process.pid
         assert (limit_b(page), limit_b(core)) == (PAGE_MEMORY_MB << 20, resource.RLIM_INFINITY)
-        assert (last_to_go(page), last_to_go(core)) == (FIRST_TO_GO, 0)
+        assert (last_to_go(page), last_to_go(core)) == (OOM_SCORE_ADJ, 0)
         used_b = memory_kb(page, "VmData") << 10
         resource.prlimit(page, resource.RLIMIT_DATA, (used_b, PAGE_MEMORY_MB << 20))  # nothing more: the limit has been reached
         until_s = time.monotonic() + PATIENCE_S

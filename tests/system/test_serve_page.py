@@ -70,7 +70,7 @@ def fill(folder: Path, weeks: int) -> None:
             at = now - timedelta(days=7 * (weeks - 1 - week), hours=3)
             occasion = record.Occasion("mill-7", WEEKLY, at)
             if week == weeks - 3:
-                doc = record.failed(
+                doc = record.failed_doc(
                     occasion, LinkDown("modbus+tcp://127.0.0.1:5021", "connect", "connection refused", "is the laser on?"), at, 5.0
                 )
             else:
@@ -86,7 +86,7 @@ def fill(folder: Path, weeks: int) -> None:
                 result = Result(
                     verdict, values, text=text, started_utc=at, duration_s=312.0, campaign=f"quick-check {at:%Y-%m-%d %H:%M:%S}"
                 )
-                doc = record.found(occasion, result)
+                doc = record.check_doc(occasion, result)
             store.verifications.add_with_messages(machine, doc, [])
 
 

@@ -1,4 +1,4 @@
-"""``abbe alarm list | acknowledge``: what the scheduled checks warn of, what was done about it, and a person's "I have seen it"."""
+"""``abbe alarm list | acknowledge``: warnings of the scheduled checks, the service's work on them, and a person's acknowledgement."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def list_alarms(
 def acknowledge(
     machine: MachineFile,
     number: Annotated[int, typer.Argument(metavar="ALARM", help="Number of an alarm; abbe alarm list shows them.")],
-    name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who has seen it. Default: the account.", show_default=False)] = "",
+    name: Annotated[
+        str, typer.Option("--as", metavar="NAME", help="Who has seen the alarm. Default: the account.", show_default=False)
+    ] = "",
 ) -> None:
     """Note that a person has seen an alarm. It stays active until a check clears it."""
     from abbe.service.cli.common import open_store

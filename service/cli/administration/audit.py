@@ -1,4 +1,4 @@
-"""`abbe audit`: who did what, and the proof that nobody changed it since."""
+"""`abbe audit`: who did what, and the proof that no record was changed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHOWN = 10
 
 @audit.command("show")
 def show_audit(
-    last: Annotated[int, typer.Option("--last", min=1, help="So many, the newest.")] = 50,
+    last: Annotated[int, typer.Option("--last", min=1, help="Number of records, the newest.")] = 50,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -28,7 +28,7 @@ def show_audit(
     if as_json:
         print_json([asdict(record) for record in found])
         return
-    # Not only as tables show everything: a line break in a target must not make a record that is none.
+    # A line break in a target must not look like another record: tables alone would keep it.
     rows = [tuple(map(visible, (str(r.id), r.utc[:19], r.who, r.action, r.target, r.outcome))) for r in found]
     print_table(("record", "when (UTC)", "who", "what", "on", "outcome"), rows)
 

@@ -1,6 +1,6 @@
-"""Every command that changes something leaves one record in the audit of the database it worked on, however it ended.
+"""Record every command that changes something in the audit of its database, however the command ended.
 
-Before it begins it is made sure that the record can be written: what cannot be recorded is not done.
+Before a command begins, its record must be possible: what cannot be recorded is not done.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ INTERRUPTED = "interrupted"
 
 
 def commands(app: typer.Typer, before: str = "") -> Iterator[tuple[str, Any]]:
-    """All commands of a tree, by their words: ``model revert``."""
+    """Yield all commands of a tree with their full names, such as ``model revert``."""
     for one in app.registered_commands:
         yield before + str(one.name), one
     for group in app.registered_groups:
@@ -30,36 +30,36 @@ def commands(app: typer.Typer, before: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def record_all(app: typer.Typer) -> None:
-    """Put the recorder around every command."""
-    for words, one in commands(app):
-        one.callback = _recorded(words, one.callback)
+    """Wrap every command with the recorder."""
+    for command, one in commands(app):
+        one.callback = _recorded(command, one.callback)
 
 
-def _recorded(words: str, work: Any) -> Any:
+def _recorded(command: str, work: Any) -> Any:
     @functools.wraps(work)
     def around(*args: Any, **given: Any) -> Any:
-        if args or not is_recorded(words, given):
+        if args or not is_recorded(command, given):
             return work(*args, **given)
-        _make_sure(words, given)
+        _check_recordable(command, given)
         try:
             result = work(**given)
-        except typer.Exit as ended:  # how most commands end that answer by an exit code: as good as a return
-            _record(words, given, outcome_of(ended))
+        except typer.Exit as ended:  # most commands that answer by an exit code end like this: it counts as a return
+            _record(command, given, outcome_of(ended))
             raise
         except BaseException as error:
             try:
-                _record(words, given, outcome_of(error), error)
-            except Exception as second:  # noqa: BLE001 - what the command itself has to say comes first
+                _record(command, given, outcome_of(error), error)
+            except Exception as second:  # noqa: BLE001 - the command's own error comes first
                 error.add_note(f"not recorded: {second}")
             raise
-        _record(words, given, "done")
+        _record(command, given, "done")
         return result
 
     return around
 
 
 def outcome_of(error: BaseException) -> str:
-    """How a command ended: ``done``, ``no`` (exit code 1), a code of an error, ``interrupted``."""
+    """Return how a command ended: ``done``, ``no`` (exit code 1), an error's code, ``interrupted``."""
     code = getattr(error, "exit_code", None) if isinstance(error, typer.Exit) else getattr(error, "code", None)
     if isinstance(error, typer.Exit | SystemExit):
         return {0: "done", None: "done", 1: "no"}.get(code, f"exit {code}")
@@ -68,13 +68,13 @@ def outcome_of(error: BaseException) -> str:
     return str(code) if isinstance(code, str) else type(error).__name__
 
 
-def _make_sure(words: str, given: Mapping[str, Any]) -> None:
+def _check_recordable(command: str, given: Mapping[str, Any]) -> None:
     """Refuse a command that could not be recorded, before it does anything.
 
     Raises
     ------
     AbbeError
-        What the machine file or the database would be refused for anyway; or the audit, with the remedy.
+        The machine file or the database is refused anyway, or the audit cannot be written; the latter with its remedy.
     """
     from abbe.service.audit.book import HEADS, KEY, AuditBook, files_base, files_ready
     from abbe.service.cli.common import database_url, open_store
@@ -83,7 +83,7 @@ def _make_sure(words: str, given: Mapping[str, Any]) -> None:
     url = _database(given, database_url)
     missing = _missing(url)
     if missing is not None and not missing.parent.is_dir():
-        return  # the command makes the folder, or refuses it
+        return  # the command creates the folder, or refuses it
     try:
         if missing is not None:
             base = files_base(None, url)
@@ -92,10 +92,10 @@ def _make_sure(words: str, given: Mapping[str, Any]) -> None:
         with open_store(url) as store:
             AuditBook(store, url).ready()
     except AuditBroken as error:
-        raise AuditBroken(f"abbe {words} was not begun, since it could not be recorded: {error.detail}", error.remedy) from None
+        raise AuditBroken(f"abbe {command} was not begun, since it could not be recorded: {error.detail}", error.remedy) from None
 
 
-def _record(words: str, given: Mapping[str, Any], outcome: str, error: BaseException | None = None) -> None:
+def _record(command: str, given: Mapping[str, Any], outcome: str, error: BaseException | None = None) -> None:
     from abbe.service.audit.book import AuditBook
     from abbe.service.cli.common import database_url, open_store
     from abbe.service.errors import AbbeError, AuditBroken
@@ -103,26 +103,26 @@ def _record(words: str, given: Mapping[str, Any], outcome: str, error: BaseExcep
     url = _database(given, database_url)
     missing = _missing(url)
     if missing is not None:
-        # Refused by itself before there was a database: nothing was changed in one. All else has to be said.
+        # A command that refused before its database existed changed nothing; any other outcome is reported.
         if not isinstance(getattr(error, "code", None), str) and sys.stderr is not None:
             sys.stderr.write(f"not recorded in an audit: there is no database {missing}\n")
         return
     try:
         with open_store(url) as store:
-            AuditBook(store, url).write(event_of(words, given, outcome))
+            AuditBook(store, url).write(event_of(command, given, outcome))
     except AbbeError as trouble:
-        raise AuditBroken(f"abbe {words} ended ({outcome}), but it could not be recorded: {trouble.detail}", trouble.remedy) from None
+        raise AuditBroken(f"abbe {command} ended ({outcome}), but it could not be recorded: {trouble.detail}", trouble.remedy) from None
 
 
 def _database(given: Mapping[str, Any], url_of: Any) -> str:
-    if given.get("keep") is not None:  # the demo's own world
+    if given.get("keep") is not None:  # the demonstration's own database
         return f"sqlite:///{Path(given['keep']) / 'abbe.sqlite3'}"
     file = given.get("machine_file") or given.get("machine")
     return str(url_of(given.get("db"), file if isinstance(file, Path) else None))
 
 
 def _missing(url: str) -> Path | None:
-    """The SQLite file of a database that is not there (yet); None: it is there, or is no file."""
+    """Return the SQLite file of a database that does not exist yet; None: it exists, or is no file."""
     from abbe.service.storage.engine import parse_url
 
     parsed = parse_url(url)
@@ -132,11 +132,11 @@ def _missing(url: str) -> Path | None:
     return None if path.exists() else path
 
 
-def event_of(words: str, given: Mapping[str, Any], outcome: str) -> AuditEvent:
-    """What is recorded of a command: who ran it here, on what, with which options."""
+def event_of(command: str, given: Mapping[str, Any], outcome: str) -> AuditEvent:
+    """Return the record of a command: who ran it here, on what, with which options."""
     from abbe.service.audit.book import this_account
     from abbe.service.domain.audit_event import AuditEvent
 
     target = next((str(given[key]) for key in ("name", "campaign", "file", "out", "folder", "solution", "machine") if given.get(key)), "")
-    told = {key: str(value) for key, value in given.items() if value not in (None, False, "", []) and key not in {"db", "as_json"}}
-    return AuditEvent(who=this_account(), action=f"abbe {words}", target=target, outcome=outcome, doc=told)
+    options = {key: str(value) for key, value in given.items() if value not in (None, False, "", []) and key not in {"db", "as_json"}}
+    return AuditEvent(who=this_account(), action=f"abbe {command}", target=target, outcome=outcome, doc=options)

@@ -1,4 +1,4 @@
-"""`abbe backup` and `abbe restore`: everything that is kept, as a folder to put away, and back."""
+"""`abbe backup` and `abbe restore`: copy everything that is stored into a folder, and restore it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def backup(
         list[Path], typer.Argument(metavar="[MACHINE.toml] TARGET", help="Machine file, and a new folder.", show_default=False)
     ],
     store: StoreOption = None,
-    without_key: Annotated[bool, typer.Option("--without-key", help="Leave the audit's key out; keep it elsewhere.")] = False,
+    without_key: Annotated[bool, typer.Option("--without-key", help="Leave out the audit's key; keep it elsewhere.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Copy database, samples that it does not have yet and audit into a new folder, while the service goes on. The copy is checked."""
+    """Copy the database, samples that it does not have yet, and the audit into a new folder while the service runs. The copy is checked."""
     from abbe.service.backup.backup import back_up
     from abbe.service.clock import SystemClock
 
@@ -50,18 +50,18 @@ def restore(
         list[Path], typer.Argument(metavar="[MACHINE.toml] BACKUP", help="Machine file, and the folder of a backup.", show_default=False)
     ],
     store: StoreOption = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Put a database that is there aside; it is renamed, not deleted.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Set an existing database aside; it is renamed, not deleted.")] = False,
     audit_key: Annotated[
         Path | None, typer.Option("--audit-key", metavar="FILE", help="Key of the audit, for a backup without it.", show_default=False)
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Bring a backup back, after its files, its schema and its audit were checked. Refused over a database that exists or is in use."""
-    from abbe.service.backup.restore import restore as ordered_rollback
+    """Restore a backup, after checking its files, its schema and its audit. Refused over a database that exists or is in use."""
+    from abbe.service.backup.restore import restore as restore_backup
     from abbe.service.clock import SystemClock
 
     into, folder = _places(places, store, "BACKUP")
-    done = ordered_rollback(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
+    done = restore_backup(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
     aside = [str(path) for path in done.aside]
     if as_json:
         print_json({"database": str(done.database), "backup": done.backup.doc, "audit_records": done.records, "aside": aside})
@@ -76,7 +76,7 @@ def restore(
 
 
 def _places(places: list[Path], store: str | None, last: str) -> tuple[BackupSource, Path]:
-    """Database and folder that the words name."""
+    """Return database and folder that the arguments name."""
     from abbe.service.backup.backup import BackupSource
     from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine

@@ -1,4 +1,4 @@
-"""``abbe check-config`` and ``abbe schema``: what a machine file says, and what it can say."""
+"""``abbe check-config`` and ``abbe schema``: the values of a machine file, and its schema."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def check_config(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Machine file (TOML).", show_default=False)],
     as_json: JsonOption = False,
 ) -> None:
-    """Check a machine file and print its effective values and where each comes from; exit code 2 where something cannot work."""
+    """Check a machine file and print its effective values with their origins; exit code 2 if something cannot work."""
     from abbe.service.campaigns.plausibility import check_plausibility
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
@@ -27,8 +27,8 @@ def check_config(
     database = mask_secrets(loaded.database_url)
     if as_json:
         values = {key: {"value": value, "origin": origin} for key, value, origin in loaded.values()}
-        said = {"good": found.good, "errors": found.errors, "warnings": found.warnings}
-        print_json({"file": str(file), "database": database, "values": values} | said)
+        result = {"good": found.good, "errors": found.errors, "warnings": found.warnings}
+        print_json({"file": str(file), "database": database, "values": values} | result)
         raise typer.Exit(2 if found.errors else 0)
     rows = [(key, "-" if value is None else json.dumps(value, ensure_ascii=False), origin) for key, value, origin in loaded.values()]
     print_table(("key", "value", "from"), rows, title=f"{file} is good" if found.good else str(file))
@@ -49,4 +49,4 @@ def schema(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to
         for path in write_schemas(folder):
             typer.echo(str(path))
     except OSError as err:
-        raise ConfigError(f"{folder}: cannot be written: {err.strerror}", "give a folder that may be written") from None
+        raise ConfigError(f"{folder}: cannot be written: {err.strerror}", "give a writable folder") from None

@@ -24,7 +24,7 @@ def fleet(
     from abbe.service.storage.store import Store
 
     url = database_url(db, machine)
-    open_store(url).close()  # a missing file is one line, and none is made
+    open_store(url).close()  # a missing file is one line of error and is not created
     with Store.open(url) as store:
         lines = lines_of(store, SystemClock().utc())
     if as_json:

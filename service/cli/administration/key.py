@@ -1,4 +1,4 @@
-"""`abbe key`: the keys with which compensation files are signed."""
+"""`abbe key`: keys that sign compensation files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from abbe.service.cli.common import DbOption, MachineOption
 
-key = typer.Typer(help="Keys with which compensation files are signed.", no_args_is_help=True)
+key = typer.Typer(help="Keys that sign compensation files.", no_args_is_help=True)
 
 
 @key.command("new")
@@ -18,7 +18,7 @@ def new(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Make a key. The private one stays in FILE, for its owner only; the public one is printed, for [signatures] trusted."""
+    """Create a key. The private one stays in FILE, readable by its owner only; the public one is printed, for [signatures] trusted."""
     from abbe.service.signed.keys import new_key
 
     typer.echo(new_key(file))

@@ -1,4 +1,4 @@
-"""``abbe serve MACHINE.toml``: the unattended service. Everything heavy is imported when it is run, not when ``--help`` is asked for."""
+"""``abbe serve MACHINE.toml``: the unattended service. Heavy modules are imported when it runs, not for ``--help``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 LONGEST_NAME = 180
-"""Of a recipe that a person starts: page and core exchange words of 200 characters, and a rate stands behind the name."""
+"""Longest name of a recipe that a person starts: page and core exchange texts of 200 characters, and a rate follows the name."""
 
 
 def serve(
@@ -56,20 +56,13 @@ def serve(
 
 
 def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
-    """Return what the service is to do.
-
-    Parameters
-    ----------
-    loaded : LoadedMachine
-        The machine file.
-    port : int, optional
-        Instead of the file's.
+    """Return the setup of the service; ``port`` replaces the file's.
 
     Raises
     ------
     AbbeError
-        A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: better now than at
-        the first slot, at night.
+        A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: reported now rather
+        than at the first slot, at night.
     """
     from abbe.service.campaigns.builtin_recipes import RECIPES, campaign_source
     from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
@@ -153,7 +146,7 @@ def _broker(loaded: LoadedMachine) -> Broker | None:
         return None
     ca, certificate, key = (_beside(loaded.path, name) for name in (mqtt.ca, mqtt.certificate, mqtt.key))
     broker = replace(parse(mqtt.url), ca=ca, certificate=certificate, key=key)
-    broker.tls_context()  # better now than at every attempt to connect
+    broker.tls_context()  # fail now rather than at every attempt to connect
     return broker
 
 
@@ -175,7 +168,7 @@ def duties_on(
 ) -> Callable[[Store], Duties]:
     """Return what the service does about alarms, given its store.
 
-    ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: is shown what the campaign's paths read.
+    ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: gets the samples of the campaign's paths.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved
@@ -197,7 +190,7 @@ def duties_on(
 
 
 def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
-    """Return what a person can order of tables, given the service's store: a push only where the service does not push by itself."""
+    """Return the orders for tables, given the service's store. People can order a push only if the service does not push by itself."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.ordered_rollback import ordered_rollback
     from abbe.service.compensation.push_approved import push_approved
@@ -216,7 +209,7 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
 
 
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[Store], MeasureCampaign]:
-    """Return how a full campaign is measured that a person starts, given the service's store."""
+    """Return how to run a full campaign that a person starts, given the service's store."""
     from abbe.service.campaigns.builtin_recipes import campaign_source
     from abbe.service.clock import SystemClock
     from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
@@ -235,7 +228,7 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
 
 def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
-    """The full campaigns that can be started on this machine: the shipped one, and what the machine file names for alarms."""
+    """Return the full campaigns that fit this machine: the built-in one, and the machine file's for alarms."""
     from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, campaign_source
     from abbe.service.sequences.check import dry_run_campaign, paced
 
@@ -251,12 +244,12 @@ def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
 
 
 def _beside(machine_file: Path, name: str) -> str:
-    """A file of the machine file's folder, or an absolute one; empty stays empty."""
+    """Return a file's path relative to the machine file's folder, or the absolute path as it is; empty stays empty."""
     return str(machine_file.resolve().parent / name) if name else ""
 
 
 def _fits(recipe: str, site: Site) -> bool:
-    """Whether a recipe can be offered on this machine at all: its paths lie inside the strokes."""
+    """Return whether a recipe's paths lie inside the machine's strokes."""
     from abbe.service.campaigns.builtin_recipes import recipe_plan
     from abbe.service.sequences.check import dry_run_campaign
 

@@ -1,4 +1,4 @@
-"""``abbe version`` and ``abbe sim``: about the program, and the simulated machine beside it."""
+"""``abbe version`` and ``abbe sim``: the versions, and the simulated machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from abbe.service.children import python_words
+from abbe.service.children import python_command
 
 SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Everything after ``sim`` belongs to the simulators, ``--help`` included."""
@@ -30,14 +30,14 @@ def version() -> None:
 
 def sim(context: typer.Context) -> None:
     """Run the simulated machine and its instruments; arguments go to the module `abbe.simulators`."""
-    # A group of its own: Ctrl-C reaches the child once, from here, and not a second time from the terminal.
+    # Its own process group: Ctrl-C reaches the child once, from here, and not again from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-    words = list(context.args)
-    if words[:1] != ["truth"] and "--watch-stdin" not in words:
-        # The child ends when this pipe closes: not even SIGKILL of this process leaves it behind.
-        words.append("--watch-stdin")
+    arguments = list(context.args)
+    if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:
+        # The child ends when this pipe closes, even if this process is killed by SIGKILL.
+        arguments.append("--watch-stdin")
         own_group["stdin"] = subprocess.PIPE
-    child = subprocess.Popen(python_words("abbe.simulators", *words), **own_group)  # noqa: S603 - our own package
+    child = subprocess.Popen(python_command("abbe.simulators", *arguments), **own_group)  # noqa: S603 - our own package
 
     def forward(number: int, _frame: FrameType | None) -> None:
         if child.poll() is None:

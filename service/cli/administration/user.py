@@ -1,4 +1,4 @@
-"""`abbe user`: who may use the page and the interface, and as what."""
+"""`abbe user`: users of the page and the interface, and their roles."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def list_users(db: DbOption = None, machine: MachineOption = None, as_json: Json
 
 @user.command("role")
 def set_role(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None) -> None:
-    """Give a user another role. His sessions end; his tokens keep what of their scopes the new role has."""
+    """Give a user another role. The user's sessions end; tokens keep the part of their scopes that the new role has."""
     with _people(db, machine) as (people, _):
         people.set_role(name, role)
     typer.echo(f"user {name!r} is {role}")
@@ -54,7 +54,7 @@ def set_role(name: Name, role: RoleArgument, db: DbOption = None, machine: Machi
 
 @user.command("password")
 def set_password(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
-    """Give a user another password: asked for, or read from standard input. His sessions end."""
+    """Give a user another password: asked for, or read from standard input. The user's sessions end."""
     with _people(db, machine) as (people, _):
         people.get(name)
         people.set_password(name, _password())
@@ -63,15 +63,15 @@ def set_password(name: Name, db: DbOption = None, machine: MachineOption = None)
 
 @user.command("disable")
 def disable_user(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
-    """Shut a user out at once, with sessions and tokens. Users are not deleted: the audit names them."""
+    """Disable a user at once, with sessions and tokens. Users are not deleted: the audit names them."""
     with _people(db, machine) as (people, _):
         people.disable(name)
-    typer.echo(f"user {name!r} is shut out")
+    typer.echo(f"user {name!r} is disabled")
 
 
 @user.command("enable")
 def enable_user(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
-    """Let a user in again."""
+    """Enable a disabled user."""
     with _people(db, machine) as (people, _):
         people.disable(name, enable=True)
     typer.echo(f"user {name!r} may log in")
@@ -81,12 +81,12 @@ def enable_user(name: Name, db: DbOption = None, machine: MachineOption = None) 
 def new_token(
     name: Name,
     title: Annotated[str, typer.Argument(metavar="TOKEN", help="Name of the token.", show_default=False)],
-    scope: Annotated[list[str], typer.Option("--scope", help="What it may do; may be repeated. A part of what the user may.")],
-    days: Annotated[float, typer.Option("--days", help="How long it holds.")] = 90.0,
+    scope: Annotated[list[str], typer.Option("--scope", help="A right of the token, one of the user's; may be repeated.")],
+    days: Annotated[float, typer.Option("--days", help="How long the token is valid, days.")] = 90.0,
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Make a token and print it, once: only its hash is kept."""
+    """Create a token and print it, once: only its hash is stored."""
     with _people(db, machine) as (people, _):
         text = people.add_token(name, title, scope, days)
     typer.echo(text)
@@ -94,7 +94,7 @@ def new_token(
 
 @token.command("list")
 def list_tokens(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
-    """List tokens: whose, what they may, until when."""
+    """List tokens: user, scopes, expiry."""
     with _people(db, machine) as (_, store):
         found = store.people.tokens()
     rows = [(owner.name, t.name, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t, owner in found]
@@ -112,7 +112,7 @@ def revoke_token(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Revoke a token, at once and for ever."""
+    """Revoke a token, at once and permanently."""
     with _people(db, machine) as (people, _):
         people.revoke_token(name, title)
     typer.echo(f"token {title!r} of {name!r} is revoked")
@@ -130,7 +130,7 @@ def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) ->
 
 
 def _password() -> str:
-    """From a terminal, typed twice and not shown; else the first line of standard input. Never an argument: those are seen by everybody."""
+    """Read a password: from a terminal, typed twice and not shown; else the first line of stdin. Never an argument: others see those."""
     from abbe.service.errors import PasswordRefused
 
     if not sys.stdin.isatty():

@@ -1,4 +1,4 @@
-"""`abbe discover`: what the simulation of a machine lacks, named, sized and proved; nothing is written to the machine."""
+"""`abbe discover`: find, size and prove what the simulation of a machine lacks; nothing is written to the machine."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ def discover(  # noqa: PLR0913 - one argument for each option
     db: DbOption = None,
     machine: MachineOption = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
-    live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine of --machine, and go on.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine of --machine, and continue.")] = False,
     accept_table: AcceptTable = False,
 ) -> None:
-    """Find where measurement and simulation disagree, and name the missing effect: size, what to do, what else it could be, what next.
+    """Find where measurement and simulation disagree, and name the missing effect: its size, the remedy, alternatives, the next experiment.
 
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
-    only if --db or --machine names a database. Stopped with Ctrl-C, the same command goes on where it was.
+    only if --db or --machine names a database. After Ctrl-C the same command resumes.
     """
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:
-        form_of(report)  # before the work
+        form_of(report)  # refuse a wrong suffix before the work
     if live:
-        _live_needs(campaign, machine)
+        _check_live(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
         job, journal = _started(found, store)
         finding = _searched(job, journal)
         if live and store is not None and machine is not None:
-            job, journal, finding = _gone_on(store, machine, (job, journal, finding), accept_table=accept_table)
+            job, journal, finding = _run_live(store, machine, (job, journal, finding), accept_table=accept_table)
         _written(job, journal, finding, json_file, report)
     if json_file is not None and str(json_file) == "-":
         return
@@ -67,7 +67,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
 
 @contextmanager
 def opened(campaign: str, db: str | None, machine: Path | None, without: list[str]) -> Iterator[tuple[Campaign, Store | None]]:
-    """A campaign and the store it belongs to; a folder's is None where no database is named."""
+    """Yield a campaign and its store; for a folder None if no database is named."""
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder
 
     if is_folder(campaign):
@@ -81,7 +81,7 @@ def opened(campaign: str, db: str | None, machine: Path | None, without: list[st
 
 
 def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, DiscoveryJournal]:
-    """The job and where it stands."""
+    """Return the job and its journal."""
     from abbe.service.discovery.changed_since import since_of
     from abbe.service.discovery.discover import DiscoveryJournal, prepare
     from abbe.service.discovery.discovery_store import journal_of
@@ -96,21 +96,21 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Dis
     return job, DiscoveryJournal() if store is None else journal_of(store, job)
 
 
-def _live_needs(campaign: str, machine: Path | None) -> None:
-    """Before anything is read: --live needs a machine and a campaign that was measured on it."""
+def _check_live(campaign: str, machine: Path | None) -> None:
+    """Refuse --live without a machine, or for a folder: before anything is read."""
     from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
 
     if machine is None:
         raise ConfigError("--live needs the machine", "give --machine FILE")
     if is_folder(campaign):
-        raise ConfigError("--live goes on with a campaign of the store, not with a folder", "measure it with `abbe measure`")
+        raise ConfigError("--live needs a campaign of the store, not a folder", "measure it with `abbe measure`")
 
 
-def _gone_on(
+def _run_live(
     store: Store, machine: Path, at: tuple[DiscoveryJob, DiscoveryJournal, Finding], *, accept_table: bool = False
 ) -> tuple[DiscoveryJob, DiscoveryJournal, Finding]:
-    """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is done twice."""
+    """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is measured twice."""
     from dataclasses import replace
     from datetime import timedelta
 
@@ -133,48 +133,48 @@ def _gone_on(
         about = replace(finding.where, runs=(test.like,)) if finding.verdict == "unknown" and test.like else None
         wanted = next_plan(test.adds, site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
         if wanted.plan is None:
-            typer.echo(f"by hand: {', '.join(wanted.by_hand)} is nothing that Abbe runs on this machine by itself")
+            typer.echo(f"by hand: Abbe cannot run {', '.join(wanted.by_hand)} on this machine")
             break
-        what = added(store, job.campaign, wanted.plan, wanted.after_s)
-        wait_s = _measured(store, site, job.campaign, what, accept_table=accept_table)
-        accept_table = accept_table and what.left is None  # the person has looked at the table of now, not at one that comes later
+        addition = added(store, job.campaign, wanted.plan, wanted.after_s)
+        wait_s = _measured(store, site, job.campaign, addition, accept_table=accept_table)
+        accept_table = accept_table and addition.left is None  # the person has accepted the present table, not a later one
         if wait_s > 0.0:
             start = SystemClock().utc() + timedelta(seconds=wait_s + 1.0)
             what_for = ", ".join(test.adds)
             typer.echo(f"too early for {what_for}: give the same command at {start:%H:%M:%S} UTC or later; nothing has moved")
             break
-        job, journal = next_search(store, job, journal, what.plan.name)
+        job, journal = next_search(store, job, journal, addition.plan.name)
         finding = _searched(job, journal)
     return job, journal, finding
 
 
-def _measured(store: Store, site: Site, campaign: Campaign, what: Added, *, accept_table: bool) -> float:
-    """What is left of an added measurement, run on the machine; stopped, it says what is kept. Gives the seconds to wait, or 0."""
+def _measured(store: Store, site: Site, campaign: Campaign, addition: Added, *, accept_table: bool) -> float:
+    """Run the rest of an added measurement on the machine; a stop reports what is kept. Return the seconds to wait, or 0."""
     from abbe.service.cli.measure import ready_session
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
     from abbe.service.discovery.discover_live import measure_added
 
-    if what.begun is not None:
-        done = len(what.plan.tests) - (0 if what.left is None else len(what.left.tests))
-        typer.echo(f"going on with campaign {what.plan.name!r}: {done} of {len(what.plan.tests)} runs are measured")
-    if what.left is None:
+    if addition.begun is not None:
+        done = len(addition.plan.tests) - (0 if addition.left is None else len(addition.left.tests))
+        typer.echo(f"resuming campaign {addition.plan.name!r}: {done} of {len(addition.plan.tests)} runs are measured")
+    if addition.left is None:
         return 0.0
 
     async def work() -> float:
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
-                return await measure_added(session, store, site, campaign, what, sink)
+                return await measure_added(session, store, site, campaign, addition, sink)
 
     try:
         return run_job(work())
     except SystemExit:
-        typer.echo("stopped: runs that were measured completely are kept; the same command goes on there", err=True)
+        typer.echo("stopped: completed runs are kept; the same command resumes there", err=True)
         raise
 
 
 def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
-    """The finding, with progress on stderr; Ctrl-C says what is kept."""
+    """Return the finding, with progress on stderr; Ctrl-C reports what is kept."""
     from abbe.service.cli.progress import display
     from abbe.service.discovery.discover import discover as work
     from abbe.service.discovery.discovery_engine import search
@@ -185,16 +185,16 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
         except KeyboardInterrupt:
             state = journal.steps[-1].state if journal.steps else "nothing"
             kept = (
-                f"discovery {journal.id} stands at {state}; the same command goes on there"
+                f"discovery {journal.id} stands at {state}; the same command resumes there"
                 if journal.id
-                else "nothing is kept of a folder without --db"
+                else "without --db nothing of a folder is kept"
             )
             typer.echo(f"stopped: {kept}", err=True)
             raise
 
 
 def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, json_file: Path | None, report: Path | None) -> None:
-    """Files that were asked for, each whole or not at all."""
+    """Write the requested files, each whole or not at all."""
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discovery_answer import answer_doc
     from abbe.service.rendering.document_page import write_document

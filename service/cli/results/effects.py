@@ -1,4 +1,4 @@
-"""`abbe effects`: what Abbe knows by name, and one effect's page."""
+"""`abbe effects`: the catalogue of known effects, and one effect's page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def effects(
     name: Annotated[str | None, typer.Argument(metavar="NAME", help="One effect; without it all are listed.", show_default=False)] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """The catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""
+    """Show the catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""
     from abbe.service.discovery.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
     from abbe.service.effects.axis_test import SLOW_DRIFT
     from abbe.service.effects.effect_catalogue import catalogue, effect_named, plugins

@@ -33,7 +33,7 @@ def import_campaign(
     """Check a campaign folder and store it: all of it or, after any mistake, nothing."""
     from abbe.service.runs.exchange import import_folder, read_folder
 
-    read_folder(folder)  # before a database is made
+    read_folder(folder)  # before a database is created
     with open_store(database_url(db, machine), must_exist=False) as store:
         record = store.campaigns.find(import_folder(store, folder))
         typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")

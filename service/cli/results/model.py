@@ -1,4 +1,4 @@
-"""`abbe model`: the model book of a machine - list, show, compare, go back."""
+"""`abbe model`: the model book of a machine - list, show, compare, revert."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from abbe.service.storage.store import Store
 
 model = typer.Typer(
-    help="The model book of a machine: versions with their effects, where each came from, and the way back.", no_args_is_help=True
+    help="The model book of a machine: versions with their effects, where each came from, and how to revert.", no_args_is_help=True
 )
 
 Machine = Annotated[str, typer.Argument(metavar="MACHINE", help="Name of the machine.", show_default=False)]
@@ -47,7 +47,7 @@ def show_model(
     machine_file: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show one version: its effects with their size, what takes them out, and the runs they came from."""
+    """Show one version: its effects with their size, their remedy, and the runs they came from."""
     from abbe.service.discovery.discovery_words import size_text
     from abbe.service.effects.model_book import REMEDIES
 
@@ -58,7 +58,7 @@ def show_model(
         return
     typer.echo(f"machine {machine}, model version {found.version}: {found.book.why}")
     rows = [(e.words, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
-    print_table(("effect", "size, U (k = 2)", "taken out by", "from campaign"), rows)
+    print_table(("effect", "size, U (k = 2)", "remedy", "from campaign"), rows)
     if found.book.gone:
         typer.echo("no longer there: " + ", ".join(found.book.gone))
     source = found.book.provenance
@@ -75,7 +75,7 @@ def diff_models(
     machine_file: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what one version has more, less or of another size than another."""
+    """Show the effects that were added, removed or resized between two versions."""
     from abbe.service.discovery.discovery_words import unit
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import differences, version
@@ -106,7 +106,7 @@ def revert_model(
     db: DbOption = None,
     machine_file: MachineOption = None,
 ) -> None:
-    """Make an older version current again. Nothing is deleted: it is appended as a new version."""
+    """Make an older version current again. Nothing is deleted: a new version is appended."""
     from abbe.service.effects.model_book import revert
 
     with open_store(database_url(db, machine_file)) as store:
@@ -119,7 +119,7 @@ def _size(size: LabelSize | None) -> dict[str, float] | None:
 
 
 def _version(store: Store, machine: str, number: int | None) -> ModelVersion:
-    """A version, or the current one."""
+    """Return a version, or the current one."""
     from abbe.service.effects.model_book import current, version
 
     newest = current(store, machine)

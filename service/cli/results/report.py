@@ -1,4 +1,4 @@
-"""``abbe report``: a report that can be signed, as PDF, HTML, CSV or JSON."""
+"""``abbe report``: a report for signature, as PDF, HTML, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def report(
 ) -> None:
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
-    --machine FILE takes its database, and adds limits, certificates and the allowed temperature. Nothing is measured or computed anew;
+    --machine FILE takes its database, and adds limits, certificates and the allowed temperature. Nothing is measured or computed again;
     the same data give the same bytes.
     """
     from abbe.service.config import load_machine
@@ -47,9 +47,9 @@ def report(
     from abbe.service.report.report import rules_of
 
     for target in out or []:
-        form_of(target)  # before the work
+        form_of(target)  # refuse a wrong suffix before the work
     rules = rules_of(None if machine is None else load_machine(machine).machine)
-    # Both may be given: the machine file for its limits, and a database elsewhere (an archive, a fleet's).
+    # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
     url = database_url(db, machine if db is None else None)
     document = _document(what, number, of, url, rules)
     for target in out or [Path(default_name(document))]:

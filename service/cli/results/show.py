@@ -1,4 +1,4 @@
-"""``abbe runs`` and ``abbe show``: what was measured."""
+"""``abbe runs`` and ``abbe show``: the measured runs and campaigns."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def show(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show one run: state, setup and what its columns hold (--json: as an exchange file). Or a campaign: runs and incidents."""
+    """Show one run: state, set-up and statistics of its columns (--json: as an exchange file). Or a campaign: runs and incidents."""
     from abbe.service.cli.results.show_campaign import show_campaign
     from abbe.service.domain.measured import RunRecord
     from abbe.service.queries.measured import run_summary
@@ -63,12 +63,12 @@ def show(
         print_json(document)
         return
     pieces = (document.get("timing") or {}).get("pieces", [])
-    told = {"pieces": ", ".join(f"{one['readings']} of {one['run']}" for one in pieces) + " and its own"} if pieces else {}
-    told |= {"judged": why} if (why := not_judged(document)) else {}
+    extra = {"pieces": ", ".join(f"{one['readings']} of {one['run']}" for one in pieces) + " and its own"} if pieces else {}
+    extra |= {"judged": why} if (why := not_judged(document)) else {}
     setup = {f"setup.{key}": value for key, value in document["setup"].items()}
     print_table(
         ("key", "value"),
-        [(key, "" if value is None else str(value)) for key, value in (facts | told | setup | _samples(record, chunks)).items()],
+        [(key, "" if value is None else str(value)) for key, value in (facts | extra | setup | _samples(record, chunks)).items()],
         title=f"run {record.campaign}/{record.label}",
     )
     print_table(
@@ -77,7 +77,7 @@ def show(
 
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
-    """Where every ball-bar sample ended: stored, flagged, or in which gap."""
+    """Return the account of all ball-bar samples: stored, flagged, or in which gap."""
     from abbe.drivers.flags import BAR_REASONS
     from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 
@@ -87,14 +87,14 @@ def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
         return {}
     sums = ledger.doc()
     flags = ", ".join(f"{reason} {sums['flags'][reason]}" for reason in BAR_REASONS if reason in sums["flags"])
-    told = {"samples": f"{sums['stored_valid']} valid, {sums['stored_flagged']} flagged" + (f" ({flags})" if flags else "")}
-    told["missing"] = f"{sums['in_gaps']} in {sums['gaps']} gaps" + (f", {sums['unaccounted']} unaccounted" if sums["unaccounted"] else "")
+    rows = {"samples": f"{sums['stored_valid']} valid, {sums['stored_flagged']} flagged" + (f" ({flags})" if flags else "")}
+    rows["missing"] = f"{sums['in_gaps']} in {sums['gaps']} gaps" + (f", {sums['unaccounted']} unaccounted" if sums["unaccounted"] else "")
     if (count := len(ledger.ends())) > 1:
-        told["streams"] = str(count) if streams is not None else f"{count} (guessed: the run does not say)"
+        rows["streams"] = str(count) if streams is not None else f"{count} (guessed: the run does not say)"
     for number, gap in enumerate(ledger.gaps, start=1):
         last = "?" if gap.last is None else str(gap.last)
-        told[f"gap {number}"] = f"samples {gap.first} to {last}: {gap.cause}"
-    return told
+        rows[f"gap {number}"] = f"samples {gap.first} to {last}: {gap.cause}"
+    return rows
 
 
 def _statistics(key: str, values: list[float] | None) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""``abbe show CAMPAIGN``: its runs, and what trouble the links made while it was measured."""
+"""``abbe show CAMPAIGN``: its runs, and incidents of the links while it was measured."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> None:
-    """Print a campaign: one line for each run, one for each kind of trouble on a link and how it ended."""
+    """Print a campaign: one line for each run, one for each kind of incident and how it ended."""
     from abbe.service.sequences.journal import not_written, troubles
 
     runs, journal = store.runs.all(campaign.id), store.checkpoints.of_campaign(campaign.id)
@@ -29,7 +29,7 @@ def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> N
     print_table(("key", "value"), [(key, str(value)) for key, value in who.items()], title=f"campaign {campaign.name}")
     rows = [(str(one.id), one.label, one.test, one.visible_status, one.reason) for one in runs]
     print_table(("number", "run", "test", "status", "reason"), rows, title="runs")
-    if journal:  # of a campaign that was imported nobody knows
+    if journal:  # an imported campaign has no journal
         _incidents(found, lost)
 
 

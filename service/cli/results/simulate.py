@@ -1,4 +1,4 @@
-"""`abbe simulate`: what the present model says every run should read, beside what was measured."""
+"""`abbe simulate`: the present model's prediction of every run, beside the measurement."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def simulate(
 ) -> None:
     """Predict every run with the present model, fitted to the identify runs, and show measured against simulated. Nothing is stored.
 
-    The present model is what the campaign says, with the effects of the machine's model book.
+    The present model is the campaign's, with the effects of the machine's model book.
     """
     from abbe.service.cli.progress import display
     from abbe.service.discovery.discover import prepare
@@ -41,7 +41,7 @@ def simulate(
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:
-        form_of(report)  # before the work
+        form_of(report)  # refuse a wrong suffix before the work
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
         sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
         base, table = (None, NO_TABLE) if store is None else (current(store, found.site.name), table_then(store, found))

@@ -1,4 +1,4 @@
-"""`abbe solve`: what the runs of a campaign say about the machine, without touching it."""
+"""`abbe solve`: identify the machine's errors from the runs of a campaign, without touching the machine."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 STAGES = 10
-"""Stages of a solution that the display counts; the last ones share one if the solver needs more rounds."""
+"""Stages that the display counts; the last ones share one if the solver needs more rounds."""
 
 
 SIDE_BY_SIDE = 3
-"""Runs next to each other in a table: more do not fit 100 columns."""
+"""Runs next to each other in a table: more do not fit in 100 columns."""
 
 
 class ModelName(StrEnum):
@@ -58,7 +58,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         Path | None,
         typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
     ] = None,
-    tables: Annotated[bool, typer.Option("--tables", help="Also say what each kind of table could reach.")] = False,
+    tables: Annotated[bool, typer.Option("--tables", help="Also show what each kind of table could reach.")] = False,
     grid: Annotated[
         Path | None, typer.Option("--grid", metavar="FILE.csv", help="Also write the 3-D grid of corrections.", show_default=False)
     ] = None,
@@ -69,7 +69,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
 
-    A folder's result is stored only if --db or --machine names a database. A run that cannot be what it says is refused (exit code 2).
+    A folder's result is stored only if --db or --machine names a database. A run that contradicts its description is refused (exit code 2).
     """
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, keep
     from abbe.service.domain.solution_file import SolutionFile
@@ -78,30 +78,30 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:
-        form_of(report)  # before the work
+        form_of(report)  # refuse a wrong suffix before the work
     wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
         chosen = found.without(without or [])
-        told, doc = _solved(chosen, wanted)
+        summary, doc = _solved(chosen, wanted)
         if db is not None or machine is not None:
-            with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: what is refused leaves no database
+            with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: a refusal creates no database
                 doc |= keep(store, found, doc)
         if report is not None:
-            _write_report(None, chosen, told, doc, machine, report)
+            _write_report(None, chosen, summary, doc, machine, report)
     else:
         with stored_campaign(campaign, database_url(db, machine)) as (store, found):
             chosen = found.without(without or [])
             known = taken_out(store, chosen, table_then(store, chosen))
-            told, doc = _solved(known.campaign, wanted)
+            summary, doc = _solved(known.campaign, wanted)
             doc |= known.doc
             doc |= keep(store, found, doc)
             if report is not None:
-                _write_report(store, chosen, told, doc, machine, report)
+                _write_report(store, chosen, summary, doc, machine, report)
     if as_json:
         print_json(doc)
         return
-    _print(told, SolutionFile.read(doc))
+    _print(summary, SolutionFile.read(doc))
     for name, target in (("report", report), ("grid", grid)):
         if target is not None:
             typer.echo(f"{name}: {target}")
@@ -109,7 +109,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 
 @dataclass(frozen=True)
 class _SolveRequest:
-    """What was asked for beside the solution itself."""
+    """The requested options."""
 
     model: ModelName | None
     tables: bool
@@ -121,7 +121,7 @@ class _SolveRequest:
 
 @contextmanager
 def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
-    """The store and its campaign of that name; what is neither a folder nor in the store is said in one line."""
+    """Yield the store and its campaign of that name; a name that is neither a folder nor in the store is one line of error."""
     from abbe.service.campaign_data.campaign_folder import from_store
     from abbe.service.errors import StoreError
 
@@ -137,7 +137,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
 
 
 def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[str, Any]]:
-    """The solution and its document, with progress on stderr."""
+    """Return the account of the solution and its document, with progress on stderr."""
     from abbe.service.cli.progress import display
     from abbe.service.domain.progress import Progress
     from abbe.service.identification.solve import solve_runs
@@ -146,20 +146,20 @@ def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[st
     with display() as sink:
         stages = iter(range(1, STAGES))
 
-        def say(text: str) -> None:
+        def report_stage(text: str) -> None:
             sink(Progress("solve", float(next(stages, STAGES - 1)), float(STAGES), None, text))
 
-        solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, say=say)
-        say("what these runs cannot tell, and how well the volume is known")
-        told = account(solved)
-        solution = solution_of(told).model_copy(update=_more(told, wanted, say))
+        solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, say=report_stage)
+        report_stage("what these runs cannot tell, and how well the volume is known")
+        summary = account(solved)
+        solution = solution_of(summary).model_copy(update=_more(summary, wanted, report_stage))
         doc = {"campaign": campaign.name, "machine": campaign.site.doc} | as_doc(solution)
         sink(Progress("solve", float(STAGES), float(STAGES), 0.0, "done"))
-    return told, doc
+    return summary, doc
 
 
-def _more(told: Account, wanted: _SolveRequest, say: Callable[[str], None]) -> dict[str, Any]:
-    """What takes longer and is only done on request. The grid is written here: what it refuses, stores nothing."""
+def _more(summary: Account, wanted: _SolveRequest, report_stage: Callable[[str], None]) -> dict[str, Any]:
+    """Return the results that take longer, as requested. The grid is written here: if it is refused, nothing is stored."""
     out: dict[str, Any] = {}
     if not (wanted.tables or wanted.grid or wanted.trials):
         return out
@@ -167,17 +167,19 @@ def _more(told: Account, wanted: _SolveRequest, say: Callable[[str], None]) -> d
     from abbe.service.rendering.page_file import write_page
 
     if wanted.grid is not None:
-        say(f"grid of {wanted.nodes} x {wanted.nodes} x {wanted.nodes} nodes")
-        write_page(grid_text(machine_grid(told, wanted.nodes, wanted.unit_mm)), wanted.grid)
+        report_stage(f"grid of {wanted.nodes} x {wanted.nodes} x {wanted.nodes} nodes")
+        write_page(grid_text(machine_grid(summary, wanted.nodes, wanted.unit_mm)), wanted.grid)
     if wanted.tables:
-        say("what each kind of table could reach")
-        out["tables"] = table_rows(told, wanted.unit_mm)
+        report_stage("what each kind of table could reach")
+        out["tables"] = table_rows(summary, wanted.unit_mm)
     if wanted.trials:
-        out["monte_carlo"] = monte_carlo(told, say)
+        out["monte_carlo"] = monte_carlo(summary, report_stage)
     return out
 
 
-def _write_report(store: Store | None, campaign: Campaign, told: Account, doc: dict[str, Any], machine: Path | None, target: Path) -> None:
+def _write_report(
+    store: Store | None, campaign: Campaign, summary: Account, doc: dict[str, Any], machine: Path | None, target: Path
+) -> None:
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import write_document
@@ -186,23 +188,23 @@ def _write_report(store: Store | None, campaign: Campaign, told: Account, doc: d
 
     rules = rules_of(None if machine is None else load_machine(machine).machine)
     made = SystemClock().utc().isoformat(timespec="seconds")
-    write_document(solution_report(store, campaign, SolutionResult(doc, doc.get("solution_id"), told), made, rules), target)
+    write_document(solution_report(store, campaign, SolutionResult(doc, doc.get("solution_id"), summary), made, rules), target)
 
 
-def _print(told: Account, solution: SolutionFile) -> None:
+def _print(summary: Account, solution: SolutionFile) -> None:
     from abbe.service.identification.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
     from abbe.service.identification.table_removal import table_line
 
     typer.echo(f"campaign {solution.campaign}: model {solution.model}, {len(solution.runs)} runs")
     _lines("look at these runs:", solution.flags)
-    _parameters(told)
-    _comparison(told)
-    o = told.observability
+    _parameters(summary)
+    _comparison(summary)
+    o = summary.observability
     if solution.verdict is not None:
         typer.echo(f"{solution.verdict.word.capitalize()}. {solution.verdict.text}")
         typer.echo(solution.verdict.layout)
     typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.seen.effective_rank} of them well.")
-    typer.echo(worst_line(told))
+    typer.echo(worst_line(summary))
     _tables(solution)
     if solution.table_taken_out is not None:
         typer.echo(table_line(solution.table_taken_out))
@@ -210,9 +212,9 @@ def _print(told: Account, solution: SolutionFile) -> None:
         typer.echo(f"look at this: {solution.table_not_taken_out}")
     if solution.machine_model is not None:
         _lines("model book, not for tables (taken out of the readings where it lasts):", solution.machine_model.not_for_tables)
-    _lines("noise found:", noise_lines(told.joint))
-    _lines("outliers:", outlier_lines(told.solved))
-    _lines("residuals that are not noise:", residual_lines(told.joint))
+    _lines("noise found:", noise_lines(summary.joint))
+    _lines("outliers:", outlier_lines(summary.solved))
+    _lines("residuals that are not noise:", residual_lines(summary.joint))
     _lines("these runs cannot tell:", solution.not_observable)
     _lines("what would show more:", solution.advice)
     if solution.solution_id is not None:
@@ -226,17 +228,17 @@ def _lines(heading: str, lines: list[str]) -> None:
         typer.echo(f"- {text}")
 
 
-def _parameters(told: Account) -> None:
+def _parameters(summary: Account) -> None:
     from abbe.models.compensation.summary import SCALE_NOTE
     from abbe.service.identification.solve_report import HIDDEN_NOTE
 
-    status = {m.name: m.status for m in told.observability.motions}
+    status = {m.name: m.status for m in summary.observability.motions}
     rows: list[list[str]] = []
-    for p in told.mean:
+    for p in summary.mean:
         unit = "µm/m" if p.name[0] == "E" else "µrad"
         what = f"mean over the volume; {HIDDEN_NOTE}" if status.get(p.name) == "not observable" else "mean over the volume"
         rows.append([p.name, _figure(p.value * 1e6), f"{2 * p.u * 1e6:.2f}", unit, what])
-    for axis, (v, u) in told.joint.backlash_mm().items():
+    for axis, (v, u) in summary.joint.backlash_mm().items():
         rows.append([f"backlash {axis}", _figure(v * 1e3), f"{2 * u * 1e3:.2f}", "µm", "lost motion"])
     print_table(["parameter", "value", "U (k = 2)", "unit", "what"], rows)
     typer.echo(f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}")
@@ -244,10 +246,10 @@ def _parameters(told: Account) -> None:
     typer.echo("error motions, each for itself: " + "; ".join(f"{s}: {names}" for s, names in words.items()))
 
 
-def _comparison(told: Account) -> None:
+def _comparison(summary: Account) -> None:
     from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE
 
-    solved = told.solved
+    solved = summary.solved
     labels = list(solved.helices)
     for at in range(0, len(labels), SIDE_BY_SIDE):
         some = labels[at : at + SIDE_BY_SIDE]
@@ -291,7 +293,7 @@ def _helix_row(estimate: Any) -> list[str]:
 
 
 def _step_rows(figures: dict[str, float]) -> list[list[str]]:
-    """The papers' figures; keys end in their unit, ``u_`` + key is the standard uncertainty."""
+    """Return the papers' figures; keys end in their unit, ``u_`` + key is the standard uncertainty."""
     rows = []
     for key in (k for k in figures if not k.startswith("u_")):
         name, _, unit = key.rpartition("_")

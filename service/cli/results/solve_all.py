@@ -1,4 +1,4 @@
-"""`abbe solve-all`: many campaigns anew, here, in processes, or on a Dask cluster."""
+"""`abbe solve-all`: solve many campaigns again, here, in processes, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="Campaigns by name, e.g. 'june-*'.")] = "*",
-    model: Annotated[ModelName, typer.Option("--model", help="As of abbe solve.")] = ModelName.rigid21,
+    model: Annotated[ModelName, typer.Option("--model", help="As for abbe solve.")] = ModelName.rigid21,
     workers: Annotated[int, typer.Option("--workers", min=1, max=256, help="Processes of this computer.")] = 1,
     dask: Annotated[
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster instead.", show_default=False)
@@ -25,7 +25,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve many campaigns of a database anew, each exactly as abbe solve does; exit code 1 if one was refused."""
+    """Solve many campaigns of a database again, each exactly as abbe solve does; exit code 1 if one was refused."""
     from abbe.service.cli.common import database_url, open_store
     from abbe.service.errors import NotStored
     from abbe.service.identification.reanalysis import HEADINGS, row, tasks_of

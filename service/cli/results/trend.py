@@ -1,4 +1,4 @@
-"""``abbe trend``: do the figures of the checks drift, since when, and when do they reach their limits."""
+"""``abbe trend``: the trend of the checks' figures, since when they drift, and when they reach their limits."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def trend(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
+    """Show the trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
     from abbe.service.cli.common import reader_of
     from abbe.service.queries.checks import trends
     from abbe.service.queries.reader import json_value
     from abbe.service.verification.trend_table import HEADINGS, chart, row
     from abbe.service.verification.verified_by import measure_now
 
-    since = _moment(after)
+    since = _utc(after)
     with reader_of(machine) as reader:
         found = trends(reader, reader.machine, since)
     if as_json:
@@ -49,7 +49,7 @@ def trend(
     print_table(HEADINGS, [row(one) for one in found.figures])
 
 
-def _moment(text: str | None) -> datetime | None:
+def _utc(text: str | None) -> datetime | None:
     from datetime import UTC
 
     from abbe.service.errors import ConfigError
@@ -57,7 +57,7 @@ def _moment(text: str | None) -> datetime | None:
     if text is None:
         return None
     try:
-        moment = datetime.fromisoformat(text)
+        time = datetime.fromisoformat(text)
     except ValueError:
         raise ConfigError(f"--after {text!r} is not a date or time", "write e.g. 2026-11-21 or 2026-11-21T03:00:00Z") from None
-    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)

@@ -1,4 +1,4 @@
-"""`abbe comp`: compensation tables - as the files that controls read, and back."""
+"""`abbe comp`: convert compensation tables to and from the files of controls."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from abbe.service.formats.choice import FormatChoice
     from abbe.service.formats.model import Compensation
 
-comp = typer.Typer(help="Compensation tables: as the files that controls read, and back.", no_args_is_help=True)
+comp = typer.Typer(help="Compensation tables: as files of controls, and back.", no_args_is_help=True)
 
 FormatOption = Annotated[
     str, typer.Option("--format", metavar="F", help="Format or control; abbe comp formats lists them.", show_default=False)
@@ -27,7 +27,7 @@ ReferenceOption = Annotated[
 
 @comp.command("formats")
 def list_formats(as_json: JsonOption = False) -> None:
-    """List formats and controls: what each can hold, how its sign is known."""
+    """List formats and controls: what each can hold, and how its sign is known."""
     from abbe.service.formats.controls import CONTROLS
     from abbe.service.formats.registry import FORMATS
 
@@ -56,13 +56,13 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     sign: Annotated[
         Path | None, typer.Option("--sign", metavar="KEY", help="Sign for the machine of --machine: FILE.sig.", show_default=False)
     ] = None,
-    days: Annotated[float, typer.Option("--days", help="With --sign: how long the files may be taken in.")] = 30.0,
+    days: Annotated[float, typer.Option("--days", help="With --sign: how long the files may be imported.")] = 30.0,
     base: Annotated[str, typer.Option("--base", help="With --sign: fingerprint of the table that was active while measuring.")] = "none",
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the best tables that a control can hold, with what each kind of table would leave."""
+    """Write the best tables that a control can hold, and show what each kind of table would leave."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import control_for, export, formats_in, identified, reference_of, write_files
     from abbe.service.compensation.comp_signed import TableSeal, check_signing, sign_files
@@ -104,8 +104,8 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Read a control's files as the control would: show the tables, what they are worth (signed for this machine, or only a candidate),
-    and how they differ from a solution's.
+    """Read a control's files as the control would: show the tables, their status (signed for this machine, or only a candidate), and how
+    they differ from a solution's.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
@@ -118,9 +118,9 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     nominal = known.machine if known is not None else _machine(machine)
     start = at if at is not None else nominal.stroke_mm[:, 0]
     files = read_files(file)
-    worth = seal_status(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
+    status = seal_status(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
     found = read_key(form, files, settings_for(control, nominal, start))
-    doc: dict[str, Any] = {"tables": _tables(found), "standing": "signed" if worth.signed else "candidate", "why": worth.why}
+    doc: dict[str, Any] = {"tables": _tables(found), "standing": "signed" if status.signed else "candidate", "why": status.why}
     if known is not None:
         same = check_same(found, expected(known, control, at), 0.51 * control.unit_mm + 1e-6)
         doc["differences_um"] = {d.axis: d.size_mm * 1e3 for d in same}
@@ -130,10 +130,10 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     print_table(
         ("table", "points", "from (mm)", "to (mm)", "smallest", "largest", "unit"), [tuple(map(str, t.values())) for t in doc["tables"]]
     )
-    typer.echo(f"{doc['standing']}: {worth.why}")
+    typer.echo(f"{doc['standing']}: {status.why}")
     if "differences_um" in doc:
-        words = ", ".join(f"{a} {v:.4f} µm" for a, v in doc["differences_um"].items())
-        typer.echo(f"these are the tables of solution {solution}; largest difference: {words}")
+        sizes = ", ".join(f"{a} {v:.4f} µm" for a, v in doc["differences_um"].items())
+        typer.echo(f"these are the tables of solution {solution}; largest difference: {sizes}")
 
 
 def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 
 
 def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none: bool) -> bool:
-    """Whether a solution is known to have been measured without a correction; refused where there was one."""
+    """Return whether a solution is known to be measured without a correction; refused if one was in force."""
     from abbe.service.compensation.comp_export import solution_document
     from abbe.service.tables.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
 
@@ -158,14 +158,14 @@ def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none:
 
 
 def _machine_file(file: Path | None) -> MachineFile | None:
-    """What a machine file says; None without one."""
+    """Return a machine file's content; None without one."""
     from abbe.service.config import load_machine
 
     return None if file is None else load_machine(file).machine
 
 
 def _machine(file: Path | None) -> Any:
-    """Nominal geometry of a machine file; without one, a machine that only says where zero is."""
+    """Return the nominal geometry of a machine file; without one, a machine that only defines where zero is."""
     import numpy as np
 
     from abbe.models.machine import Machine
@@ -182,13 +182,13 @@ def _choice(c: FormatChoice) -> dict[str, Any]:
 
 
 def _holds(limits: Any) -> str:
-    words = ("own", "cross", "products", "lattice", "motions")
-    held = [w for w in words if getattr(limits, w)]
+    kinds = ("own", "cross", "products", "lattice", "motions")
+    held = [kind for kind in kinds if getattr(limits, kind)]
     return ", ".join(held) + ("; both directions" if limits.directional and limits.own else "")
 
 
 def _tables(found: Compensation) -> list[dict[str, Any]]:
-    """One line per table: name, points, range, smallest and largest number as a correction."""
+    """Return one line per table: name, points, range, smallest and largest value as a correction."""
     rows = []
     for t in found.tables:
         ways = [("", t.forward_mm)] if not t.directional else [(", moving in +", t.forward_mm), (", moving in −", t.backward_mm)]

@@ -1,4 +1,4 @@
-"""`abbe comp commission`: prove what the controller does for a safe push and with a correction, before a real table is written."""
+"""`abbe comp commission`: prove how the controller handles a push and a correction, before a real table is written."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ def commission(
     machine: MachineArgument,
     levels_only: Annotated[
         bool,
-        typer.Option("--levels-only", help="Only prove what the controller does for a safe push: one move of 3 mm, nothing is mounted."),
+        typer.Option("--levels-only", help="Only prove the controller's level for pushes: one move of 3 mm, nothing is mounted."),
     ] = False,
     wait_s: Annotated[
-        float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
+        float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
     accept_table: AcceptTable = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Try what the controller must refuse; then write a small known step for each axis, measure it with the ball-bar.
+    """Try what the controller must refuse; then write a small known step for each axis and measure it with the ball-bar.
 
-    Proves its level for pushes, and sign, axis and unit of its tables. Exit code 1: something was not proved.
+    This proves its level for pushes, and sign, axis and unit of its tables. Exit code 1: something was not proved.
     """
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
-    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.cli.waiting import rollback_when_safe
     from abbe.service.compensation.commission import commission as work_commission
     from abbe.service.compensation.commission_levels import commission_levels
     from abbe.service.compensation.proved_levels import check_level
@@ -55,7 +55,7 @@ def commission(
                 return levels, None
             await check_level(session.controller, store, site)
             with display() as sink:
-                async with taken_back_when_safe(session, store, site, wait_s):
+                async with rollback_when_safe(session, store, site, wait_s):
                     return levels, await work_commission(session, store, site, progress=sink)
 
     with Store.open(loaded.database_url) as store:

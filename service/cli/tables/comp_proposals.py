@@ -1,4 +1,4 @@
-"""`abbe comp propose | show | diff | approve | reject`: tables as proposals, looked at and agreed to before anything is written."""
+"""`abbe comp propose | show | diff | approve | reject`: tables as proposals, reviewed and approved before anything is written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def propose(
     campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Identification campaign in the store.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Solve a campaign and store the tables that follow as a proposal; writes nothing to the controller (exit code 1: reasons against)."""
+    """Solve a campaign and store the resulting tables as a proposal; nothing is written to the controller (exit code 1: objections)."""
     from dataclasses import replace
 
     from abbe.service.cli.progress import display
@@ -64,7 +64,7 @@ def _print_made(store: Store, made: StoredProposal, *, as_json: bool) -> None:
     for line in found.not_for_tables:
         typer.echo(f"not in the tables: {line}")
     if found.reasons:
-        typer.echo("it is stored to be looked at, and cannot be approved or pushed")
+        typer.echo("it is stored for review, and cannot be approved or pushed")
 
 
 def show_proposals(
@@ -75,7 +75,7 @@ def show_proposals(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Proposals: what they promise, with uncertainty, where they stand, the reasons against them."""
+    """Show proposals: their promise with uncertainty, their state, the reasons against them."""
     from abbe.service.queries import proposals
     from abbe.service.queries.reader import json_value
 
@@ -119,7 +119,7 @@ def diff(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """What a proposal changes: each of the nine tables in numbers, and as a picture."""
+    """Show what a proposal changes: each of the nine tables in numbers, and as a picture."""
     from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_report, largest, rows
     from abbe.service.compensation.proposal_doc import load
     from abbe.service.queries.proposals import difference_of
@@ -127,7 +127,7 @@ def diff(
     from abbe.service.rendering.document_page import form_of, write_document
 
     if html is not None:
-        form_of(html)  # before the work
+        form_of(html)  # refuse a wrong suffix before the work
     with open_store(database_url(db, machine)) as store:
         found = compare(store, proposal, other)
         proposed = load(store, proposal)
@@ -145,7 +145,7 @@ def diff(
 def approve(
     proposal: ProposalArgument,
     name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who approves. Default: the account.", show_default=False)] = "",
-    hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long it holds, at most.", min=0.01, max=720.0)] = 24.0,
+    hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long the approval holds, at most.", min=0.01, max=720.0)] = 24.0,
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
@@ -170,7 +170,7 @@ def approve(
 
 
 def _control(machine: Path | None, name: str) -> str:
-    """Identity of a machine's control; empty where its machine file was not given."""
+    """Return the identity of a machine's control; empty without its machine file."""
     from abbe.service.config import load_machine
     from abbe.service.devices.urls import control_of
 
@@ -185,7 +185,7 @@ def reject(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Reject a proposal for good: it cannot be approved or pushed any more (exit code 1: it cannot be rejected any more)."""
+    """Reject a proposal permanently: it cannot be approved or pushed (exit code 1: it cannot be rejected any more)."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposal_decisions import reject as work_reject
     from abbe.service.compensation.proposals import login

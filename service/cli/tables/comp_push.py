@@ -1,4 +1,4 @@
-"""`abbe comp push | rollback`: a proposal into the controller through the same door as `abbe correct`, and the table of before back."""
+"""`abbe comp push | rollback`: push a proposal with the checks of `abbe correct`, or restore the previous table."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def push(
         str, typer.Option(metavar="CAMPAIGN", help="Verification campaign measured with the present table; default: it is measured now.")
     ] = "",
     wait_s: Annotated[
-        float, typer.Option(help="How long to wait for a safe machine, should an unverified table be active; 0: not.")
+        float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
     accept_table: AcceptTable = False,
 ) -> None:
-    """Push a proposal, prove it, measure again; the old table comes back by itself if the machine is not better (exit code 1)."""
+    """Push a proposal, prove it, measure again; roll back to the old table if the machine is not better (exit code 1)."""
     from abbe.service.cli.progress import display
     from abbe.service.cli.running import run_job
-    from abbe.service.cli.waiting import taken_back_when_safe
+    from abbe.service.cli.waiting import rollback_when_safe
     from abbe.service.compensation.correct import push as work_push
     from abbe.service.compensation.gate import PushContext, admit
     from abbe.service.config import load_machine
@@ -39,16 +39,16 @@ def push(
 
     loaded = load_machine(machine)
     site = site_of(loaded.machine)
-    said: list[str] = []
+    hints: list[str] = []
 
     async def work(store: Store) -> Correction:
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink)
                 admission = await admit(context, proposal)
-                said.append(admission.hint)
+                hints.append(admission.hint)
                 runs = await verification_before(session, store, site, before, sink)
-                async with taken_back_when_safe(session, store, site, wait_s):
+                async with rollback_when_safe(session, store, site, wait_s):
                     return await work_push(context, admission, runs)
 
     with Store.open(loaded.database_url) as store:
@@ -59,7 +59,7 @@ def push(
                 typer.echo(f"not pushed: {reason}")
             raise typer.Exit(1) from None
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
-    for line in (*(f"not in the tables: {text}" for text in found.not_for_tables), *filter(None, said)):
+    for line in (*(f"not in the tables: {text}" for text in found.not_for_tables), *filter(None, hints)):
         typer.echo(line)
     raise typer.Exit(0 if found.decision.keep else 1)
 
@@ -68,13 +68,11 @@ def rollback(
     machine: MachineArgument,
     to: Annotated[
         int | None,
-        typer.Option(
-            "--to", metavar="PUSH", help="To what was in force when this push had ended; 0: before the first.", show_default=False
-        ),
+        typer.Option("--to", metavar="PUSH", help="To the table in force after this push; 0: before the first.", show_default=False),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask: the machine is unverified afterwards, and I want that.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask: I know that the machine is unverified afterwards.")] = False,
 ) -> None:
-    """Make the table active again that was in force before the last kept push: by a person's order, without measuring. Asks first."""
+    """Restore the table that was in force before the last kept push: on a person's order, without measuring. Asks first."""
     from dataclasses import replace
 
     from abbe.service.cli.running import run_job
@@ -94,11 +92,11 @@ def rollback(
     async def work(store: Store) -> RollbackResult | str | None:
         last = read_entries(store, site.name, site.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
-        if not (finished and to is None) and not yes and not await _asked(to):
-            raise ConfigError("nothing was taken back", "say yes, or add --yes where nobody is at the console")
+        if not (finished and to is None) and not yes and not await _confirmed(to):
+            raise ConfigError("nothing was taken back", "answer yes, or add --yes if no one is at the console")
         async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
             if finished and to is None:
-                return f"push {last[0].push} was open and is finished; to go further back, say so again"
+                return f"push {last[0].push} was open and is finished; to go further back, run the command again"
             return await work_rollback(session.controller, store, site, to)
 
     with Store.open(loaded.database_url) as store:
@@ -112,8 +110,8 @@ def rollback(
         typer.echo(f"the machine is unverified now: {measure_now(str(machine))}")
 
 
-async def _asked(to: int | None) -> bool:
-    """Whether the person at the console wants the table of before; nobody there: no."""
+async def _confirmed(to: int | None) -> bool:
+    """Return whether the person at the console wants the rollback; without a console: no."""
     from abbe.service.cli.ask import console_confirm
 
     which = {None: "from before the last kept push", 0: "from before the first push"}.get(to, f"that was in force after push {to}")

@@ -1,4 +1,4 @@
-"""`abbe accept-table`: a person vouches for the table that is active in the controller."""
+"""`abbe accept-table`: a person vouches for the controller's active table."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import typer
 
 def accept_table(
     machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
-    yes: Annotated[bool, typer.Option("--yes", help="I have looked at the controller: its active table is right.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="I have checked the controller: its active table is right.")] = False,
 ) -> None:
-    """Say that the active table is right, so that work can go on: after an interrupted push that Abbe could not clear up, under whatever
-    name it was begun, or where this database did not push the table. Who and when is kept in the push journal.
+    """Accept the active table as right, so that work can continue: after an interrupted push that Abbe could not resolve, under any name,
+    or if this database did not push the table. The push journal records who and when.
     """
     from abbe.service.compensation.proposals import by_whom
     from abbe.service.compensation.recover import accept

@@ -1,4 +1,4 @@
-"""What the address space shows, as a flat mapping from path to value: pure, so that what is shown is tested without a server."""
+"""Content of the address space as a flat mapping from path to value: pure, so that it is tested without a server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_TEXT = 500
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One variable. ``value`` None: not known, which is shown as a bad status and not as a zero."""
+    """One variable. ``value`` None: unknown, which is shown as a bad status and not as zero."""
 
     value: Value
     kind: Kind
@@ -30,7 +30,7 @@ Picture = dict[str, Leaf]
 
 
 def picture_of(facts: PlantFacts) -> Picture:
-    """Return what is shown of the machine."""
+    """Return all variables of the machine."""
     return {
         "State": Leaf(facts.state, "text"),
         "Version": Leaf(facts.version, "text"),
@@ -59,7 +59,7 @@ def _running(facts: PlantFacts) -> Picture:
 
 
 def _last(check: Verification | None, verdict: str | None) -> Picture:
-    """The last check. Its verdict stands only where it is of the table in force."""
+    """Return the last check; ``verdict`` as `PlantFacts.verdict`."""
     out = {
         "LastResult/Number": Leaf(check.id if check else None, "count"),
         "LastResult/Verdict": Leaf(verdict, "text"),
@@ -124,5 +124,5 @@ def _devices(facts: PlantFacts) -> Picture:
 
 
 def _short(text: str) -> str:
-    """Device strings end up here: printable, and of sane length."""
+    """Return printable text of at most `MAX_TEXT` characters: device strings may hold anything."""
     return "".join(c if c.isprintable() else " " for c in text)[:MAX_TEXT]

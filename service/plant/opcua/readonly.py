@@ -1,8 +1,8 @@
-"""asyncua's server without everything that changes something: whoever comes over the network reads, and nothing else.
+"""asyncua's server without any service that changes something: network clients can only read.
 
-The library decides by user roles and by each node's access level, and answers a client on an unencrypted channel even where only encrypted
-ones are offered (it needs that channel for discovery). Here the services themselves are closed for every session from outside, and with
-known certificates a session is activated only on a channel that was encrypted with one of them.
+The library decides by user roles and by each node's access level, and answers a client on an unencrypted channel even if only encrypted
+ones are offered (it needs that channel for discovery). Here the services themselves are closed for every external session, and with known
+certificates a session is activated only on a channel encrypted with one of them.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class ClientSession(InternalSession):
     """A client's session."""
 
     async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
-        """Write nothing."""
+        """Refuse every write."""
         return [ua.StatusCode(ua.StatusCodes.BadNotWritable) for _ in params.NodesToWrite]
 
     async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:
-        """Call nothing."""
+        """Refuse every call."""
         return [ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadNotExecutable)) for _ in params]
 
     async def add_nodes(self, params: Any) -> Any:
@@ -59,7 +59,7 @@ class ClientSession(InternalSession):
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     def activate_session(self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None) -> ua.ActivateSessionResult:
-        """Let somebody in: with known certificates, by an encrypted channel of one of them only."""
+        """Activate a session; if certificates are known, only on a channel encrypted with one of them."""
         server = self.iserver
         if isinstance(server, ReadOnlyServer) and server.trusted is not None:
             server.must_be_known(peer_certificate)
@@ -67,25 +67,25 @@ class ClientSession(InternalSession):
 
 
 class _Readers(UserManager):
-    """Everybody who proved what is asked of him reads; nobody is more."""
+    """Gives every authenticated client the role of a reader, and no client more."""
 
     def __init__(self, trusted: Mapping[bytes, x509.Certificate] | None) -> None:
         self._trusted = trusted
 
     def get_user(self, iserver: InternalServer, username: str | None = None, password: str | None = None, certificate: Any = None) -> Any:
-        """Return a reader, or None for somebody whose certificate is not known."""
+        """Return a reader, or None if the certificate is not known."""
         if username is not None or (self._trusted is not None and certificate not in self._trusted):
             return None
         return User(role=UserRole.User)
 
 
 class ReadOnlyServer(InternalServer):
-    """The inside of the server.
+    """The internal server.
 
     Parameters
     ----------
     trusted : mapping of bytes to certificate, or None
-        Who may come, by the DER bytes of his certificate. None: everybody who can reach us (this computer), anonymously.
+        Certificates of the clients that may connect, by their DER bytes. None: any program on this computer, anonymously.
     """
 
     def __init__(self, trusted: Mapping[bytes, x509.Certificate] | None) -> None:
@@ -93,13 +93,13 @@ class ReadOnlyServer(InternalServer):
         self.trusted = trusted
         self.supported_tokens = (ua.AnonymousIdentityToken,) if trusted is None else (ua.X509IdentityToken,)
         self.allow_remote_admin = False
-        self.disabled_clock = True  # its loop sleeps a second through every stop; ours writes the time
+        self.disabled_clock = True  # its loop delays every stop by a second; `OpcUaServer` writes the time
         self.max_connections = MAX_CONNECTIONS
         self.max_subscriptions = MAX_SUBSCRIPTIONS
         self.max_pending_activation_seconds = ACTIVATION_S
 
     def must_be_known(self, certificate: bytes | None) -> None:
-        """Refuse a channel without encryption, or of somebody who is not known, or whose certificate has run out."""
+        """Refuse a channel without encryption, with an unknown certificate, or with an expired one."""
         known = (self.trusted or {}).get(certificate or b"")
         if known is None:
             raise ServiceError(ua.StatusCodes.BadCertificateUntrusted if certificate else ua.StatusCodes.BadSecurityModeInsufficient)
@@ -107,16 +107,16 @@ class ReadOnlyServer(InternalServer):
             raise ServiceError(ua.StatusCodes.BadCertificateTimeInvalid)
 
     def create_session(self, name: str, user: Any = None, external: bool = False) -> InternalSession:
-        """Return a session; one from outside can only read."""
+        """Return a session that can only read."""
         return ClientSession(self, self.aspace, self.subscription_service, name, user=User(role=UserRole.Anonymous), external=external)
 
     def register_server(self, server: Any, conf: Any = None) -> None:
-        """Refuse: this is no discovery server, and the service needs no session."""
+        """Refuse: this is no discovery server, and this service needs no session."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
 
 def seal(space: AddressSpace) -> int:
-    """Take from every node the right to write and from every method the right to be called, the standard's own too; return how many."""
+    """Remove write access from every node and execute access from every method, the standard's own too; return how many."""
     sealed = 0
     for nodeid in list(space.keys()):
         attributes = space[nodeid].attributes

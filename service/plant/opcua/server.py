@@ -1,4 +1,4 @@
-"""The OPC UA server as one part of the service: shows facts once a second, takes nothing. If it cannot listen, nothing else suffers."""
+"""The OPC UA server as a part of the service: updates its values once a second, accepts none. Its failures affect nothing else."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class OpcUaServer:
     Parameters
     ----------
     setup : OpcUa
-        Where to listen, who may read; checked (`abbe.service.plant.opcua.setup.check_opcua`).
+        Address, certificates and clients; checked (`abbe.service.plant.opcua.setup.check_opcua`).
     source : FactsSource
-        What is shown.
+        Facts to show.
     clock : Clock
         Pauses and time stamps.
     machine, version : str
@@ -48,19 +48,19 @@ class OpcUaServer:
         self._setup, self._source, self._clock = setup, source, clock
         self._machine, self._version = machine, version
         self.port = 0
-        """Where it listens; 0 while it does not."""
+        """TCP port; 0 while it does not listen."""
         self.listening = asyncio.Event()
         self.sealed = 0
-        """Rights to write and to call that were taken from the standard's own nodes."""
+        """Number of write and execute rights removed from the standard's own nodes."""
         self._built: tuple[Server, Space] | None = None
 
     async def prepare(self) -> None:
-        """Build the address space. It takes a second or two and holds up the event loop for parts of one: before anything moves."""
+        """Build the address space, before anything moves: it takes a second or two and blocks the event loop for parts of one."""
         self._built = await self._build()
-        gc.freeze()  # some hundred thousand objects that stay: without this, every full collection would look at them, for 0.2 s
+        gc.freeze()  # some hundred thousand permanent objects: without this, every full collection would visit them, for 0.2 s
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Serve until ``stop`` or until cancelled. Where it cannot listen, it says so and tries again every half minute."""
+        """Serve until ``stop`` or until cancelled. If it cannot listen, it logs that and tries again every half minute."""
         while not stop.is_set():
             try:
                 await self._serve(stop)
@@ -69,7 +69,7 @@ class OpcUaServer:
                 await self._pause(AGAIN_S, stop)
 
     async def _serve(self, stop: asyncio.Event) -> None:
-        if self._setup.port:  # cheaper to find out now than after a second of building the address space, at every attempt
+        if self._setup.port:  # fail now rather than after a second of building the address space, at every attempt
             family = socket.AF_INET6 if ":" in self._setup.host else socket.AF_INET
             socket.create_server((self._setup.host, self._setup.port), family=family).close()
         server, space = self._built or await self._build()

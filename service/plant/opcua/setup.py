@@ -1,4 +1,4 @@
-"""Whether an OPC UA server can be served as the machine file says. Knows nothing of asyncua, so that it is checked without it."""
+"""Check the OPC UA section of the machine file. Independent of asyncua, so that it works without it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from abbe.service.errors import ConfigError
 
 
 def check_opcua(setup: OpcUa) -> None:
-    """Refuse what cannot work or must not be.
+    """Refuse an impossible or unsafe setup.
 
     Raises
     ------
     ConfigError
-        It would listen for other computers in clear, or to everybody; a certificate cannot be read; the extra is not installed.
+        It would listen for other computers unencrypted, or to everyone; a certificate cannot be read; asyncua is not installed.
     """
     if setup.guarded and not (setup.certificate and setup.clients):
         raise ConfigError(
@@ -41,7 +41,7 @@ def trusted(files: Sequence[str]) -> dict[bytes, x509.Certificate]:
     Raises
     ------
     ConfigError
-        One cannot be read, or is no certificate.
+        A file cannot be read, or is no certificate.
     """
     found = {}
     for name in files:
@@ -58,5 +58,5 @@ def trusted(files: Sequence[str]) -> dict[bytes, x509.Certificate]:
 
 
 def in_force(certificate: x509.Certificate, now: datetime | None = None) -> bool:
-    """Tell whether a certificate is within its days."""
+    """Return whether a certificate is valid now."""
     return certificate.not_valid_before_utc <= (now or datetime.now(UTC)) <= certificate.not_valid_after_utc

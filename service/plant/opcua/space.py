@@ -1,4 +1,4 @@
-"""Keeps the nodes of the address space equal to a picture: makes what is missing, writes what has changed."""
+"""Keep the nodes of the address space equal to a picture: create missing ones, write changed values."""
 
 from __future__ import annotations
 
@@ -23,17 +23,7 @@ _TYPES: dict[Kind, tuple[ua.VariantType, int]] = {
 
 
 class Space:
-    """The machine's part of the address space.
-
-    Parameters
-    ----------
-    server : Server
-        Initialised.
-    index : int
-        Of our namespace.
-    machine : str
-        Name of the machine.
-    """
+    """The machine's part of the address space; ``index``: of Abbe's namespace."""
 
     def __init__(self, server: Server, index: int, machine: str) -> None:
         self._server, self._index, self._machine = server, index, machine
@@ -42,7 +32,7 @@ class Space:
         self._stale = False
 
     async def show(self, picture: Picture, now: datetime) -> int:
-        """Write what has changed; return how many variables that were. What is no longer in the picture is not known any more."""
+        """Write changed values; return how many. Values missing from the picture become unknown."""
         gone = {path: Leaf(None, leaf.kind, leaf.unit) for path, leaf in self._shown.items() if path not in picture}
         changed = {path: leaf for path, leaf in {**picture, **gone}.items() if self._stale or self._shown.get(path) != leaf}
         for path, leaf in changed.items():
@@ -52,7 +42,7 @@ class Space:
         return len(changed)
 
     async def show_stale(self, now: datetime) -> bool:
-        """Say of every value that it is the last one known, and no longer of now; return False if that was said before."""
+        """Mark every value as the last known one; return False if they were marked before."""
         if self._stale:
             return False
         self._stale = True

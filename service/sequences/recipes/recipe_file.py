@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 
 from abbe.service.errors import ConfigError
-from abbe.service.explain import expected, nearest, where
+from abbe.service.explain import expected, location_text, nearest
 from abbe.service.sequences.recipes.fields import TestRecipe, file_fields, file_table
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear, Recipe
 from abbe.service.sequences.recipes.setups import shared_setups
@@ -94,7 +94,7 @@ def _check_keys(content: dict[str, Any], source: str) -> None:
         keys = [] if kind is None else list(file_fields(kind))
         for key in table if keys else ():
             if key not in keys:
-                raise ConfigError(f"{source}: unknown key {where(('test', k, key))!r}", nearest(key, keys))
+                raise ConfigError(f"{source}: unknown key {location_text(('test', k, key))!r}", nearest(key, keys))
         if isinstance(table, dict):
             table.setdefault("role", "identify")
 
@@ -104,12 +104,16 @@ def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
     tail = f" (and {more} more)" if more else ""
     place = tuple(p for p in first["loc"] if p not in KINDS)
     if first["type"] == "extra_forbidden":
-        return ConfigError(f"{source}: unknown key {where(place)!r}{tail}", nearest(str(place[-1]), list(RecipeFile.model_fields)))
+        return ConfigError(f"{source}: unknown key {location_text(place)!r}{tail}", nearest(str(place[-1]), list(RecipeFile.model_fields)))
     if first["type"] == "union_tag_not_found":
-        return ConfigError(f"{source}: key {where((*place, 'kind'))!r} is missing{tail}", f"add kind = {' or '.join(map(repr, KINDS))}")
+        return ConfigError(
+            f"{source}: key {location_text((*place, 'kind'))!r} is missing{tail}", f"add kind = {' or '.join(map(repr, KINDS))}"
+        )
     if first["type"] == "missing":
-        return ConfigError(f"{source}: key {where(place)!r} is missing{tail}", f"add {place[-1]} = ...")
-    return ConfigError(f"{source}: {where(place)}: {expected(first)}{tail}", "correct it; docs/reference/recipe-file.md has all keys")
+        return ConfigError(f"{source}: key {location_text(place)!r} is missing{tail}", f"add {place[-1]} = ...")
+    return ConfigError(
+        f"{source}: {location_text(place)}: {expected(first)}{tail}", "correct it; docs/reference/recipe-file.md has all keys"
+    )
 
 
 def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:

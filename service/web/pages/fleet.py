@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from abbe.service.domain.utc import utc_text
-from abbe.service.scheduler.fleet import FleetFigure, MachineStatus, stands
+from abbe.service.scheduler.fleet import FleetFigure, MachineStatus, machine_statuses
 from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import folded, is_open
 
@@ -61,7 +61,7 @@ class FleetQuery:
 
 def fleet_lines(store: Store, now: datetime, query: FleetQuery) -> list[FleetLine]:
     """The matching machines in the requested order."""
-    lines = [_line(store, one) for one in stands(store, now) if _fits(one, query)]
+    lines = [_line(store, one) for one in machine_statuses(store, now) if _fits(one, query)]
     if query.sort == "machine":
         return sorted(lines, key=lambda one: one.machine.machine)
     if query.sort == "due":

@@ -235,7 +235,7 @@ def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signa
     child.write_text(CHILD)
     instead = (
         "from abbe.service.cli import main; from abbe.service.cli.administration import system; "
-        f"system.python_words = lambda _, *words: [{sys.executable!r}, {str(child)!r}, *words]"
+        f"system.python_command = lambda _, *words: [{sys.executable!r}, {str(child)!r}, *words]"
     )
     command = [sys.executable, "-c", f"{instead}; main()", "sim", "a.toml", "--help", "--speed=3"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

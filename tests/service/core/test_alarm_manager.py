@@ -107,7 +107,7 @@ class Bench:
         return found
 
     def jobs(self, state: str = "") -> list[JobState]:
-        return [job for job in self.book.seen() if job.state.startswith(state)]
+        return [job for job in self.book.latest() if job.state.startswith(state)]
 
     async def steer(self, how: Steering, who: str = "user:bob") -> tuple[str, str]:
         running = self.book.running

@@ -46,7 +46,7 @@ def result(day: float, diagonal: float = 9.0, helix: float = 1.4, **more: Any) -
 def records(*results: Result, recipe: str = "quick-check") -> list[VerificationRecord]:
     """Newest first, as the store gives them."""
     schedule = Schedule("daily", "0 5 * * *", "UTC", recipe)
-    docs = [record.found(record.Occasion("mill-7", schedule, r.started_utc), r) for r in results]
+    docs = [record.check_doc(record.Occasion("mill-7", schedule, r.started_utc), r) for r in results]
     return [VerificationRecord(k, 1, None, d["verdict"], d, d["started_utc"]) for k, d in enumerate(docs, 1)][::-1]
 
 

@@ -95,7 +95,7 @@ async def test_a_slot_waits_for_a_job_by_hand(bench: Bench) -> None:
     await bench.clock.pass_time(60)
     assert bench.ran == ["by hand", "hourly"]
     assert bench.ledger.of("done: pass") == [utc(2026, 6, 1, 13)]
-    by_timetable, by_hand = bench.book.seen()
+    by_timetable, by_hand = bench.book.latest()
     assert (by_hand.id, by_hand.who, by_hand.schedule, by_hand.state, by_hand.verification) == (answer.job, "user:bob", "", "done: pass", 1)
     assert (by_timetable.who, by_timetable.schedule, by_timetable.verification) == ("", "hourly", 2)
 
@@ -108,7 +108,7 @@ async def test_a_job_by_hand_does_not_come_between(bench: Bench) -> None:
     running = bench.book.running
     assert running is not None
     assert await bench.steer(running.id, "pause") == "done"  # that of the timetable can be steered too
-    assert bench.book.seen()[0].state == "pausing"
+    assert bench.book.latest()[0].state == "pausing"
     assert await bench.steer(running.id, "resume") == "done"
     bench.may_end.set()
     await settle()
@@ -148,7 +148,7 @@ async def test_old_jobs_are_forgotten_and_after_the_end_none_is_started(bench: B
     first = (await bench.start()).job
     for _ in range(MOST_JOBS):
         await bench.start()
-    assert len(bench.book.seen()) == MOST_JOBS
+    assert len(bench.book.latest()) == MOST_JOBS
     assert await bench.steer(first, "stop") == "unknown"
     await bench.book.close()
     assert (await bench.start()).outcome == "busy"
@@ -157,7 +157,7 @@ async def test_old_jobs_are_forgotten_and_after_the_end_none_is_started(bench: B
 async def test_the_end_stops_a_job_by_hand(bench: Bench) -> None:
     job = (await bench.start()).job
     await bench.book.close()
-    assert [(seen.id, seen.state) for seen in bench.book.seen()] == [(job, "interrupted")]
+    assert [(seen.id, seen.state) for seen in bench.book.latest()] == [(job, "interrupted")]
     assert bench.scheduler.take("next") == ""
     bench.scheduler.give_back()
 

@@ -84,7 +84,7 @@ class Bench:
     async def start(self, recipe: str = "identification", key: str = "", who: str = "token:bob/ci") -> Answer:
         answer = await self.book.start(StartJob("start", 1, recipe, key, who))
         if answer.outcome == "done":
-            await self.until(lambda: self.book.seen()[0].prompt or self.book.seen()[0].ended_utc is not None)
+            await self.until(lambda: self.book.latest()[0].prompt or self.book.latest()[0].ended_utc is not None)
         return answer
 
     async def until(self, what: Any) -> None:
@@ -104,8 +104,8 @@ class Bench:
         return (await self.book.steer(SteerJob("steer", 1, job, how, "token:bob/ci"))).outcome
 
     async def ended(self) -> JobState:
-        await self.until(lambda: self.book.seen()[0].ended_utc is not None)
-        return self.book.seen()[0]
+        await self.until(lambda: self.book.latest()[0].ended_utc is not None)
+        return self.book.latest()[0]
 
     async def led(self) -> JobState:
         job = (await self.start()).job
@@ -130,16 +130,16 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
 async def test_it_asks_goes_on_by_the_right_word_and_ends_with_a_proposal(bench: Bench) -> None:
     answer = await bench.start("identification at 500 Hz")
     assert bench.scheduler.take("a check") == "by hand: identification at 500 Hz"
-    job = bench.book.seen()[0]
+    job = bench.book.latest()[0]
     assert (job.kind, job.state, job.prompt, job.ask, job.who) == ("campaign", "asking", 1, BAR, "token:bob/ci")
     told = bench.snapshots.now(0).check
     assert told is not None
     assert (told.id, told.state, told.prompt, told.ask) == (job.id, "asking", 1, BAR)
     for prompt, who, outcome in ((1, "user:eve", "forbidden"), (0, "token:bob/ci", "conflict"), (2, "token:bob/ci", "conflict")):
         assert await bench.done(answer.job, prompt, who) == outcome
-    assert bench.book.seen()[0].prompt == 1
+    assert bench.book.latest()[0].prompt == 1
     assert await bench.done(answer.job, 1) == "done"
-    assert (bench.book.seen()[0].prompt, bench.book.seen()[0].ask) == (2, LASER)
+    assert (bench.book.latest()[0].prompt, bench.book.latest()[0].ask) == (2, LASER)
     assert await bench.done(answer.job, 1) == "conflict", "the word for the bar is none for the laser"
     assert await bench.done(answer.job, 2) == "done"
     done = await bench.ended()
@@ -156,7 +156,7 @@ async def test_who_may_measure_but_not_propose_starts_checks_only_and_says_done(
         for recipe in ("identification", "identification at 500 Hz", "own.toml"):
             refused = await bench.start(recipe, who=who)
             assert (refused.outcome, told in refused.text, refused.job) == ("forbidden", True, "")
-    assert (bench.orders, bench.book.seen(), bench.recorded()) == ([], (), [])
+    assert (bench.orders, bench.book.latest(), bench.recorded()) == ([], (), [])
     job = (await bench.start()).job
     assert (await bench.start(who="user:oscar")).outcome == "forbidden", "before he is told what runs"
     assert (await bench.start("quick-check", who="user:oscar")).outcome == "busy"
@@ -168,7 +168,7 @@ async def test_who_ends_it_ends_the_wait(bench: Bench, how: Steering) -> None:
     bench.notes = ("abbe measure --resume goes on",)
     job = (await bench.start()).job
     assert await bench.steer(job, "pause") == "done"
-    assert (bench.book.seen()[0].state, bench.book.seen()[0].prompt) == ("pausing", 1)
+    assert (bench.book.latest()[0].state, bench.book.latest()[0].prompt) == ("pausing", 1)
     assert await bench.steer(job, how) == "done"
     done = await bench.ended()
     assert (done.state, done.prompt, done.proposal) == ("done: stopped", 0, None)
@@ -209,7 +209,7 @@ async def test_how_it_ended_is_its_text(bench: Bench, end: Any, state: str, text
 async def test_an_end_of_the_service_is_told(bench: Bench) -> None:
     await bench.start()
     await bench.book.close()
-    assert bench.book.seen()[0].state == "interrupted"
+    assert bench.book.latest()[0].state == "interrupted"
     assert [outcome for _, _, outcome in bench.recorded()] == ["begun", "stopped"]
 
 

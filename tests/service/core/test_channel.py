@@ -307,7 +307,7 @@ class Nothing:
 
     asked: list[Any] = field(default_factory=list)
 
-    def seen(self) -> tuple[JobState, ...]:
+    def latest(self) -> tuple[JobState, ...]:
         return ()
 
 

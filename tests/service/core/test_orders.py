@@ -93,10 +93,10 @@ class Bench:
         """The newest job, once it has ended."""
         self.may_end.set()
         async with asyncio.timeout(within(10)):
-            while self.book.seen()[0].ended_utc is None:
+            while self.book.latest()[0].ended_utc is None:
                 self.news.clear()
                 await self.news.wait()
-        return self.book.seen()[0]
+        return self.book.latest()[0]
 
     def recorded(self) -> list[tuple[str, str, str, str]]:
         return [(r.who, r.action, r.outcome, r.doc["reason"]) for r in self.store.audit.events()]
@@ -169,7 +169,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
     answer = await bench.ask(push=2)
     assert (answer.outcome, answer.text.split(":")[0]) == ("conflict", "which table is in force is not known")
     assert JournalView.read(bench.store, MACHINE).history().now.crc is None
-    assert (bench.orders_seen, bench.book.seen(), bench.recorded()) == ([], (), [])
+    assert (bench.orders_seen, bench.book.latest(), bench.recorded()) == ([], (), [])
 
 
 async def test_nothing_comes_between_two_jobs(bench: Bench) -> None:
@@ -180,7 +180,7 @@ async def test_nothing_comes_between_two_jobs(bench: Bench) -> None:
     assert (answer.outcome, answer.text) == ("busy", "the machine measures: quick-check")
     await bench.ended()
     await settle()
-    bench.scheduler.take("taking back what an earlier end has left open")
+    bench.scheduler.take("recovery of an interrupted run or push")
     assert (await bench.ask()).outcome == "busy"
     bench.scheduler.give_back()
     assert (await bench.ask()).outcome == "done"
@@ -205,7 +205,7 @@ async def test_an_end_of_the_service_says_where_it_stands(bench: Bench) -> None:
     async with asyncio.timeout(within(10)):
         await bench.written.wait()
     await bench.book.close()
-    assert bench.book.seen()[0].state == "interrupted"
+    assert bench.book.latest()[0].state == "interrupted"
     assert [outcome for _, _, outcome, _ in bench.recorded()] == ["begun", "open"]
 
 

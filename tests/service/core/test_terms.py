@@ -14,7 +14,7 @@ from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
-from abbe.service.scheduler.ready import Ready, SeenDevices
+from abbe.service.scheduler.ready import DeviceReadings, Ready
 from abbe.service.scheduler.slots import cron_in_words, next_slot, previous_slot, slots_between
 from abbe.service.scheduler.windows import covers
 from tests.pretended_status import READY, controller_status
@@ -169,20 +169,20 @@ MONDAY_8, MONDAY_20 = utc(2026, 6, 1, 8), utc(2026, 6, 1, 20)
         (Needs(operator="present"), MONDAY_8, None, ""),
         (Needs(operator="present"), MONDAY_20, None, "no operator is there"),
         (Needs(operator="absent"), MONDAY_8, None, "an operator is there"),
-        (Needs(operator="absent"), MONDAY_20, SeenDevices(status()), ""),
-        (Needs(operator="absent"), MONDAY_20, SeenDevices(status(READY | Condition.DOOR_OPEN)), "somebody is at the machine"),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status()), ""),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY | Condition.NC_PROGRAM)), "not idle: an NC program runs"),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY | Condition.SPINDLE)), "not idle: the spindle turns"),
-        (Needs(idle=True), MONDAY_8, SeenDevices(status(READY | Condition.MOVING)), "not idle: an axis moves"),
+        (Needs(operator="absent"), MONDAY_20, DeviceReadings(status()), ""),
+        (Needs(operator="absent"), MONDAY_20, DeviceReadings(status(READY | Condition.DOOR_OPEN)), "a person is at the machine"),
+        (Needs(idle=True), MONDAY_8, DeviceReadings(status()), ""),
+        (Needs(idle=True), MONDAY_8, DeviceReadings(status(READY | Condition.NC_PROGRAM)), "not idle: an NC program runs"),
+        (Needs(idle=True), MONDAY_8, DeviceReadings(status(READY | Condition.SPINDLE)), "not idle: the spindle turns"),
+        (Needs(idle=True), MONDAY_8, DeviceReadings(status(READY | Condition.MOVING)), "not idle: an axis moves"),
         (Needs(idle=True), MONDAY_8, None, "the devices cannot be asked"),
-        (Needs(air=True), MONDAY_8, SeenDevices(status(), 20.0), ""),
-        (Needs(air=True), MONDAY_8, SeenDevices(status(), 25.5), "the air has 25.5 C, allowed are 18..24 C"),
-        (Needs(air=True), MONDAY_8, SeenDevices(status(), None), "nobody measures the air"),
+        (Needs(air=True), MONDAY_8, DeviceReadings(status(), 20.0), ""),
+        (Needs(air=True), MONDAY_8, DeviceReadings(status(), 25.5), "the air has 25.5 C, allowed are 18..24 C"),
+        (Needs(air=True), MONDAY_8, DeviceReadings(status(), None), "the air temperature is not measured"),
     ],
 )
-async def test_preconditions(needs: Needs, at: datetime, seen: SeenDevices | None, lack: str) -> None:
-    async def look(with_air: bool) -> SeenDevices:
+async def test_preconditions(needs: Needs, at: datetime, seen: DeviceReadings | None, lack: str) -> None:
+    async def look(with_air: bool) -> DeviceReadings:
         if seen is None:
             raise LinkDown("tcp://127.0.0.1:5021", "connect", "refused", "switch it on")
         return seen
@@ -198,12 +198,12 @@ async def test_a_machine_is_warm_when_it_was_seen_at_work() -> None:
     clock = FakeClock(MONDAY_8)
     minute = 0
 
-    async def look(with_air: bool) -> SeenDevices:
+    async def look(with_air: bool) -> DeviceReadings:
         nonlocal minute
         minute += 1
         if 10 <= minute < 20:
             raise LinkDown("tcp://127.0.0.1:5021", "read", "gone", "")
-        return SeenDevices(
+        return DeviceReadings(
             status(READY | Condition.SPINDLE if minute % 2 else READY, x=float(minute % 4)) if minute <= 30 else status(x=30.0 % 4)
         )
 
@@ -223,7 +223,7 @@ async def test_a_machine_is_warm_when_it_was_seen_at_work() -> None:
 
 
 async def test_nobody_is_looked_at_without_need() -> None:
-    async def look(with_air: bool) -> SeenDevices:
+    async def look(with_air: bool) -> DeviceReadings:
         raise AssertionError
 
     ready = Ready(look, [HOURLY], (18.0, 24.0), (), FakeClock(MONDAY_8))

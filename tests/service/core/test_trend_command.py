@@ -46,8 +46,8 @@ def machine(tmp_path: Path) -> Path:
                 limits={"body_diagonal_um": 20.0, "helix_rms_um": 5.0},
                 started_utc=at,
             )
-            store.verifications.add_with_messages(machine_id, record.found(record.Occasion("mill-7", schedule, at), result), [])
-        gone = record.failed(record.Occasion("mill-7", schedule, at), OSError("cable"), at, 1.0)
+            store.verifications.add_with_messages(machine_id, record.check_doc(record.Occasion("mill-7", schedule, at), result), [])
+        gone = record.failed_doc(record.Occasion("mill-7", schedule, at), OSError("cable"), at, 1.0)
         store.verifications.add_with_messages(machine_id, gone, [])
     return path
 

@@ -48,9 +48,9 @@ class Site:
         at = NOW - timedelta(days=days_ago)
         occasion = record.Occasion("mill-7", WEEKLY, at)
         if isinstance(result, Exception):
-            doc = record.failed(occasion, result, at, 1.0)
+            doc = record.failed_doc(occasion, result, at, 1.0)
         else:
-            doc = {**record.found(occasion, result), "started_utc": at.isoformat()}
+            doc = {**record.check_doc(occasion, result), "started_utc": at.isoformat()}
         self.store.verifications.add_with_messages(self.store.machines.add("mill-7", {}), doc, [])
 
 
@@ -89,7 +89,7 @@ async def test_a_running_check_and_a_device_that_fails(site: Site) -> None:
     assert "measuring" in page
     assert "revision 3 of 10" not in page
     assert "revolution 3 of 10" in page
-    site.board.job_ended(record.failed(record.Occasion("m", WEEKLY, NOW), LinkDown(DEVICES["laser"], "read", "gone"), NOW, 1))
+    site.board.job_ended(record.failed_doc(record.Occasion("m", WEEKLY, NOW), LinkDown(DEVICES["laser"], "read", "gone"), NOW, 1))
     status = (await site.client.get("/api/v1/status")).json()
     assert [device["state"] for device in status["devices"]] == ["not used yet", "fault"]
     assert status["job"] is None
@@ -217,7 +217,7 @@ def test_trend_survives_figures_without_size_or_limit() -> None:
     ],
 )
 def test_a_point_shows_the_verdict_of_its_figure(verdict: str, diagonal: float, helix: float, expected: tuple[str, str]) -> None:
-    doc = record.found(
+    doc = record.check_doc(
         record.Occasion("m", WEEKLY, NOW), Result(verdict=verdict, values={"body_diagonal_um": diagonal, "helix_rms_um": helix})
     )
     check = read_as(Verification, {"id": 1, **doc})

@@ -139,7 +139,7 @@ async def test_an_answer_that_is_no_is_the_end_s_text(monkeypatch: pytest.Monkey
         raise no
 
     monkeypatch.setattr(work, "_measured", measured)
-    monkeypatch.setattr(work, "made_of", refuse)
+    monkeypatch.setattr(work, "make_proposal", refuse)
     led = await work.run_guided_campaign(pretended(), {}, "bob")
     assert led == JobOutcome("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
 
@@ -153,7 +153,7 @@ async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypat
         return SimpleNamespace(number=3, proposed=SimpleNamespace(solution_id=2, reasons=("LIMITS: too much", "STALE")))
 
     monkeypatch.setattr(work, "_measured", measured)
-    monkeypatch.setattr(work, "made_of", made)
+    monkeypatch.setattr(work, "make_proposal", made)
     led = await work.run_guided_campaign(pretended(), {}, "bob")
     assert led == JobOutcome("ended", "proposal 3 cannot be approved: LIMITS: too much; STALE", 2, 3)
     assert seen == ["full 1 by bob"]
@@ -166,7 +166,7 @@ async def test_a_stop_while_it_is_solved_leaves_no_proposal(monkeypatch: pytest.
         raise AssertionError
 
     monkeypatch.setattr(work, "_measured", measured)
-    monkeypatch.setattr(work, "made_of", made)
+    monkeypatch.setattr(work, "make_proposal", made)
     with pytest.raises(Stopped) as told:
         await work.run_guided_campaign(pretended(), {}, "bob")
     assert "abbe comp propose MACHINE.toml 'full 1'" in told.value.__notes__[0]

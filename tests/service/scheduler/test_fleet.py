@@ -21,7 +21,7 @@ from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.owner import Owner, this_process
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import HeartbeatRecord
-from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, row, stands, state_of
+from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, machine_statuses, row, state_of
 from abbe.service.scheduler.heartbeat import SILENT_AFTER, Heartbeat
 from abbe.service.storage.store import Store
 from tests.experiments.bench.history_case import START, History, build
@@ -87,7 +87,7 @@ def test_the_list_of_a_history(url: str, capsys: pytest.CaptureFixture[str]) -> 
         store.heartbeats.put("mill-2", {"state": "measuring", "due": []})
         store.heartbeats.put("new-4", {"state": "waiting", "due": []})
         one, two, three, new = fleet(store, now)
-        standing = stands(store, now)
+        standing = machine_statuses(store, now)
     assert standing == [
         MachineStatus(**{field.name: getattr(line, field.name) for field in fields(MachineStatus)}) for line in (one, two, three, new)
     ]

@@ -32,7 +32,7 @@ from abbe.service.rendering.document import Document
 from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler import record
-from abbe.service.scheduler.fleet import MachineStatus, stands
+from abbe.service.scheduler.fleet import MachineStatus, machine_statuses
 from abbe.service.storage.store import Store
 from abbe.service.verification.verified_by import STRANGE_TABLE, VerifiedBy, verified_by
 from abbe.service.web.page import environment, render
@@ -61,7 +61,7 @@ class World:
             self.store.campaigns.add(machine, name, {"table_crc": crc32(table)})
         told = Result(verdict, {"body_diagonal_um": value}, text=verdict, started_utc=begun or now, duration_s=1.0, campaign=name)
         occasion = record.Occasion("mill-7", Schedule("weekly", "0 6 * * 1", "UTC", "quick-check"), now)
-        return self.store.verifications.add_with_messages(machine, record.found(occasion, told), [])
+        return self.store.verifications.add_with_messages(machine, record.check_doc(occasion, told), [])
 
     def push(self, base: bytes, new: bytes, states: tuple[Any, ...] = KEPT, **doc: Any) -> None:
         asyncio.run(as_if_pushed(self.store, SystemClock(), "mill-7", doc or {"proposal": 1}, (base, new), states))
@@ -81,7 +81,7 @@ class World:
         return verified_by(self.store, "mill-7")
 
     def fleet(self) -> MachineStatus:
-        return stands(self.store, datetime.now(UTC))[0]
+        return machine_statuses(self.store, datetime.now(UTC))[0]
 
     def _view(self) -> StatusReader:
         return StatusReader(Reader(self.store, "mill-7", SystemClock()), "0", self.board, list, "")

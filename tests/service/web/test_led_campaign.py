@@ -113,10 +113,10 @@ async def test_the_answer_is_the_core_s_and_stands_in_the_audit(desk: Desk, plan
     assert (answer["kind"], answer["state"], answer["prompt"], answer["ask"], answer["proposal"]) == ("campaign", "asking", 3, ASK, None)
     record = plant.store.audit.events(1)[0]
     assert (record.target, record.outcome) == (f"job {NUMBER}, prompt 3", "done 202")
-    desk.answer = ("conflict", "prompt 3 is not what this job waits for", "")
+    desk.answer = ("conflict", "this job does not wait for prompt 3", "")
     late = await desk.client.post(DONE, headers=who)
     assert (late.status_code, late.headers["content-type"]) == (409, MEDIA_TYPE)
-    assert "not what this job waits for" in late.json()["detail"]
+    assert "does not wait for prompt 3" in late.json()["detail"]
     before = len(desk.asked)
     for wrong in ("0", "-1", "x", "1e3", "9999999"):
         assert (await desk.client.post(DONE.replace("/3/", f"/{wrong}/"), headers=who)).status_code == 404

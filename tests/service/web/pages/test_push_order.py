@@ -66,10 +66,10 @@ class Bench:
 
     async def ended(self) -> JobState:
         async with asyncio.timeout(within(10)):
-            while self.book.seen()[0].ended_utc is None:
+            while self.book.latest()[0].ended_utc is None:
                 self.news.clear()
                 await self.news.wait()
-        return self.book.seen()[0]
+        return self.book.latest()[0]
 
 
 @pytest.fixture
