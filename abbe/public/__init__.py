@@ -1,1 +1,1 @@
-"""The functions behind `import abbe`: thin, typed, in the units of the package; each calls what the commands call."""
+"""The functions behind `import abbe`: thin, typed, in the units of the package, on the same code as the commands."""

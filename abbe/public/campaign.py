@@ -1,4 +1,4 @@
-"""Where measurements come from: a campaign folder, or a campaign of the database."""
+"""Read measurements from a campaign folder or the database."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def read_campaign(source: str | Path, *, database: str | None = None) -> Campaig
     Parameters
     ----------
     source : str or Path
-        Folder with campaign.json (docs/schemas); with ``database`` the name of a campaign there.
+        Folder with campaign.json (docs/schemas), or, with ``database``, the name of a campaign.
     database : str, optional
-        Address of the store, e.g. ``"sqlite:///abbe.sqlite3"``.
+        URL of the database, e.g. ``"sqlite:///abbe.sqlite3"``.
 
     Raises
     ------
     FileFormatError
-        The first mistake in any file: file, key, row, and what was expected.
+        A file has a mistake; the message names file, key, row, and the expected value of the first one.
     StoreError
-        There is no such campaign or database.
+        The campaign or the database does not exist.
     """
     if database is not None:
         with Store.open(database) as store:
@@ -38,11 +38,11 @@ def read_campaign(source: str | Path, *, database: str | None = None) -> Campaig
 
 
 def read_errors(source: str | Path) -> ErrorMotions:
-    """Read the error motions of an errors file (``abbe-errors/1``), in mm and rad; its covariance is not read here.
+    """Read the error motions of an errors file (``abbe-errors/1``), in mm and rad, without its covariance.
 
     Raises
     ------
     FileFormatError
-        The first mistake: file and key.
+        The file has a mistake; the message names file and key of the first one.
     """
     return read_file(Path(source)).motions

@@ -1,4 +1,4 @@
-"""Find what the simulation of a machine lacks, and prove it on runs that were not fitted."""
+"""Find effects that the simulation of a machine lacks, and prove them on runs outside the fit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prepare
 from abbe.service.discovery.discover import discover as run_discovery
 from abbe.service.discovery.discovery_engine import search
-from abbe.service.discovery.discovery_words import unit
+from abbe.service.discovery.discovery_text import unit
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue, checked
@@ -23,20 +23,19 @@ from abbe.service.report.report_discovery import found_report
 
 @dataclass(frozen=True, eq=False)
 class DiscoveryAnswer:
-    """What a discovery found. Made by `discover`.
+    """Result of `discover`.
 
     Attributes
     ----------
     verdict : str
-        ``"named"``, ``"none"`` (measurement and simulation agree), or ``"unknown"`` (something is missing that the catalogue does not
-        explain).
+        ``"named"``, ``"none"`` (measurement and simulation agree), or ``"unknown"`` (the catalogue does not explain the difference).
     effects : dict
-        Label, e.g. ``"backlash:X"``, and its signed strength with standard uncertainty.
+        Signed strength with standard uncertainty by label, e.g. ``"backlash:X"``.
     gap : dict
-        Role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated ``before_um`` and ``after_um`` the effects, and
-        ``floor_um``, the noise that no model takes out.
+        By role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated ``before_um`` and ``after_um`` the effects, and
+        ``floor_um``, the noise that no model removes.
     next_measurement : dict or None
-        The measurement that would tell more: what it ``adds``, which suspects it ``separates``, ``minutes``, and ``why``.
+        The most informative next measurement: what it ``adds``, which suspects it ``separates``, ``minutes``, and ``why``.
     """
 
     verdict: str
@@ -53,7 +52,7 @@ class DiscoveryAnswer:
         Raises
         ------
         FileFormatError
-            Another ending, or the file cannot be written.
+            The file name has another ending, or the file cannot be written.
         """
         made = datetime.now(UTC).isoformat(timespec="seconds")
         write_document(found_report(self._job, self._journal, self._finding, made), Path(target))
@@ -68,16 +67,16 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     Parameters
     ----------
     effects : tuple of Effect
-        One's own, looked for beside the catalogue; each has to pass the self-test.
+        Additional effects to search for beside the catalogue; each must pass the self-test.
     progress : callable, optional
-        Gets a share of the work, from 0 to 1, with a line of text.
+        Receives the share of the work, from 0 to 1, with a line of text.
 
     Raises
     ------
     EffectPluginBroken
-        One of ``effects`` breaks a rule of the self-test, or has a name that the catalogue uses.
+        One of ``effects`` fails the self-test, or reuses a name of the catalogue.
     NotObservable, CampaignRefused
-        There is no run to identify from, or a run cannot be what it says.
+        No run has the role identify, or the data of a run contradict its description.
     """
     known = catalogue()
     job = prepare(campaign, (*known, *checked(effects, {e.name for e in known})))

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 
 class Estimate(NamedTuple):
-    """A value, its standard uncertainty (GUM, k = 1), both in ``unit``, and whether the runs show it by themselves.
+    """A value and its standard uncertainty (GUM, k = 1), both in ``unit``.
 
-    ``status``: "observed", "weak" or "not observable": the value of the last holds only together with the others.
+    ``status``: "observed", "weak" or "not observable"; a value that is not observable is valid only together with the others.
     """
 
     value: float

@@ -1,4 +1,4 @@
-"""A drawing that a notebook shows and a file keeps."""
+"""A drawing for notebooks and files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.service.rendering.palette import style_rules
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One or more ``<svg>`` elements; a notebook draws it by itself."""
+    """One or more ``<svg>`` elements; a notebook displays it automatically."""
 
     svg: str
 
@@ -19,7 +19,7 @@ class Picture:
         return f"<div><style>{style_rules()}</style>{self.svg}</div>"
 
     def save(self, target: str | Path) -> None:
-        """Write it as an HTML page.
+        """Write the picture as an HTML page.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Simulate a campaign: what the instruments would read on a machine whose errors are known."""
+"""Simulate a campaign: the readings of the instruments on a machine with known errors."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from abbe.service.site import Site, machine_doc
 
 NAME = "simulated"
 SETUP_S = 300.0
-"""Time to mount a set-up."""
+"""Time to mount a set-up, s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedInstruments:
-    """Standard deviations of what a simulated campaign draws.
+    """Standard deviations of the random values in a simulated campaign.
 
-    ``bar_noise_mm``, ``laser_noise_mm``: of one reading; ``cup_mm``: of each component of the place where a cup is mounted;
-    ``bar_length_mm``: of the bar's calibrated length, one bar for all radii. ``readings_per_s``: of the bar, at most the recipe's rate.
+    ``bar_noise_mm``, ``laser_noise_mm``: of one reading; ``cup_mm``: of each component of a cup's position; ``bar_length_mm``: of the bar's
+    calibrated length, with one bar for all radii. ``readings_per_s``: of the bar, at most the recipe's rate.
     """
 
     bar_noise_mm: float = 3e-4
@@ -60,45 +60,38 @@ def simulate(
 
     Parameters
     ----------
-    machine : Machine
     plan : CampaignPlan or recipes
         E.g. ``abbe.identification(machine)``, or recipes such as ``abbe.Helix(...)``.
     errors : ErrorMotions
         Tool relative to workpiece, mm and rad.
     effects : mapping, optional
-        Label and signed strength in the effect's unit, e.g. ``{"backlash:X": 6.0}`` (µm). Non-linear parameters have their usual values.
+        Signed strength in the effect's unit by label, e.g. ``{"backlash:X": 6.0}`` (µm). Non-linear parameters have their typical values.
     own_effects : tuple of Effect, optional
-        Known beside the catalogue.
-    instruments : SimulatedInstruments, optional
+        Additional effects beside the catalogue.
     seed : int
-        Equal seeds draw equal campaigns.
-
-    Returns
-    -------
-    Campaign
-        As a folder or the database would give it.
+        Equal seeds give equal campaigns.
 
     Raises
     ------
     EffectUnknown, Unusable
-        An effect is not known, has no such key, or has more than one coefficient and so no reading that follows from its strength.
+        An effect is unknown, has no such key, or has several coefficients, so that its strength does not determine the readings.
     ConfigError
         A recipe does not fit the machine.
     """
-    tools, rng = instruments or SimulatedInstruments(), np.random.default_rng(seed)
+    settings, rng = instruments or SimulatedInstruments(), np.random.default_rng(seed)
     known = catalogue()
     known = (*known, *checked(own_effects, {e.name for e in known}))
     wanted = [_effect(label, strength, known) for label, strength in (effects or {}).items()]
     tests = plan.tests if isinstance(plan, CampaignPlan) else tuple(recipe.plan(machine) for recipe in plan)
     doc = machine_doc(NAME, machine)
     name = plan.name if isinstance(plan, CampaignPlan) else NAME
-    world = _SimulatedMachine(machine, errors, tools, rng, float(rng.normal(0.0, tools.bar_length_mm)), {})
+    simulated = _SimulatedMachine(machine, errors, settings, rng, float(rng.normal(0.0, settings.bar_length_mm)), {})
     runs, clock_s = [], 0.0
     for test in tests:
         clock_s += SETUP_S if test.mounts else 0.0
-        run = _run(name, doc, test, clock_s, tools)
+        run = _run(name, doc, test, clock_s, settings)
         clock_s = run["columns"]["t_s"][-1]
-        run["columns"]["deviation_mm"] = world.read(path_of(run, machine, 2, 0.0), wanted).tolist()
+        run["columns"]["deviation_mm"] = simulated.read(path_of(run, machine, 2, 0.0), wanted).tolist()
         runs.append(run)
     head = {
         "format": CAMPAIGN_FORMAT,
@@ -113,11 +106,11 @@ def simulate(
 
 @dataclass(frozen=True)
 class _SimulatedMachine:
-    """The machine and the instruments as drawn: one bar, and one place for each cup."""
+    """One random sample of machine and instruments: one bar length, and one position for each cup."""
 
     machine: Machine
     errors: ErrorMotions
-    tools: SimulatedInstruments
+    instruments: SimulatedInstruments
     rng: np.random.Generator
     bar_mm: float
     cups: dict[str, F1]
@@ -129,11 +122,11 @@ class _SimulatedMachine:
             column = effect.signal((path,), key, {p.name: p.typical for p in effect.shape})[0]
             out = out + self._moved(effect, column[:, 0], coefficient)
         if path.kind == "laser":
-            noise = self.rng.normal(0.0, self.tools.laser_noise_mm, path.n)
+            noise = self.rng.normal(0.0, self.instruments.laser_noise_mm, path.n)
             return np.asarray(out + noise - (out + noise)[0])
-        cup = self.cups.setdefault(path.setup, self.rng.normal(0.0, self.tools.cup_mm, 3))
+        cup = self.cups.setdefault(path.setup, self.rng.normal(0.0, self.instruments.cup_mm, 3))
         off_sphere = np.linalg.norm(path.at.q_mm - path.centre_mm, axis=1) - path.radius_mm  # a chord lies inside its arc
-        return np.asarray(off_sphere + out - path.look @ cup + self.bar_mm + self.rng.normal(0.0, self.tools.bar_noise_mm, path.n))
+        return np.asarray(off_sphere + out - path.look @ cup + self.bar_mm + self.rng.normal(0.0, self.instruments.bar_noise_mm, path.n))
 
     def _moved(self, effect: Effect, column: F1, coefficient: float) -> F1:
         if effect.kind == "mean":
@@ -160,7 +153,7 @@ def _effect(label: str, strength: float, known: tuple[Effect, ...]) -> tuple[Eff
 
 
 def _coefficient(effect: Effect, strength: float, values: Values) -> float:
-    """The coefficient that has this strength; a strength may be a root of it."""
+    """The coefficient that has this strength, solved numerically, because a strength may be a root of it."""
 
     def above(coefficient: float) -> float:
         return effect.strength(np.array([coefficient]), values) / effect.per_unit - strength
@@ -171,10 +164,10 @@ def _coefficient(effect: Effect, strength: float, values: Values) -> float:
     return float(brentq(above, -reach, reach, xtol=1e-12))
 
 
-def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, tools: SimulatedInstruments) -> dict[str, Any]:
+def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, instruments: SimulatedInstruments) -> dict[str, Any]:
     """An ``abbe-run/1`` object without readings."""
-    rows = [_path_rows(step, begins_s, tools) for step in test.steps if isinstance(step, RecordPath)] or [_standing_rows(test, begins_s)]
-    t_s, q_mm, feed, direction = rows[0]
+    paths = [_path_rows(step, begins_s, instruments) for step in test.steps if isinstance(step, RecordPath)]
+    t_s, q_mm, feed, direction = paths[0] if paths else _standing_rows(test, begins_s)
     columns = {"t_s": t_s.tolist(), **{f"{a.lower()}_mm": q_mm[:, k].tolist() for k, a in enumerate(AXES)}}
     columns |= {"feed_mm_min": feed.tolist(), "direction": [int(v) for v in direction], "deviation_mm": None}
     head = {"format": RUN_FORMAT, "campaign": campaign, "run_id": test.label, "test": test.test, "role": test.role, "machine": machine}
@@ -185,13 +178,13 @@ _Rows = tuple[F1, F2, F1, F1]
 """Time, commanded positions, feed in mm/min, direction."""
 
 
-def _path_rows(step: RecordPath, begins_s: float, tools: SimulatedInstruments) -> _Rows:
-    """Rows along a polyline at constant feed; feed-in and feed-out are driven and not read."""
+def _path_rows(step: RecordPath, begins_s: float, instruments: SimulatedInstruments) -> _Rows:
+    """Rows along a polyline at constant feed; feed-in and feed-out have no readings."""
     points = np.asarray(step.points_mm)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     first, last = step.measured or (0, len(points) - 1)
     speed = step.feed_mm_min / 60.0
-    at = np.arange(arc[first], arc[last], speed / min(tools.readings_per_s, step.rate_hz))
+    at = np.arange(arc[first], arc[last], speed / min(instruments.readings_per_s, step.rate_hz))
     q_mm = np.stack([np.interp(at, arc, points[:, k]) for k in range(3)], axis=1)
     return begins_s + at / speed, q_mm, np.full(at.size, step.feed_mm_min), np.full(at.size, float(step.direction))
 

@@ -1,4 +1,4 @@
-"""Solve a campaign: error motions with uncertainty, deviation anywhere in the volume, tables."""
+"""Solve a campaign: error motions with uncertainty, deviation anywhere in the volume, compensation tables."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from abbe.public.estimates import Estimate
 from abbe.public.picture import Picture
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import TableRefused
-from abbe.service.identification.solve import Say, solve_runs
-from abbe.service.identification.solve_report import Account, account, judged, solution_doc
+from abbe.service.identification.solve import ProgressText, solve_runs
+from abbe.service.identification.solve_report import Assessment, assess, solution_doc, solution_verdict
 from abbe.service.rendering.document_page import write_document
 from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.plots.bands import motion_bands
@@ -30,7 +30,7 @@ from abbe.service.report.solution_sections import motion_curves, parameter_rows
 
 @dataclass(frozen=True, eq=False)
 class Deviation:
-    """Where the tool is relative to where it should be, in mm; best-fit rigid motion over the strokes removed.
+    """Deviation of the tool from its commanded position, mm; best-fit rigid motion over the strokes removed.
 
     Attributes
     ----------
@@ -45,9 +45,9 @@ class Deviation:
 
 
 class Solution:
-    """What the runs of a campaign say about the machine. Made by `solve`."""
+    """Error motions of a machine from the runs of a campaign; result of `solve`."""
 
-    def __init__(self, campaign: Campaign, found: Account) -> None:
+    def __init__(self, campaign: Campaign, found: Assessment) -> None:
         self.campaign = campaign
         self._found = found
 
@@ -58,18 +58,18 @@ class Solution:
 
     @property
     def verdict(self) -> str:
-        """One line: how far this solution can be trusted, and why not further."""
-        told = judged(self._found)
-        return f"{told.word}: {told.text}"
+        """One line: how far this solution can be trusted, and what limits it."""
+        verdict = solution_verdict(self._found)
+        return f"{verdict.word}: {verdict.text}"
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """What is odd about single runs; an open flag forbids tables."""
+        """Oddities of single runs; an open flag forbids tables."""
         return tuple(f.line for f in self._found.solved.flags)
 
     @property
     def not_observable(self) -> tuple[str, ...]:
-        """What these runs cannot tell, and what would."""
+        """What these runs cannot determine, and which measurement would."""
         return tuple(g.text for g in self._found.observability.hidden)
 
     @cached_property
@@ -93,7 +93,7 @@ class Solution:
         Raises
         ------
         ValueError
-            The shape is another one, or a number is not finite.
+            The shape is wrong, or a number is not finite.
         """
         points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -116,11 +116,13 @@ class Solution:
         TableRefused
             A flag is open, or the solution is not good enough for a table.
         """
-        told = judged(self._found)
+        verdict = solution_verdict(self._found)
         if self.flags:
             raise TableRefused(f"no tables from a solution with open flags: {self.flags[0]}", "look at that run first; nothing was written")
-        if told.sign == "bad":
-            raise TableRefused(f"no tables from a solution that is {told.word}: {told.reasons[0]}", "measure more; nothing was written")
+        if verdict.sign == "bad":
+            raise TableRefused(
+                f"no tables from a solution that is {verdict.word}: {verdict.reasons[0]}", "measure more; nothing was written"
+            )
         return quantise(nine_tables(self._found.joint, counts, sources=self._found.sources), unit_mm)
 
     def plot(self) -> Picture:
@@ -135,7 +137,7 @@ class Solution:
         Raises
         ------
         FileFormatError
-            Another ending, or the file cannot be written.
+            The file name has another ending, or the file cannot be written.
         """
         made = datetime.now(UTC).isoformat(timespec="seconds")
         result = SolutionResult(solution_doc(self._found), account=self._found)
@@ -145,22 +147,24 @@ class Solution:
         return f"<abbe.Solution of {self.campaign.name}: {self.model}, {self.verdict}>"
 
 
-def solve(campaign: Campaign, *, model: Literal["rigid6", "rigid21", "auto"] | None = None, progress: Say | None = None) -> Solution:
-    """Solve the runs of a campaign that have the role ``identify``, after checks that each can be what it says.
+def solve(
+    campaign: Campaign, *, model: Literal["rigid6", "rigid21", "auto"] | None = None, progress: ProgressText | None = None
+) -> Solution:
+    """Solve the runs of a campaign with the role ``identify``, after checking each for consistency.
 
     Parameters
     ----------
     model : str, optional
-        ``"rigid6"``: three scales and three squareness; ``"rigid21"``: 21 error motions; ``"auto"``: what held-out runs ask for. None:
-        rigid21, or rigid6 with a flag where there are too few readings.
+        ``"rigid6"``: three scales and three squareness; ``"rigid21"``: 21 error motions; ``"auto"``: the model that predicts held-out runs
+        best. None: rigid21, or rigid6 with a flag if the readings are too few.
     progress : callable, optional
-        Gets one line a stage.
+        Receives one line of text per stage.
 
     Raises
     ------
     NotObservable
-        There is no run to identify from.
+        No run has the role identify.
     CampaignRefused, InstrumentsDisagree
-        A run, bar or mirror cannot be what it says; the message says which and what to do.
+        The data of a run, bar or mirror contradict its description; the message names it and the remedy.
     """
-    return Solution(campaign, account(solve_runs(campaign.site, campaign.runs, model=model, say=progress)))
+    return Solution(campaign, assess(solve_runs(campaign.site, campaign.runs, model=model, progress=progress)))

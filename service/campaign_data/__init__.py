@@ -1,1 +1,1 @@
-"""A campaign as it was read: its runs, whether they can be what they say, and where they come from."""
+"""A campaign as read: its runs, their consistency, and their provenance."""

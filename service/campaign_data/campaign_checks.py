@@ -1,7 +1,7 @@
-"""Is every run of a campaign what it says? Before anything is solved, each mistake is one line: which run, what is wrong, what to do.
+"""Check every run of a campaign before a solution. Each issue is one line: the run, the mistake and the remedy.
 
-First geometry (do the points lie where the set-up says?), then copies, then what the readings say of each other
-(`abbe.models.solvers.plausibility`). A finding either refuses the campaign or stands as a flag beside the result.
+The checks are geometry (are the points where the set-up says?), copies, and consistency of the readings with the other runs
+(`abbe.models.solvers.plausibility`). An issue either refuses the campaign or becomes a flag beside the result.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.plausibility import SuspectRun, suspects
 from abbe.service.campaign_data.campaign_issue import CampaignIssue
-from abbe.service.campaign_data.copied_runs import copies
-from abbe.service.campaign_data.run_geometry import geometry
-from abbe.service.campaign_data.run_times import times
+from abbe.service.campaign_data.copied_runs import copy_issues
+from abbe.service.campaign_data.run_geometry import geometry_mistake
+from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.errors import CampaignRefused
 
 Doc = dict[str, Any]
 LARGEST_MM = 2.0
-"""No ball-bar and no machine worth a laser deviates by more: many such numbers are in another unit, single ones are outliers."""
+"""Largest plausible deviation: many larger numbers are in another unit, single ones are outliers."""
 NO_READING_MM = 1000.0
-"""Not even a spike: no instrument shows such a deviation."""
+"""No instrument can read a deviation this large, not even as a spike."""
 SPIKES = 0.05
-"""Larger a share of a run's readings is no matter of single outliers."""
+"""Largest share of a run's readings that can be single outliers."""
 HALF = 0.5
 FEWEST_BAR = 20
 PER_TURN = 8
 OTHER_RATIO = 8.0
-"""A run that misses the others' prediction by so many times what is expected is another machine's (`OTHER_MM` too); below it is a flag."""
+"""A run whose misfit exceeds this multiple of the expected one, and `OTHER_MM`, is from another machine; a smaller misfit is a flag."""
 OTHER_MM = 4e-3
 
 _READINGS = {
@@ -47,39 +47,34 @@ _READINGS = {
 }
 
 
-def refuse(findings: Sequence[CampaignIssue]) -> None:
-    """Stop at the first finding that refuses the campaign.
+def refuse(issues: Sequence[CampaignIssue]) -> None:
+    """Raise if an issue refuses the campaign.
 
     Raises
     ------
     CampaignRefused
-        Its line; how many more there are.
+        The first such issue, and the runs with further ones.
     """
-    bad = [f for f in findings if f.refuse]
+    bad = [f for f in issues if f.refuse]
     if bad:
         more = f" (and {len(bad) - 1} more: {', '.join(sorted({f.run for f in bad[1:]}))})" if len(bad) > 1 else ""
         raise CampaignRefused(f"run {bad[0].run}: {bad[0].what}{more}", f"{bad[0].remedy}; nothing was stored")
 
 
 def check_files(machine: Doc, runs: Sequence[Doc]) -> list[CampaignIssue]:
-    """What single runs and their comparison show without any model: machine, geometry, units, time, copies, too few readings.
+    """Issues that need no model: machine, geometry, units, times, copies, too few readings.
 
-    Parameters
-    ----------
-    machine : dict
-        The campaign's machine object.
-    runs : sequence of dict
-        ``abbe-run/1`` objects with readings.
+    ``machine``: the campaign's machine object; ``runs``: ``abbe-run/1`` objects with readings.
     """
     out = _twice([str(r["run_id"]) for r in runs])
     for run in runs:
-        out += _other_machine(machine, run) or geometry_findings(machine, run)
+        out += _other_machine(machine, run) or geometry_issues(machine, run)
         out += _readings(run)
-    return _nothing_measured(runs) + out + times(runs) + copies(runs)
+    return _nothing_measured(runs) + out + time_issues(runs) + copy_issues(runs)
 
 
 def _nothing_measured(runs: Sequence[Doc]) -> list[CampaignIssue]:
-    """Runs whose readings are all the same: refused if they all are, else flagged."""
+    """Runs with constant readings: refused if all runs are constant, otherwise flagged."""
     still = [r["run_id"] for r in runs if _constant(r)]
     if not still:
         return []
@@ -94,9 +89,9 @@ def _constant(run: Doc) -> bool:
     return bool(y.size and (y == y[0]).all())
 
 
-def geometry_findings(machine: Doc, run: Doc) -> list[CampaignIssue]:
-    """Whether the points of a run lie where its set-up says, inside the strokes."""
-    what = geometry(machine, run)
+def geometry_issues(machine: Doc, run: Doc) -> list[CampaignIssue]:
+    """Issues of a run whose points do not lie where its set-up says, or not inside the strokes."""
+    what = geometry_mistake(machine, run)
     return [CampaignIssue(run["run_id"], what.text, what.remedy, what.refuse)] if what else []
 
 
@@ -107,10 +102,10 @@ def _twice(names: list[str]) -> list[CampaignIssue]:
 
 def _other_machine(machine: Doc, run: Doc) -> list[CampaignIssue]:
     theirs = run.get("machine") or {}
-    for key, word in (("name", "name"), ("chain", "chain"), ("stroke_mm", "strokes"), ("pivots_mm", "pivots"), ("tool_mm", "tool")):
+    for key, title in (("name", "name"), ("chain", "chain"), ("stroke_mm", "strokes"), ("pivots_mm", "pivots"), ("tool_mm", "tool")):
         ours, other = machine.get(key), theirs.get(key)
         if ours is not None and other is not None and not _same(ours, other):
-            what = f"measured on another machine: {word} {_short(other)}, the campaign's is {_short(ours)}"
+            what = f"measured on another machine: {title} {_short(other)}, the campaign's is {_short(ours)}"
             return [CampaignIssue(run["run_id"], what, "leave it out (--without), or correct its machine object", True)]
     return []
 
@@ -134,7 +129,7 @@ def _short(value: Any) -> str:
 
 
 def _readings(run: Doc) -> list[CampaignIssue]:
-    """Time, size and number of the readings of one run."""
+    """Issues of times, size and number of one run's readings."""
     label, columns = run["run_id"], run["columns"]
     y, t = (np.asarray(columns[k], dtype=np.float64) for k in ("deviation_mm", "t_s"))
     valid = np.asarray(columns.get("valid", np.ones(y.size))).astype(bool)
@@ -151,7 +146,7 @@ def _readings(run: Doc) -> list[CampaignIssue]:
 
 
 def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[CampaignIssue]:
-    """Deviations that no machine has: most of them, another unit; some, a lost beam or bar; single ones are left to the robust weights."""
+    """Impossible deviations: most of them mean another unit, some a lost beam or bar; robust weights handle single ones."""
     size = np.where(valid, np.abs(y), 0.0)
     count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
     if largest > NO_READING_MM:
@@ -170,7 +165,7 @@ def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> 
 
 
 def _too_few(run: Doc, count: int) -> list[CampaignIssue]:
-    """Few readings are a flag: fewer than 10 are refused where runs become arrays (`abbe.service.runs.observations`)."""
+    """Flag a ball-bar run with few readings; `abbe.service.runs.observations` refuses fewer than 10."""
     turns = float(run["setup"].get("turns") or 1.0)
     wanted = max(FEWEST_BAR, int(np.ceil(PER_TURN * turns)))
     if not run["test"].startswith("ballbar") or not 10 <= count < wanted:
@@ -182,7 +177,7 @@ def _too_few(run: Doc, count: int) -> list[CampaignIssue]:
 
 
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[CampaignIssue]:
-    """Runs whose readings contradict those of the others (`abbe.models.solvers.plausibility.suspects`)."""
+    """Issues of runs whose readings contradict the other runs (`abbe.models.solvers.plausibility.suspects`)."""
     found = suspects(machine, data)
     return [_suspect(s, alone=len(found) == 1) for s in found]
 

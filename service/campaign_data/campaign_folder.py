@@ -1,4 +1,4 @@
-"""Where a campaign comes from: the store, or a folder with campaign.json that is read, checked and, if asked for, stored."""
+"""Load a campaign from the store, or from a folder with campaign.json, which is read, checked and, on request, stored."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from abbe.service.campaign_data.provenance import machine_digest, run_digest
 from abbe.service.devices.urls import DeviceUrls
 from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.errors import CampaignRefused
-from abbe.service.runs.cases import set_once
+from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
 from abbe.service.site import Site, machine_from_doc
@@ -19,9 +19,9 @@ from abbe.service.storage.store import Store
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign as a solver takes it. ``folder``: where it was read from; None for one of the store. ``doc``: its campaign object.
+    """A campaign for a solver. ``folder``: its source, None if the store; ``doc``: its campaign object.
 
-    ``removed``: the table whose side effects were removed from the readings; None: none were.
+    ``removed``: the table whose side effects were subtracted from the readings; None without one.
     """
 
     name: str
@@ -32,12 +32,12 @@ class Campaign:
     removed: TableTakenOut | None = None
 
     def without(self, labels: list[str]) -> Campaign:
-        """The campaign without some of its runs.
+        """The campaign without the named runs.
 
         Raises
         ------
         CampaignRefused
-            There is no such run.
+            The campaign has no such run.
         """
         names = [r["run_id"] for r in self.runs]
         missing = [n for n in labels if n not in names]
@@ -47,7 +47,7 @@ class Campaign:
 
 
 def is_folder(campaign: str) -> bool:
-    """Whether an argument names a campaign folder and not a campaign of the store."""
+    """Whether an argument names a campaign folder rather than a campaign of the store."""
     return (Path(campaign) / CAMPAIGN_FILE).exists() or Path(campaign).is_dir()
 
 
@@ -64,12 +64,12 @@ def from_folder(folder: Path) -> Campaign:
 
 
 def from_store(store: Store, name: str) -> Campaign:
-    """Complete runs of a campaign in the store.
+    """A campaign of the store with its complete runs.
 
     Raises
     ------
     StoreError
-        There is no such campaign.
+        The store has no such campaign.
     """
     record = store.campaigns.find(name)
     runs = [load_run(store, r.id) for r in store.runs.all(record.id) if r.visible_status == "complete"]
@@ -81,41 +81,41 @@ def from_store(store: Store, name: str) -> Campaign:
 def _campaign(name: str, doc: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
     machine = doc["machine"]
     site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
-    return Campaign(name, site, set_once(runs), folder, doc)
+    return Campaign(name, site, with_earliest_mounting(runs), folder, doc)
 
 
-def keep(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:
-    """Store a solution with its runs; a folder is imported first, unless its campaign is there already.
+def store_solution(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:
+    """Store a solution with its runs; a folder whose campaign is not stored yet is imported first.
 
     Returns
     -------
     dict
-        What the document learns by it: ``run_ids``, ``solution_id``, and ``same_as``: earlier solutions of the same readings and model.
+        New keys of the document: ``run_ids``, ``solution_id``, and ``same_as``: earlier solutions of the same readings and model.
 
     Raises
     ------
     StoreError
-        It cannot be written.
+        The store cannot be written.
     CampaignRefused
-        Another campaign of this name is in the store.
+        The store has another campaign of this name.
     """
     ids = ensure_stored(store, campaign)
     record = store.campaigns.find(campaign.name)
     used = [ids[label] for label in doc["inputs"]["runs"]]
     same = [s.id for s in store.solutions.all(record.id) if s.doc.get("inputs", {}).get("digest") == doc["inputs"]["digest"]]
-    told = {"run_ids": used, "same_as": same}
-    return told | {"solution_id": store.solutions.add(record.id, "joint", used, doc | told)}
+    added = {"run_ids": used, "same_as": same}
+    return added | {"solution_id": store.solutions.add(record.id, "joint", used, doc | added)}
 
 
 def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
-    """Have a campaign in the store: a folder is imported, unless it is there already. Returns the numbers of its runs by their labels.
+    """Import a campaign folder unless its campaign is stored already, and return the ids of the complete runs by label.
 
     Raises
     ------
     StoreError
-        It cannot be written.
+        The store cannot be written.
     CampaignRefused
-        Another campaign of this name is in the store.
+        The store has another campaign of this name.
     """
     if campaign.folder is not None and all(c.name != campaign.name for c in store.campaigns.all()):
         import_folder(store, campaign.folder)
@@ -127,9 +127,9 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
 
 
 def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:
-    """The stored campaign must be of the same machine and hold the same readings with the same set-ups: solutions refer to its runs."""
+    """Refuse unless the stored campaign has the same machine, readings and set-ups: solutions refer to its runs."""
     differs = None
-    there = {r["run_id"]: r for r in set_once([load_run(store, number) for number in ids.values()])}
+    there = {r["run_id"]: r for r in with_earliest_mounting([load_run(store, number) for number in ids.values()])}
     if machine_digest(machine_from_doc(machine)) != machine_digest(campaign.site.machine):
         differs = "the machine (chain, strokes, pivots or tool)"
     for run in campaign.runs:

@@ -1,4 +1,4 @@
-"""One thing that is wrong with a run of a campaign, in one line."""
+"""An issue of a run of a campaign, in one line."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class CampaignIssue:
-    """One thing that is wrong with one run (or with two that contradict each other).
+    """One mistake in one run, or in two that contradict each other.
 
-    ``refuse``: nothing may be solved from such a campaign; otherwise it is a flag beside the result.
+    ``refuse``: the campaign must not be solved; otherwise the issue is a flag beside the result.
     """
 
     run: str
@@ -19,5 +19,5 @@ class CampaignIssue:
 
     @property
     def line(self) -> str:
-        """One line for people."""
+        """Run, mistake and remedy in one line."""
         return f"run {self.run}: {self.what} - {self.remedy}"

@@ -1,4 +1,4 @@
-"""Does a run stand in a campaign twice? One measurement that counts twice makes everything look better known than it is."""
+"""Find runs that occur in a campaign twice. A measurement that counts twice makes the uncertainty look too small."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from abbe.service.campaign_data.campaign_issue import CampaignIssue
 
 Doc = dict[str, Any]
 COPIED_SHARE = 0.98
-"""Runs share no more readings than this, positions included, unless one is a copy: noise differs every time."""
+"""Share of equal readings, positions included, from which a run is a copy: noise differs every time."""
 VISIBLE_STEPS = 2.0
-"""Noise shows where neighbours bend by more of the sensor's steps than this, rms: rounding alone makes them bend by 0.7."""
+"""Rms second difference of the readings, in sensor steps, above which they show noise: rounding alone gives 0.7."""
 NOTHING_MM = 1e-9
 STATE = ("x_mm", "y_mm", "z_mm", "direction")
 
 
-def copies(runs: Sequence[Doc]) -> list[CampaignIssue]:
-    """Runs whose readings stand in another run already, whatever they are called.
+def copy_issues(runs: Sequence[Doc]) -> list[CampaignIssue]:
+    """Issues of runs whose readings occur in an earlier run, regardless of their labels.
 
-    Where the readings show noise, alike readings are a copy whenever they are said to be measured. A coarse sensor shows none, and repeats
-    of it are alike: there a copy has the same times, too.
+    If the readings show noise, equal readings are a copy whatever their times. Repeats with a coarse sensor can be equal without noise:
+    there a copy must also have the same times.
     """
     rows = [_rows(r) for r in runs]
     out = []
@@ -38,13 +38,13 @@ def copies(runs: Sequence[Doc]) -> list[CampaignIssue]:
 
 
 def _copied(one: Counter[Any], other: Counter[Any]) -> bool:
-    """Whether nearly all rows of the shorter one stand in the other, each as often."""
+    """Whether nearly all rows of the shorter one occur in the other, equally often."""
     shorter = min(one.total(), other.total())
     return shorter > 0 and (one & other).total() >= COPIED_SHARE * shorter
 
 
 def _rows(run: Doc) -> Counter[Any]:
-    """Position and deviation of every reading, 10 nm and 0.01 nm; none for a run whose deviations are all the same."""
+    """Position and deviation of every reading, in 10 nm and 0.01 nm; empty for a run with constant deviations."""
     y = _column(run, "deviation_mm")
     if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
         return Counter()
@@ -53,13 +53,13 @@ def _rows(run: Doc) -> Counter[Any]:
 
 
 def _timed(run: Doc, rows: Counter[Any]) -> Counter[Any]:
-    """The same with the time of every reading, ms."""
+    """Time, ms, and deviation of every reading."""
     return Counter(zip(np.rint(_column(run, "t_s") * 1e3).tolist(), _column(run, "deviation_mm").tolist(), strict=True)) if rows else rows
 
 
 def _shows_noise(run: Doc) -> bool:
-    """Whether two measurements of this run could be told apart by their noise: places that it visits again read otherwise, or, where it
-    visits none again, neighbouring readings bend by more than rounding makes them."""
+    """Whether the readings show noise, so that a repeated measurement would differ: places visited again read differently, or, without
+    repeated places, the second differences exceed those from rounding."""
     y, states = _column(run, "deviation_mm"), zip(*(_column(run, c).tolist() for c in STATE), strict=True)
     places: dict[Any, list[float]] = {}
     for state, v in zip(states, y.tolist(), strict=True):

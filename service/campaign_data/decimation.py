@@ -1,4 +1,4 @@
-"""Long campaigns become shorter ones: means of neighbouring ball-bar readings, so that a search takes seconds and not minutes."""
+"""Decimate long campaigns to means of neighbouring ball-bar readings, so that a search takes seconds instead of minutes."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from abbe.service.domain.discovery_file import FoundThinning
 
 MOST_READINGS = 20000
-"""Ball-bar readings of a campaign that are searched one by one; more become means of so many neighbours that about as many are left."""
+"""Largest number of ball-bar readings that a search takes unchanged; more are averaged in blocks until about this many remain."""
 FEWEST = 3
-"""A run of fewer blocks stays as it is: one or two values would say nothing of its path."""
+"""A run of fewer blocks stays unchanged: one or two values would not describe its path."""
 GAP = 1.5
-"""A block that takes this much longer than usual has lost readings."""
+"""Ratio of a block's duration to the median from which readings are missing."""
 STILL_MM = 1e-6
-"""An axis that moves less than this from reading to reading stands."""
+"""An axis that moves less than this from one reading to the next stands still."""
 
 
 def lines_of(made: FoundThinning) -> tuple[str, ...]:
-    """For people: what was done to long runs, what therefore could not be seen, what to do about it."""
+    """Lines about the decimation: what was done, what it hides, and the remedy."""
     each, means = made.readings_per_value, made.how == "means"
     became = f"every {each} of them became one mean" if means else f"of every {each} one was looked at, as it was read"
     done = f"{made.readings} ball-bar readings are more than are searched one by one: {became}, {made.kept} values in all"
@@ -28,13 +28,13 @@ def lines_of(made: FoundThinning) -> tuple[str, ...]:
 
 
 def _not_seen(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
-    """What the shorter runs cannot show, one sentence each.
+    """What the decimated runs cannot show, one sentence each.
 
-    ``each``: readings that one value stands for; ``interval_s``: from value to value; ``turning``: values in whose readings an axis turns.
+    ``each``: readings per value; ``interval_s``: from value to value; ``turning``: number of values in whose readings an axis reverses.
     """
     highest_hz = 0.5 / interval_s  # Nyquist
     if means:
-        # A spike of one interval lies across two values as a rule; one of two fills a value wherever it begins.
+        # A spike as long as one interval usually spans two values; one as long as two intervals fills a value wherever it begins.
         spikes = f"a spike at a reversal keeps its height from {2.0 * interval_s:.2g} s on, one of a single reading is 1/{each} as high"
         sides = f"in {turning} means an axis turns round, and both sides of its lost motion are mixed there"
         fast = f"vibration above {highest_hz:.2g} Hz is averaged down, or looks like a slower one"
@@ -49,13 +49,7 @@ REMEDY = f"to see it, search fewer runs (--without RUN): up to {MOST_READINGS} b
 
 
 def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> FoundThinning | None:
-    """What `thinned` or `picked` did to runs; None if nothing.
-
-    Parameters
-    ----------
-    before, after : list of dict
-        The same runs in the same order.
-    """
+    """The effect of `thinned` or `picked` on runs, given the same runs in the same order before and after; None if unchanged."""
     pairs = [(b, a) for b, a in zip(before, after, strict=True) if _measured_bar(b)]
     changed = [(b, a) for b, a in pairs if len(a["columns"]["t_s"]) < len(b["columns"]["t_s"])]
     if not changed:
@@ -78,19 +72,19 @@ def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Found
 
 
 def _step(before: dict[str, Any], after: dict[str, Any]) -> int:
-    """Readings from one value that was picked to the next."""
+    """Number of readings from one picked value to the next."""
     first, second = np.searchsorted(before["columns"]["t_s"], after["columns"]["t_s"][:2])
     return int(second - first)
 
 
 def _finite(run: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Readings that are numbers; a flagged one need not be."""
+    """The finite readings; a flagged one may be NaN."""
     values = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
     return np.asarray(values[np.isfinite(values)])
 
 
 def _turning(run: dict[str, Any], each: int) -> int:
-    """Blocks of so many readings inside which an axis turns round."""
+    """Number of blocks of ``each`` readings inside which an axis reverses."""
     inside: set[int] = set()
     for axis in "xyz":
         step = np.diff(np.asarray(run["columns"][f"{axis}_mm"], dtype=np.float64))
@@ -101,11 +95,11 @@ def _turning(run: dict[str, Any], each: int) -> int:
 
 
 def thinned(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Runs with as many ball-bar readings as a search can hold.
+    """Runs with as many ball-bar readings as a search can process.
 
-    Every measured ball-bar run is averaged over the same number of neighbours, so that one reading's noise is alike in all of them. Laser
-    runs have one reading a position and stay, sealed runs too: each of their readings is predicted. What is left at a run's end, less
-    than a block, is not used.
+    Every measured ball-bar run is averaged over the same number of neighbours, so that the noise of a value is the same in all of them.
+    Laser runs have one reading per position and stay unchanged. So do sealed runs, because each of their readings is predicted. An
+    incomplete block at the end of a run is dropped.
     """
     long = [r for r in runs if _measured_bar(r)]
     total = sum(len(r["columns"]["t_s"]) for r in long)
@@ -114,10 +108,10 @@ def thinned(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def picked(runs: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Runs with about ``most`` measured ball-bar readings, each as it was read: the middle one of every block.
+    """Runs with about ``most`` measured ball-bar readings: the middle reading of every block, unchanged.
 
-    Means have less noise. But a mean over a turn of an axis is half of either side, and lost motion or friction that is large against
-    the noise then looks like nothing that has a formula. A run shorter than `FEWEST` blocks stays as it is.
+    Means have less noise, but a mean over a reversal mixes both sides, and lost motion or friction well above the noise then matches no
+    formula. A run shorter than `FEWEST` blocks stays unchanged.
     """
     total = sum(len(r["columns"]["t_s"]) for r in runs if _measured_bar(r))
     block = -(-total // most)
@@ -135,9 +129,9 @@ def _measured_bar(run: dict[str, Any]) -> bool:
 
 
 def _means(run: dict[str, Any], block: int) -> dict[str, Any]:
-    """One value a block, at its middle reading: the mean of what the readings are off the commanded points, put back there.
+    """One value per block at its middle reading: the mean of the readings minus their nominal values, plus the nominal value there.
 
-    The mean of points on a sphere lies inside it; a block with a gap in time is left out.
+    Without the nominal values, the mean of points on a sphere would lie inside it. A block with a gap in time is dropped.
     """
     columns = run["columns"]
     count = len(columns["t_s"]) // block
@@ -154,7 +148,7 @@ def _means(run: dict[str, Any], block: int) -> dict[str, Any]:
     weight = np.where(some[:, None], valid, 1.0)
     nominal = _nominal_mm(run)
     off = (np.asarray(columns["deviation_mm"], dtype=np.float64) - nominal)[rows]
-    off = np.where(weight > 0.0, off, 0.0)  # a flagged reading need not be a number
+    off = np.where(weight > 0.0, off, 0.0)  # a flagged reading may be NaN
     out["deviation_mm"] = ((off * weight).sum(axis=1) / weight.sum(axis=1) + nominal[middle]).tolist()
     if "valid" in columns:
         out["valid"] = some.astype(int).tolist()
@@ -162,7 +156,7 @@ def _means(run: dict[str, Any], block: int) -> dict[str, Any]:
 
 
 def _nominal_mm(run: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """What a perfect machine's bar would read at the commanded points, mm: a path of straight pieces runs a little inside its sphere."""
+    """Reading of the bar on a perfect machine at the commanded points, mm: a path of chords runs slightly inside its sphere."""
     q = np.column_stack([np.asarray(run["columns"][f"{c}_mm"], dtype=np.float64) for c in "xyz"])
     away = np.linalg.norm(q - np.asarray(run["setup"]["centre_mm"], dtype=np.float64), axis=1)
     return np.asarray(away - float(run["setup"]["radius_mm"]))

@@ -1,4 +1,4 @@
-"""What a solution came from: hashes of the runs' data, and which program solved them."""
+"""Provenance of a solution: digests of the runs' data, and versions of the program."""
 
 from __future__ import annotations
 
@@ -17,14 +17,12 @@ import numpy as np
 from abbe.models.machine import Machine
 
 SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
-
-
 AS_MEASURED, LESS = "as_measured", "less"
-"""Keys of a run whose readings were changed: digest of what was measured, and in words what was taken out of it."""
+"""Keys of a run with changed readings: digest of the measured data, and descriptions of what was subtracted."""
 
 
 def run_digest(run: dict[str, Any]) -> str:
-    """SHA-256 of what was measured: test, set-up and the columns that are solved from; the run's name and campaign do not count."""
+    """SHA-256 of test, set-up and the columns that a solution uses; label and campaign do not count."""
     out = hashlib.sha256(json.dumps([run["test"], run["setup"]], sort_keys=True).encode())
     for name in SETUP_OF_DATA:
         values = run["columns"].get(name)
@@ -33,26 +31,26 @@ def run_digest(run: dict[str, Any]) -> str:
     return out.hexdigest()
 
 
-def changed(run: dict[str, Any], columns: dict[str, Any], less: str) -> dict[str, Any]:
-    """A run with other readings, which remembers what was measured and what was taken out of it."""
-    return run | {"columns": columns, AS_MEASURED: measured_digest(run), LESS: [*run.get(LESS, ()), less]}
+def with_changed_columns(run: dict[str, Any], columns: dict[str, Any], removed: str) -> dict[str, Any]:
+    """The run with new columns, the digest of its measured data, and a description of what was subtracted."""
+    return run | {"columns": columns, AS_MEASURED: measured_digest(run), LESS: [*run.get(LESS, ()), removed]}
 
 
 def measured_digest(run: dict[str, Any]) -> str:
-    """`run_digest` of a run as it was measured, whatever was taken out of its readings since."""
+    """`run_digest` of the measured data, before any subtraction."""
     return str(run.get(AS_MEASURED) or run_digest(run))
 
 
-def taken_from(runs: list[dict[str, Any]]) -> list[str]:
-    """What was taken out of readings, in words, each once."""
-    return sorted({words for run in runs for words in run.get(LESS, ())})
+def removals_of(runs: list[dict[str, Any]]) -> list[str]:
+    """Descriptions of everything that was subtracted from the readings, without duplicates."""
+    return sorted({text for run in runs for text in run.get(LESS, ())})
 
 
 def whole_run_digest(run: dict[str, Any]) -> str:
-    """SHA-256 of everything that a search can take from a run: `run_digest`, name, role, its machine, and all columns.
+    """SHA-256 of everything that a search can use of a run: label, test, role, machine, set-up and all columns.
 
-    Of readings that were changed those that were measured count, and what was taken out of them: what a solver makes of that may differ
-    in the last digit from computer to computer.
+    For changed readings the digest of the measured ones and the descriptions of what was subtracted count, because the subtracted values
+    may differ in the last digit between computers.
     """
     out = hashlib.sha256(json.dumps([run[k] for k in ("run_id", "test", "role", "machine", "setup")], sort_keys=True).encode())
     if AS_MEASURED in run:
@@ -64,7 +62,7 @@ def whole_run_digest(run: dict[str, Any]) -> str:
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """SHA-256 of the file a function stands in: an edited plug-in is another one. Of its name alone where there is no file."""
+    """SHA-256 of the file that defines a function, so that an edited plug-in counts as another one; of the module name without a file."""
     inner = getattr(function, "func", function)  # functools.partial
     name = str(getattr(inner, "__module__", type(inner).__module__))
     file = getattr(sys.modules.get(name), "__file__", None)
@@ -72,7 +70,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def machine_digest(machine: Machine) -> str:
-    """SHA-256 of the geometry that is solved with: chain, strokes, pivots, tool. Its name does not count."""
+    """SHA-256 of the geometry: chain, strokes, pivots, tool. The machine's name does not count."""
     out = hashlib.sha256(machine.chain.encode())
     for values in (machine.stroke_mm, machine.pivots_mm, machine.tool_mm):
         out.update((np.asarray(values, dtype="<f8") + 0.0).tobytes())  # + 0.0: minus zero is zero
@@ -80,21 +78,21 @@ def machine_digest(machine: Machine) -> str:
 
 
 def campaign_digest(digests: dict[str, str], model: str, machine: str) -> str:
-    """SHA-256 of all runs, in any order, of model and machine (`machine_digest`): the same campaign solved twice has the same."""
+    """SHA-256 of all runs in any order, the model, and the machine (`machine_digest`); equal for repeated solutions of a campaign."""
     return hashlib.sha256("\n".join([model, machine, *sorted(digests.values())]).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
-    """Abbe's version, its revision where there is one, and the libraries that do the arithmetic."""
+    """Versions of Abbe, NumPy and SciPy, and Abbe's revision if known."""
     out = {"abbe": version("abbe"), "numpy": version("numpy"), "scipy": version("scipy")}
     found = revision()
     return out if found is None else out | {"revision": found}
 
 
 def revision() -> str | None:
-    """Commit of the sources: as installed from a repository, or of the work tree that they stand in; None for a plain package.
+    """Commit of the sources, installed from a repository or in a work tree; None for a plain package.
 
-    A work tree whose program differs from its commit is told by ``+changes`` behind the commit.
+    The suffix ``+changes`` marks a work tree whose program differs from its commit.
     """
     try:
         text = distribution("abbe").read_text("direct_url.json")
@@ -109,13 +107,13 @@ def revision() -> str | None:
 
 
 def _changed(tree: Path) -> bool:
-    """Whether files of the program differ from the commit; without git nobody knows, and nothing is claimed."""
+    """Whether files of the program differ from the commit; False without git."""
     git = shutil.which("git")
     if git is None:
         return False
-    words = [git, "--no-optional-locks", "-C", str(tree), "status", "--porcelain", "--", "abbe", "models", "service"]
+    command = [git, "--no-optional-locks", "-C", str(tree), "status", "--porcelain", "--", "abbe", "models", "service"]
     try:
-        found = subprocess.run(words, capture_output=True, timeout=20, check=False)  # noqa: S603 - fixed words, no shell
+        found = subprocess.run(command, capture_output=True, timeout=20, check=False)  # noqa: S603 - fixed command, no shell
     except (OSError, subprocess.TimeoutExpired):
         return False
     return found.returncode == 0 and bool(found.stdout.strip())

@@ -1,6 +1,6 @@
-"""Do the commanded positions of a run lie where its set-up says: on the sphere, in the plane, on the line, inside the strokes?
+"""Check that the commanded positions of a run lie where its set-up says: on the sphere, in the plane, on the line, inside the strokes.
 
-Where they do not, the usual mistakes are tried (inches, micrometres, metres, exchanged columns), and the one that puts them there is named.
+If not, the usual mistakes are tried (inches, micrometres, metres, exchanged columns), and the one that explains the positions is named.
 """
 
 from __future__ import annotations
@@ -18,36 +18,33 @@ Doc = dict[str, Any]
 Distance = Callable[[F2], float]
 
 TOLERANCE_MM = 1.5
-"""Farther from its nominal path no run is: chords of a polyline stay below 0.1 mm, a ball-bar has a range of about 1 mm."""
+"""Largest distance from the nominal path: chords of a polyline deviate by less than 0.1 mm, a ball-bar has a range of about 1 mm."""
 SMALLEST_RADIUS_MM = 15.0
 UNITS = {"inches": 25.4, "µm": 1e-3, "m": 1e3}
 AXES = "xyz"
 
 
 @dataclass(frozen=True, slots=True)
-class Misplaced:
-    """What is wrong with the geometry of a run, and what to do."""
+class GeometryMistake:
+    """A mistake in the geometry of a run, and its remedy."""
 
     text: str
     remedy: str
     refuse: bool = True
 
 
-def geometry(machine: Doc, run: Doc) -> Misplaced | None:
-    """The first thing that is wrong with where a run lies; None when it lies where it says.
-
-    Keys that a run does not have are not looked at.
-    """
+def geometry_mistake(machine: Doc, run: Doc) -> GeometryMistake | None:
+    """The first mistake in the geometry of a run; None without one. Missing keys are not checked."""
     setup, columns = run["setup"], run["columns"]
     points = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in AXES])
     if not np.isfinite(points).all():
-        return Misplaced("a position is not a finite number", "correct x_mm, y_mm, z_mm")
-    look = _bar if run["test"].startswith("ballbar") else _laser
-    found = look(run["test"], setup, points)
+        return GeometryMistake("a position is not a finite number", "correct x_mm, y_mm, z_mm")
+    check = _bar if run["test"].startswith("ballbar") else _laser
+    found = check(run["test"], setup, points)
     return found or _inside(machine, points)
 
 
-def _bar(test: str, setup: Doc, points: F2) -> Misplaced | None:
+def _bar(test: str, setup: Doc, points: F2) -> GeometryMistake | None:
     centre, radius = np.asarray(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"])
     plane = str(setup.get("plane") or "").lower() if test == "ballbar_circle" else ""
 
@@ -67,11 +64,13 @@ def _bar(test: str, setup: Doc, points: F2) -> Misplaced | None:
             place = f"points leave the plane {plane.upper()} by up to {out:.0f} mm"
             return _explained(points, place, lambda p: float(np.abs(p[:, normal] - centre[normal]).max())) or _unexplained(place, "plane")
     if radius < SMALLEST_RADIUS_MM:
-        return Misplaced(f"radius_mm is {radius:g}: no ball-bar is that short, {radius * 25.4:.0f} mm would be", "write mm, not inches")
+        return GeometryMistake(
+            f"radius_mm is {radius:g}: no ball-bar is that short, {radius * 25.4:.0f} mm would be", "write mm, not inches"
+        )
     return None
 
 
-def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> Misplaced | None:
+def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> GeometryMistake | None:
     for unit, factor in UNITS.items():
         for key, c, r in (
             ("radius_mm", centre, factor * radius),
@@ -80,17 +79,17 @@ def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> Misplaced 
         ):
             if float(np.abs(np.linalg.norm(points - c, axis=1) - r).max()) < TOLERANCE_MM:
                 name = "centre_mm and radius_mm hold" if key == "both" else f"{key} holds"
-                return Misplaced(f"{place}: {name} {unit}", "convert to mm")
+                return GeometryMistake(f"{place}: {name} {unit}", "convert to mm")
     return None
 
 
-def _laser(test: str, setup: Doc, points: F2) -> Misplaced | None:
+def _laser(test: str, setup: Doc, points: F2) -> GeometryMistake | None:
     if setup.get("start_mm") is None or setup.get("end_mm") is None:
         return None
     start, end = (np.asarray(setup[k], dtype=np.float64) for k in ("start_mm", "end_mm"))
-    said = _direction(test, setup, end - start)
-    if said is not None:
-        return said
+    mistake = _direction(test, setup, end - start)
+    if mistake is not None:
+        return mistake
 
     def off(p: F2) -> float:
         low, high = np.minimum(start, end), np.maximum(start, end)
@@ -105,27 +104,29 @@ def _laser(test: str, setup: Doc, points: F2) -> Misplaced | None:
     return _sequence(setup, points) if test == "laser_diagonal" else None
 
 
-def _direction(test: str, setup: Doc, span: F1) -> Misplaced | None:
-    """Beam, axis, letters of the diagonal and increments against the line they belong to."""
+def _direction(test: str, setup: Doc, span: F1) -> GeometryMistake | None:
+    """Check beam, axis, letters of the diagonal and increments against the line from start to end."""
     unit = span / max(float(np.linalg.norm(span)), 1e-9)
     beam = setup.get("nominal_beam")
     if beam is not None and float(np.dot(beam, unit)) < 0.999 * float(np.linalg.norm(beam)):
-        return Misplaced("nominal_beam does not point from start_mm to end_mm", "correct the set-up: exchanged or reversed axes")
+        return GeometryMistake("nominal_beam does not point from start_mm to end_mm", "correct the set-up: exchanged or reversed axes")
     if test == "laser_linear" and abs(unit["XYZ".index(setup["axis"])]) < 0.999:
         moved = "XYZ"[int(np.argmax(np.abs(unit)))]
-        return Misplaced(f"axis is {setup['axis']}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
+        return GeometryMistake(f"axis is {setup['axis']}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
     letters = setup.get("diagonal") if test == "laser_diagonal" else None
     if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True) if s):  # a face diagonal leaves one axis alone
-        return Misplaced(f"diagonal is {letters}, but start_mm and end_mm run otherwise", "correct diagonal, start_mm or end_mm")
+        return GeometryMistake(f"diagonal is {letters}, but start_mm and end_mm run otherwise", "correct diagonal, start_mm or end_mm")
     step, count = setup.get("increment_mm"), setup.get("steps")
     allowed = TOLERANCE_MM + 2.0 * float(setup.get("overrun_mm") or 0.0)  # the ends are the turning points
     if isinstance(step, list | tuple) and count and float(np.abs(np.asarray(step) * count - span).max()) > allowed:
-        return Misplaced(f"{count} steps of increment_mm do not lead from start_mm to end_mm", "correct increment_mm, steps or the ends")
+        return GeometryMistake(
+            f"{count} steps of increment_mm do not lead from start_mm to end_mm", "correct increment_mm, steps or the ends"
+        )
     return None
 
 
-def _sequence(setup: Doc, points: F2) -> Misplaced | None:
-    """The way out of a step diagonal: one axis after the other, in the order that the run names (X, Y, Z where it names none)."""
+def _sequence(setup: Doc, points: F2) -> GeometryMistake | None:
+    """Check the outward path of a step diagonal: one axis after the other, in the order of the set-up (default X, Y, Z)."""
     count = int(setup.get("steps") or 0)
     if count == 0 or len(points) < 3 * count + 1 or (setup.get("order") == "" and len(points) <= 2 * count + 2):
         return None
@@ -134,13 +135,13 @@ def _sequence(setup: Doc, points: F2) -> Misplaced | None:
     wanted = np.tile(np.array([[a == o for a in "XYZ"] for o in order]), (count, 1))
     if (moved.sum(axis=1) == 1).all() and not (moved == wanted).all():
         first = "".join("XYZ"[int(np.argmax(row))] for row in moved[:3])
-        return Misplaced(
+        return GeometryMistake(
             f"steps go in the order {first}, the run says {order}: columns are exchanged or order is wrong", "correct the file"
         )
     return None
 
 
-def _inside(machine: Doc, points: F2) -> Misplaced | None:
+def _inside(machine: Doc, points: F2) -> GeometryMistake | None:
     stroke = machine.get("stroke_mm")
     if stroke is None:
         return None
@@ -155,19 +156,19 @@ def _inside(machine: Doc, points: F2) -> Misplaced | None:
     axis = int(np.argmax(np.maximum(box[:, 0] - points.min(axis=0), points.max(axis=0) - box[:, 1])))
     low, high = (f"{v:g}" for v in box[axis])
     place = f"{'XYZ'[axis]} goes {largest:.0f} mm beyond the stroke {low} to {high} mm"
-    return Misplaced(place, "correct the positions or the machine's stroke, or leave the run out (--without)")
+    return GeometryMistake(place, "correct the positions or the machine's stroke, or leave the run out (--without)")
 
 
-def _explained(points: F2, place: str, off: Distance) -> Misplaced | None:
+def _explained(points: F2, place: str, off: Distance) -> GeometryMistake | None:
     for unit, factor in UNITS.items():
         if off(factor * points) < TOLERANCE_MM:
-            return Misplaced(f"{place}: x_mm, y_mm, z_mm hold {unit}", "convert the columns to mm")
+            return GeometryMistake(f"{place}: x_mm, y_mm, z_mm hold {unit}", "convert the columns to mm")
     for order in permutations(range(3)):
         if order != (0, 1, 2) and off(points[:, order]) < TOLERANCE_MM:
             moved = [f"{AXES[k]}_mm" for k in range(3) if order[k] != k]
-            return Misplaced(f"{place}: columns {' and '.join(moved)} are exchanged", "put the columns right")
+            return GeometryMistake(f"{place}: columns {' and '.join(moved)} are exchanged", "put the columns right")
     return None
 
 
-def _unexplained(place: str, keys: str) -> Misplaced:
-    return Misplaced(f"{place}: {keys} or the positions are not of this run", "correct the set-up, or leave the run out (--without)")
+def _unexplained(place: str, keys: str) -> GeometryMistake:
+    return GeometryMistake(f"{place}: {keys} or the positions are not of this run", "correct the set-up, or leave the run out (--without)")

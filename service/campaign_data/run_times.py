@@ -1,4 +1,4 @@
-"""Are the times of a run seconds of the campaign's clock? Against its own feed, and against the other runs."""
+"""Check that the times of a run are seconds of the campaign's clock, against its own feed and against the other runs."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from abbe.service.campaign_data.campaign_issue import CampaignIssue
 
 Doc = dict[str, Any]
 FASTEST = 0.2
-"""No run takes less than this of path length over feed: the feed is what was programmed."""
+"""Least ratio of a run's duration to path length over feed: the programmed feed is the upper limit."""
 SLOWEST = {"ballbar": 10.0, "laser": 200.0}
-"""A ball-bar moves steadily; a laser run stands still at every point."""
+"""Largest ratio of a run's duration to path length over feed: a ball-bar run moves steadily, a laser run stops at every point."""
 OVERLAP = 0.1
-"""Share of the shorter of two runs that may lie in the other: clocks are not set to the second."""
+"""Largest allowed overlap of two runs as a share of the shorter one: clocks are not set to the second."""
 UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
 
 
-def times(runs: Sequence[Doc]) -> list[CampaignIssue]:
-    """Flags of runs whose t_s does not fit their feed, and of runs that were measured while others were."""
+def time_issues(runs: Sequence[Doc]) -> list[CampaignIssue]:
+    """Flags of runs whose clocks disagree, whose t_s does not fit their feed, or which overlap other runs."""
     out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
     known = {f.run for f in out}
     return out + _overlaps([r for r in runs if r["run_id"] not in known])
 
 
 def _clocks(run: Doc) -> list[CampaignIssue]:
-    """What the clocks of a run that was measured here contradict each other in (abbe.service.runs.clocks)."""
+    """The disagreement of a run's clocks, if any (`abbe.service.runs.clocks`)."""
     trouble = (run.get("timing") or {}).get("trouble")
     return (
         [CampaignIssue(run["run_id"], str(trouble), "look at the sync cable and the links, then measure it again", False)]
@@ -47,11 +47,11 @@ def _against_feed(run: Doc) -> list[CampaignIssue]:
     wanted = float((np.linalg.norm(np.diff(points, axis=0), axis=1) * 60.0 / feed[1:]).sum())
     if wanted <= 0.0:
         return []
-    waited = np.sort(np.diff(t))[::-1][: len((run.get("timing") or {}).get("pieces", []))].sum()  # between the pieces of a path
+    waited = np.sort(np.diff(t))[::-1][: len((run.get("timing") or {}).get("pieces", []))].sum()  # pauses between the pieces of a path
     ratio, slowest = float(t[-1] - t[0] - waited) / wanted, SLOWEST["laser" if run["test"].startswith("laser") else "ballbar"]
     if FASTEST <= ratio <= slowest:
         return []
-    unit = next((word for factor, word in UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says")
+    unit = next((text for factor, text in UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says")
     what = f"it took {ratio:.2g} times as long as its path at its feed_mm_min: {unit}"
     return [
         CampaignIssue(
@@ -61,7 +61,7 @@ def _against_feed(run: Doc) -> list[CampaignIssue]:
 
 
 def _overlaps(runs: Sequence[Doc]) -> list[CampaignIssue]:
-    """Runs that lie in time where others lie; the one with the most others is named first and set aside."""
+    """Runs whose times overlap; the run with the most overlaps is flagged and removed until none remains."""
     spans = {r["run_id"]: (float(r["columns"]["t_s"][0]), float(r["columns"]["t_s"][-1])) for r in runs if len(r["columns"]["t_s"])}
     spans = {k: v for k, v in spans.items() if np.isfinite(v).all()}
     meets = {k: [m for m in spans if m != k and _share(spans[k], spans[m]) > OVERLAP] for k in spans}
@@ -79,7 +79,7 @@ def _overlaps(runs: Sequence[Doc]) -> list[CampaignIssue]:
 
 
 def _share(a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Common time as a share of the shorter of two spans."""
+    """Common time of two spans as a share of the shorter one."""
     shorter = min(a[1] - a[0], b[1] - b[0])
     return (min(a[1], b[1]) - max(a[0], b[0])) / shorter if shorter > 0.0 else 0.0
 

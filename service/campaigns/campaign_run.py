@@ -12,8 +12,8 @@ from abbe.drivers.api import DeviceInfo, Point
 from abbe.drivers.errors import DriverError, LinkDown, Rebooted, ReplyTimeout
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
-from abbe.service.runs.columns import path_so_far
-from abbe.service.runs.pieces import SoFar
+from abbe.service.runs.columns import path_progress
+from abbe.service.runs.pieces import ReadProgress
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Suspending, Watching, check_interlocks
 from abbe.service.sequences.journal import DONE, RUN, WAITS, Journal
@@ -95,7 +95,7 @@ async def decline(_: str) -> bool:
     return False
 
 
-async def _nothing_read(_: str, __: int) -> SoFar | None:
+async def _nothing_read(_: str, __: int) -> ReadProgress | None:
     """Report no reading: paths begin again."""
     return None
 
@@ -162,20 +162,20 @@ def mounted_anew(item: Item, mounting: int) -> Item:
     )
 
 
-def resumed_item(item: Item, hand: int | None, records: tuple[dict[str, Any], ...], so_far: SoFar | None = None) -> Item:
+def resumed_item(item: Item, hand: int | None, records: tuple[dict[str, Any], ...], so_far: ReadProgress | None = None) -> Item:
     """Resume a test from its last checkpoint, in the present mounting."""
     hand = item.hand if hand is None else hand
     left, offset, resume_trail, remainder = rest_of(item.whole, hand, records, item.before, so_far)
     return replace(item, left=left, offset=offset, resume_trail=resume_trail, hand=hand, remainder=remainder)
 
 
-async def read_path(session: Session, store: Store, campaign: int, test: str, mounting: int) -> SoFar | None:
+async def read_path(session: Session, store: Store, campaign: int, test: str, mounting: int) -> ReadProgress | None:
     """Return how far the path of a test was read in a mounting; None if the ball-bar's box was restarted since."""
 
-    def look() -> SoFar | None:
+    def look() -> ReadProgress | None:
         lines = (one.doc for one in store.checkpoints.of_campaign(campaign) if one.kind == RUN)
         runs = [int(one["run"]) for one in lines if one["test"] == test and one["mounting"] == mounting]
-        return path_so_far(store, max(runs)) if runs else None
+        return path_progress(store, max(runs)) if runs else None
 
     found = await asyncio.to_thread(look) if session.ballbar is not None else None
     if found is None or session.ballbar is None:
@@ -224,7 +224,7 @@ class CampaignRun:
     used: set[tuple[str, int]] = field(default_factory=set)
     labels: set[str] = field(default_factory=set)
     freed: bool = False
-    read_path: Callable[[str, int], Awaitable[SoFar | None]] = _nothing_read
+    read_path: Callable[[str, int], Awaitable[ReadProgress | None]] = _nothing_read
 
     def runner(self) -> Runner:
         """Return a runner for one attempt."""
@@ -272,7 +272,9 @@ class CampaignRun:
             await self.session.controller.abort()  # the status does not show an unfinished abort
             self.freed = True
 
-    async def _next(self, item: Item, runner: Runner, why: RunInterrupted | SetupDisturbed | Interlock, so_far: SoFar | None) -> Item:
+    async def _next(
+        self, item: Item, runner: Runner, why: RunInterrupted | SetupDisturbed | Interlock, so_far: ReadProgress | None
+    ) -> Item:
         """Wait until the test can resume, and return it from its last checkpoint.
 
         Raises

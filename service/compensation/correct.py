@@ -32,7 +32,7 @@ from abbe.service.compensation.pushing import Pushing, PushResult, Questions, Wa
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import AbbeError, TableRefused, TakenBack
 from abbe.service.identification.solve import Solved, helix_misfit
-from abbe.service.identification.table_removal import less, taken
+from abbe.service.identification.table_removal import removed_table, subtract_table
 from abbe.service.push.operations import Verdict
 from abbe.service.push.validate import drift_reason
 from abbe.service.sequences.check import paced
@@ -157,7 +157,7 @@ def _as_other_runs(run: dict[str, Any], solved: Solved, table: NineTables | None
     if table is None:
         return run
     lost = np.array([v for v, _ in solved.joint.backlash_mm().values()])
-    return less([run], taken(table, lost))[0]
+    return subtract_table([run], removed_table(table, lost))[0]
 
 
 @dataclass

@@ -26,10 +26,10 @@ from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.identification.effect_removal import TakenOut, taken_out
+from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
-from abbe.service.identification.table_removal import TableThen
+from abbe.service.identification.table_removal import CampaignTable
 from abbe.service.push.validate import reasons_against
 from abbe.service.runs.columns import load_run
 from abbe.service.site import Site
@@ -149,8 +149,8 @@ async def solve_again(store: Store, site: Site, campaign: str, table: NineTables
     return await asyncio.to_thread(solve_runs, site, known.campaign.runs)
 
 
-def _campaign_without_known_effects(store: Store, name: str, table: NineTables | None) -> TakenOut:
-    return taken_out(store, from_store(store, name), TableThen(table))
+def _campaign_without_known_effects(store: Store, name: str, table: NineTables | None) -> RemovedEffects:
+    return remove_effects(store, from_store(store, name), CampaignTable(table))
 
 
 def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:

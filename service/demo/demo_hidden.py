@@ -25,7 +25,7 @@ from abbe.service.devices.session import Session, open_session
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_store import journal_of
-from abbe.service.discovery.new_measurement import NewMeasurement, judged_anew
+from abbe.service.discovery.new_measurement import NewMeasurement, validate_on
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
@@ -115,7 +115,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     progress(Progress("prediction", 0.0, 1.0, None, "the new measurement against what the model says"))
     new = await asyncio.to_thread(from_store, store, ANEW)
     model = current(store, site.name)
-    result.anew = await asyncio.to_thread(judged_anew, old, new, job.effects, model, thin=few)
+    result.anew = await asyncio.to_thread(validate_on, old, new, job.effects, model, thin=few)
     if not tables or model is None:
         return
     try:

@@ -7,7 +7,7 @@ from typing import Any
 
 from abbe.service.demo.demo_hidden import HiddenDemo
 from abbe.service.discovery.discovery_answer import where_doc
-from abbe.service.discovery.discovery_words import book_lines, effect_lines, next_of, verdict_of
+from abbe.service.discovery.discovery_text import book_lines, effect_lines, next_of, verdict_of
 from abbe.service.domain.finding import GapUm
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.rendering.numbers import plain

@@ -1,1 +1,1 @@
-"""Where simulation and measurement disagree, which effect is missing, and which measurement would tell more."""
+"""Where simulation and measurement disagree, which effect is missing, and which measurement would show more."""

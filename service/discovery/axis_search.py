@@ -1,4 +1,4 @@
-"""A positioning test of one axis against the whole catalogue: first what drifts, then what is missing beyond the scatter of its repeats."""
+"""Search a positioning test of one axis: first for a drift of its repeats, then in the catalogue for what exceeds their scatter."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.effect import Effect
 from abbe.models.probability import chi2_above
 from abbe.models.solvers.priors import U_WAVELENGTH
-from abbe.service.effects.axis_test import AXES, drift_at, drift_found, places_of
+from abbe.service.effects.axis_test import AXES, axis_drift, drift_at, places_of
 
 CHANCE = 1e-3
-"""What is missing beyond the repeats' scatter is told if chance gives as much in fewer tests than this."""
+"""Largest probability that chance alone explains an effect that is reported."""
 
 
 @dataclass(frozen=True)
 class _Scatter:
-    """How visits of one place differ, each run's mean left free: sd, mm; sums of neighbours vary ``long`` times more than single ones."""
+    """Scatter of repeated visits with each run's mean free: ``sd_mm``, and the variance inflation ``long`` of sums of neighbours."""
 
     sd_mm: float
     long: float
 
 
 def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
-    """What a test of one axis says: a drift of its repeats, and what the catalogue names in the rest; where not, what `drift_found` says.
+    """Search a test of one axis for a drift of its repeats, and the rest for effects of the catalogue.
 
-    What is named has to be more than the repeats scatter: their noise is known without any model.
+    A named effect must exceed the scatter of the repeats, whose noise needs no model; otherwise the result of `axis_drift` stands.
     """
-    told = drift_found(case)
-    drifts = drift_at(case) if told is not None and told.verdict == "named" else {}
+    drift = axis_drift(case)
+    drifts = drift_at(case) if drift is not None and drift.verdict == "named" else {}
     quiet = _without(case, drifts)
     found = discover(quiet, effects, progress=progress)
     fitted, scatter = _scale(quiet), _scatter(quiet)
-    if told is None or scatter is None:
+    if drift is None or scatter is None:
         return replace(found, fitted=fitted)
-    if found.verdict == "none" or not _beyond(quiet, found, scatter):
-        return replace(told, fitted=fitted)
-    table = (*told.where.table, *found.where.table)
-    if told.verdict == "none":
+    if found.verdict == "none" or not _exceeds_scatter(quiet, found, scatter):
+        return replace(drift, fitted=fitted)
+    table = (*drift.where.table, *found.where.table)
+    if drift.verdict == "none":
         return replace(found, where=replace(found.where, table=table), fitted=fitted)
-    return replace(_together(case, told, found, drifts, table), fitted=fitted)
+    return replace(_combined(case, drift, found, drifts, table), fitted=fitted)
 
 
 def _without(case: Case, drifts: dict[str, F1]) -> Case:
@@ -60,12 +60,12 @@ def _without(case: Case, drifts: dict[str, F1]) -> Case:
     return replace(case, runs=runs)
 
 
-def _together(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, F1], table: tuple[Significance, ...]) -> Discovery:
-    """Drift and what was named in the rest as one finding; before is the present simulation of the readings as they were measured."""
+def _combined(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, F1], table: tuple[Significance, ...]) -> Discovery:
+    """Drift and the other named effects as one finding; "before" is the present simulation of the measured readings."""
     problem = whiten(case, baseline_of(case))
     before = predictions(problem, solve(problem, ()))
-    seen = {r.path.setup for r in problem.runs}
-    left = {r.path.label: left_over(r, before[r.path.label], seen) for r in case.runs if r.deviation_mm is not None}
+    fitted_setups = {r.path.setup for r in problem.runs}
+    left = {r.path.label: left_over(r, before[r.path.label], fitted_setups) for r in case.runs if r.deviation_mm is not None}
     floor = {kind: Floor(sd, 1.0) for kind, sd in found.noise_mm.items()}
     return replace(
         found,
@@ -83,7 +83,7 @@ def _together(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, 
 
 
 def _scatter(case: Case) -> _Scatter | None:
-    """Of the fitted runs; None where no place was visited twice or all visits are alike."""
+    """Scatter of the fitted runs; None if no place was visited twice or all visits are equal."""
     runs = case.of("identify")
     if len(runs) < 2:
         return None
@@ -100,17 +100,17 @@ def _scatter(case: Case) -> _Scatter | None:
 
 
 def _stacked(case: Case) -> tuple[F1, F1, F1]:
-    """Place, reading and number of the run of all fitted readings that count."""
+    """Place, value and run number of all valid readings of the fitted runs."""
     runs = case.of("identify")
     data = [(places_of(r)[r.valid], r.data().deviation_mm[r.valid]) for r in runs]
     number = np.concatenate([np.full(len(p), float(k)) for k, (p, _) in enumerate(data)])
     return np.concatenate([p for p, _ in data]), np.concatenate([y for _, y in data]), number
 
 
-def _beyond(case: Case, found: Discovery, scatter: _Scatter) -> bool:
-    """Whether what was found moves the places by more than their repeats allow, and no name is smaller than its own U.
+def _exceeds_scatter(case: Case, found: Discovery, scatter: _Scatter) -> bool:
+    """Whether the finding moves the places by more than their repeats allow, and every named effect exceeds its own U.
 
-    Names by what they change, a lack of fit by what is left.
+    Named effects count by what they change, a lack of fit by what remains.
     """
     if any(abs(e.strength) <= 2.0 * e.u_strength for e in found.effects):
         return False
@@ -127,9 +127,9 @@ def _beyond(case: Case, found: Discovery, scatter: _Scatter) -> bool:
 
 
 def _scale(case: Case) -> tuple[Fitted, ...]:
-    """Scale of the axis, which the present simulation fits: no search looks for it, and yet these runs show it.
+    """Scale of the axis, um/m, which the present simulation fits and no search looks for.
 
-    By least squares together with a zero of every run and a lost motion that changes along the axis.
+    Least squares, together with a zero of every run and a lost motion that varies along the axis.
     """
     runs = case.of("identify")
     look = runs[0].path.look[0]

@@ -12,7 +12,7 @@ FORMAT = "abbe-discovery/1"
 
 
 def answer_doc(finding: Finding) -> dict[str, Any]:
-    """Plain JSON, lengths of gaps in µm, predictions of every sealed run in mm."""
+    """JSON of a finding: gaps in µm, predictions of every sealed run in mm."""
     held, fitted, test = finding.gaps.get("holdout"), finding.gaps.get("identify"), finding.next_test
     doc: dict[str, Any] = {
         "format": FORMAT,
@@ -62,5 +62,5 @@ def _next_test(test: NextTest) -> dict[str, Any]:
 
 
 def where_doc(where: Localization) -> dict[str, Any]:
-    """What is known of the place, without the table of tests."""
+    """The known fields of a location, without the table of significance tests."""
     return {k: v for k, v in asdict(where).items() if k != "table" and v not in (None, (), [], "")}

@@ -11,9 +11,9 @@ from abbe.service.effects.axis_test import is_axis_test
 
 
 def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
-    """Find what a case's present model lacks (`abbe.models.discovery.discover`), and tell how far it is and how long it will take.
+    """Find what a case's present model lacks (`abbe.models.discovery.discover`), and report progress and remaining time to ``sink``.
 
-    In a positioning test of one axis alone repeats are asked for a drift first (`abbe.service.discovery.axis_search`).
+    A positioning test of one axis is first searched for a drift of its repeats (`abbe.service.discovery.axis_search`).
     """
     from abbe.models.discovery.discover import discover
     from abbe.service.discovery.axis_search import axis_discovery
@@ -21,10 +21,10 @@ def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Disco
     clock = SystemClock()
     begun = clock.monotonic_s()
 
-    def tell(text: str, share: float) -> None:
+    def report(text: str, share: float) -> None:
         spent = clock.monotonic_s() - begun
         sink(Progress("discover", share, 1.0, spent * (1.0 - share) / share if share > 0.0 else None, text))
 
-    found = (axis_discovery if is_axis_test(case) else discover)(case, effects, progress=tell)
+    found = (axis_discovery if is_axis_test(case) else discover)(case, effects, progress=report)
     sink(Progress("discover", 1.0, 1.0, 0.0, "done"))
     return found

@@ -1,7 +1,6 @@
-"""States of a discovery and how one follows from the other: FITTED, SUSPICIOUS, PROPOSED, TESTING, EXPLAINED or UNEXPLAINED.
+"""States of a discovery and their order: FITTED, SUSPICIOUS, PROPOSED, TESTING, EXPLAINED or UNEXPLAINED.
 
-Pure: from a finding to its steps. Every step says who decided and by which rule; the numbers are those of the finding, which the journal
-holds once.
+Pure functions from a finding to its steps. Every step states its reason and the rule of its decision.
 """
 
 from __future__ import annotations
@@ -24,20 +23,20 @@ FOLLOWS: dict[State | None, frozenset[State]] = {
 }
 ENDS = frozenset({"EXPLAINED", "UNEXPLAINED"})
 VISIBLE = 1.05
-"""Runs that judge must miss the floor by this factor before, else the effect does not show in them and they cannot judge."""
+"""Least gap of the judging runs over their noise floor before the fit; below it the effect does not show and they cannot judge."""
 CLOSED = 0.5
-"""Share of the gap (`GapUm.closed`) that must close on runs that judge. A wrong name closes it where it was fitted, not elsewhere."""
+"""Share of the gap (`GapUm.closed`) that must close on the judging runs. A wrong effect closes it on the fitted runs only."""
 LEFT = 1.5
-"""Names that nothing proves explain a gap only if they leave less than so many times the noise."""
+"""Unproved effects explain a gap only if they leave less than this multiple of the noise."""
 WORSE = 1.05
-"""No runs may have a larger gap after than before by this factor: a solution that has run away is no finding."""
+"""Largest ratio of the gap after to the gap before in any role: a diverged solution is no finding."""
 NEAR = 3.0
-"""Evidence (natural logarithm) by which a name must be ahead of every rival to enter the model book: twenty times as likely."""
+"""Lead in evidence (natural logarithm) over every rival that an effect needs for the model book: twenty times as likely."""
 NOT_CONFIRMED = "runs that judge do not agree better with the effect than without it"
 
 
 def after_fit(finding: Finding) -> Iterator[DiscoveryStep]:
-    """The states that follow FITTED, to the end; the first of them carries the finding."""
+    """The states from FITTED to the end; the first of them carries the finding."""
     if finding.verdict == "none":
         yield DiscoveryStep(state="EXPLAINED", why=nothing_missing(finding), finding=finding)
         return
@@ -53,7 +52,7 @@ def after_fit(finding: Finding) -> Iterator[DiscoveryStep]:
 
 
 def ending(finding: Finding, judged: Judgement) -> DiscoveryStep:
-    """Whether names that were judged so explain the gap."""
+    """The last state: whether the judged effects explain the gap."""
     if judged.proved is False:
         return DiscoveryStep(state="UNEXPLAINED", why=judged.against, judged=judged)
     if finding.verdict == "unknown":
@@ -65,7 +64,7 @@ def ending(finding: Finding, judged: Judgement) -> DiscoveryStep:
 
 
 def not_entered(finding: Finding, judged: Judgement) -> str | None:
-    """Why nothing of a finding enters the model book. None: it was proved, and no rival is nearly as likely; then `entering` does."""
+    """Why a finding stays out of the model book; None if it is proved and has no close rival, so that `entering` is added."""
     if judged.proved is not True:
         return f"it is not proved, {judged.rule}"
     if finding.beside:
@@ -80,7 +79,7 @@ def not_entered(finding: Finding, judged: Judgement) -> str | None:
 
 
 def with_proof(finding: Finding) -> Finding:
-    """A finding with what the judging runs say: a name that they do not confirm is a suspect, and the verdict "unknown"."""
+    """The finding with the result of the judging runs. Effects that they refute become suspects, and the verdict "unknown"."""
     if not finding.effects:
         return finding
     judged = judge(finding)
@@ -101,19 +100,19 @@ def with_proof(finding: Finding) -> Finding:
 
 
 def _names(finding: Finding) -> tuple[EffectFound, ...]:
-    """Effects that were named, or that were and are suspects now (`with_proof`)."""
+    """The named effects, or those that `with_proof` turned into suspects."""
     return finding.effects or finding.suspects
 
 
 def entering(finding: Finding) -> tuple[EffectFound, ...]:
-    """Effects that a proof is about: those that move readings. What makes them noisier closes no gap, here or in the next campaign."""
+    """Effects that can be proved, because they shift readings; effects that only add scatter close no gap, here or in a later campaign."""
     return tuple(e for e in finding.effects if e.kind == "mean")
 
 
 def judge(finding: Finding) -> Judgement:
-    """What the runs say that only judge: how much of the gap closes on them, and whether that proves the finding.
+    """How much of the gap closes on the runs that only judge, and whether that proves the finding.
 
-    Where they cannot judge, names that leave the fitted runs a gap of `LEFT` times the noise are not believed either.
+    If they cannot judge, effects that leave the fitted runs a gap above `LEFT` times the noise are rejected too.
     """
     moving = any(e.kind == "mean" for e in _names(finding))
     found = _judged(finding, moving=moving)

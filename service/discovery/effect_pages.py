@@ -1,11 +1,11 @@
-"""The catalogue of effects as a table, and one effect as a page of words."""
+"""The catalogue of effects as a table, and the description of one effect."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from abbe.models.effects.effect import Effect
-from abbe.service.discovery.discovery_words import ADDS, unit
+from abbe.service.discovery.discovery_text import ADDS, unit
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.rendering.numbers import plain
 
@@ -13,7 +13,7 @@ HEADINGS = ("name", "what it is", "sits at", "usual size", "taken out by")
 
 
 def effect_row(effect: Effect) -> tuple[str, ...]:
-    """One line of the table."""
+    """Cells of `HEADINGS`."""
     return (effect.name, effect.title, _keys(effect), _usual(effect), REMEDIES[effect.remedy])
 
 
@@ -28,7 +28,7 @@ def _usual(effect: Effect) -> str:
 
 
 def effect_lines(effect: Effect) -> list[tuple[str, str]]:
-    """One effect's page: heading and text."""
+    """The description of one effect: pairs of heading and text."""
     lines = [
         ("what it is", effect.title),
         ("name", effect.name),
@@ -45,12 +45,12 @@ def effect_lines(effect: Effect) -> list[tuple[str, str]]:
         lines.append(("may be bent by", ", ".join(f.name for f in effect.forms)))
     lines += [("taken out by", REMEDIES[effect.remedy]), ("what to do", effect.remedy_text)]
     for rival, adds in effect.separated_by.items():
-        lines.append((f"told from {rival} by", "; or ".join(ADDS.get(a, a) for a in adds)))
+        lines.append((f"distinguished from {rival} by", "; or ".join(ADDS.get(a, a) for a in adds)))
     return [*lines, ("source", effect.source)]
 
 
 def effect_doc(effect: Effect) -> dict[str, Any]:
-    """One effect for programs."""
+    """One effect as JSON."""
     return {
         "name": effect.name,
         "title": effect.title,

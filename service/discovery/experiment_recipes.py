@@ -1,4 +1,4 @@
-"""From a proposed measurement to recipes that the sequencer can run, laid beside what the campaign has measured already."""
+"""Turn a proposed measurement into recipes for the sequencer, based on the runs that the campaign already has."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from abbe.service.sequences.recipes.recipe import MIN_TURNS, Diagonal, Helix, Li
 from abbe.service.sequences.steps import CampaignPlan, TestPlan
 
 Maker = Callable[[Helix, str], list[Recipe]]
-"""From a helix that was measured, and what labels begin with, to recipes."""
+"""Makes recipes from a measured helix and the prefix of their labels."""
 SHORTER = 0.6
 SLOW = 0.4
-"""The second feed is slower: no machine is asked for more than it was asked before."""
+"""Ratio of the second feed to the first: slower, so that no machine has to exceed a feed that it has already run."""
 DENSER = 2.0
-"""A path through a place has this many times the turns."""
+"""Factor on the number of turns of a path through a given place."""
 EQUATOR = 0.05
-"""A place that is seen lower than the equator by less than this (sine of the angle) is still on the same half."""
+"""A place below the equator by less than this (sine of the angle) still belongs to the upper half."""
 KNOWN = (
     "centre_mm", "radius_mm", "turns", "axis", "opens", "law", "even", "chord_mm", "rate_hz", "length_calibrated", "u_length_mm",
 )  # fmt: skip
-"""What a stored set-up says of its helix: without one of these nobody knows what path it was, or with what bar."""
+"""Keys of a stored set-up that define its helix: without all of them the path or the bar is unknown."""
 NO_HELIX = "the run is no helix: the sequencer repeats nothing else"
 NO_PATH = "what is stored of the helix does not say what path it was, or it was of another tool"
 TURNED = "somebody has to turn the bar or change its ball in between"
@@ -41,8 +41,8 @@ TURNED = "somebody has to turn the bar or change its ball in between"
 class NextPlan:
     """What the machine measures next, and what a person has to do.
 
-    ``plan``: None if nothing of it can be run. ``by_hand``: additions that a person has to see to, with the reason where it is not that the
-    sequencer has no such test. ``after_s``: the last reading is to be so old when the plan begins: what comes late has to come late.
+    ``plan``: None if the sequencer can run none of it. ``by_hand``: additions for a person, with the reason unless the sequencer has no
+    such test. ``after_s``: least age of the last reading at the start of the plan, s, for a repeat late in the session.
     """
 
     plan: CampaignPlan | None
@@ -59,17 +59,17 @@ def next_plan(
     max_feed_mm_min: float,
     about: Localization | None = None,
 ) -> NextPlan:
-    """Recipes for what a discovery wants to have added (``next_test.adds``).
+    """Recipes for the additions that a discovery proposes (``next_test.adds``).
 
     Parameters
     ----------
     runs : list of dict
-        What was measured so far: second feeds and late repeats are of the first helix of it, exactly as it was.
+        The measured runs. A second feed or a late repeat uses the path of their first helix.
     name : tuple of str
-        Of the new campaign, and what its labels and set-ups begin with, so that they can stand beside the old ones.
-    about : Where, optional
-        Where something without a name lives (``where`` of a finding, ``runs`` the one that is to be measured again): a helix is repeated
-        several times in one set-up, any other run by hand; another radius passes through its place.
+        Name of the new campaign, and the prefix of its labels and set-ups, which keeps them distinct from the old ones.
+    about : Localization, optional
+        Location of an unnamed effect (``where`` of a finding; its ``runs`` is the run to repeat). A helix is repeated several times in one
+        set-up, any other run by hand; a second radius passes through the location.
     """
     tests: list[TestPlan] = []
     by_hand, after_s = [], 0.0
@@ -86,12 +86,12 @@ def next_plan(
 def _tests(
     add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: Localization | None
 ) -> tuple[TestPlan, ...] | str:
-    """The tests of one addition, or what a person reads who has to see to it."""
+    """The tests of one addition, or the text for the person who has to do it."""
     make = MAKERS.get(add)
     if make is None:
         return add
     place = None if about is None else about.position_mm
-    like = _first_helix(machine, [] if add in LASER else runs if about is None else _showing(runs, about))
+    like = _first_helix(machine, [] if add in LASER else runs if about is None else _repeats_first(runs, about))
     if about is not None:
         if add == "ballbar":
             return f"{add} ({TURNED})"
@@ -107,7 +107,7 @@ def _tests(
 def _within(
     add: str, machine: Machine, recipes: list[Recipe], max_feed_mm_min: float, place: tuple[float, float, float] | None
 ) -> tuple[TestPlan, ...] | str:
-    """The tests of recipes inside the strokes; a sphere of another radius that has no room may be smaller still."""
+    """The tests of recipes inside the strokes; a second radius without room is halved once."""
     tries = [recipes]
     if add == "second_radius":
         tries.append([_shrunk(r, 0.5, place) if isinstance(r, Helix) else r for r in recipes])
@@ -124,17 +124,17 @@ def _within(
 
 
 def _is_helix(runs: list[dict[str, Any]], about: Localization) -> bool:
-    """Whether the run that is to be measured again is a helix."""
+    """Whether the run to repeat is a helix."""
     return "ballbar_helix" in [r["test"] for r in runs if r.get("run_id") in about.runs]
 
 
-def _showing(runs: list[dict[str, Any]], about: Localization) -> list[dict[str, Any]]:
-    """Runs, first those that are to be measured again."""
+def _repeats_first(runs: list[dict[str, Any]], about: Localization) -> list[dict[str, Any]]:
+    """All runs, those to repeat first."""
     return sorted(runs, key=lambda run: run.get("run_id") not in about.runs)
 
 
 def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None) -> Helix:
-    """A helix with a shorter bar about the same centre; about one nearer to a place, so that its sphere still passes there."""
+    """A helix with a shorter bar about the same centre, or about one nearer to ``place``, so that the sphere still passes through it."""
     if place is None:
         return replace(helix, radius_mm=scale * helix.radius_mm)
     at, centre = np.asarray(place, dtype=np.float64), np.asarray(helix.centre_mm, dtype=np.float64)
@@ -145,7 +145,7 @@ def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None
 
 
 def _through(place: tuple[float, float, float] | None, like: Helix, name: str) -> list[Recipe]:
-    """Twice the turns on another sphere through a place; without one, another radius as usual."""
+    """A denser helix on another sphere through ``place``; without one, the usual second radius."""
     if place is None:
         return _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm)
     near = _shrunk(like, SHORTER, place)
@@ -155,7 +155,7 @@ def _through(place: tuple[float, float, float] | None, like: Helix, name: str) -
 
 
 def _repeats(like: Helix, name: str) -> list[Recipe]:
-    """There, back and there again in one set-up: each starts where the one before ends."""
+    """Three runs in alternating direction in one set-up; each starts where the previous one ends."""
     ways: tuple[Literal[1, -1], ...] = (1, -1, 1) if like.direction > 0 else (-1, 1, -1)
     last = len(ways) - 1
     return [
@@ -165,15 +165,15 @@ def _repeats(like: Helix, name: str) -> list[Recipe]:
 
 
 def _first_helix(machine: Machine, runs: list[dict[str, Any]]) -> Helix | None:
-    """The first helix of the campaign as a recipe; None: nobody can tell what it was. Without any, the one that verifies tables."""
+    """The first helix of the campaign as a recipe, None if it cannot be repeated; without any helix, the one that verifies tables."""
     for run in runs:
         if run["test"] == "ballbar_helix":
-            return _again(machine, run)
+            return _recipe_of(machine, run)
     return replace(verification_helix(machine), role="identify")
 
 
-def _again(machine: Machine, run: dict[str, Any]) -> Helix | None:
-    """A stored helix as a recipe; None where its set-up does not say all of it, or says what this machine cannot repeat."""
+def _recipe_of(machine: Machine, run: dict[str, Any]) -> Helix | None:
+    """A stored helix as a recipe; None if its set-up is incomplete or this machine cannot repeat it."""
     setup, columns = run["setup"], run["columns"]
     if any(setup.get(key) is None for key in KNOWN) or setup["turns"] < MIN_TURNS:
         return None
@@ -210,6 +210,6 @@ MAKERS: dict[str, Maker] = {
     "laser_diagonals": _diagonals,
     "single_axis_laser": _lines,
 }
-"""What the sequencer can run. Circles in the planes, other tools, angular optics and references are a person's work."""
+"""Additions that the sequencer can run. A person does circles in the planes, other tools, angular optics and references."""
 LASER = ("laser_diagonals", "single_axis_laser")
-"""What needs no helix to be like."""
+"""Additions that need no measured helix."""

@@ -1,4 +1,4 @@
-"""What a search has found, as the record that is stored, reported and drawn without computing it again."""
+"""The result of a search as the record that is stored, reported and drawn."""
 
 from __future__ import annotations
 
@@ -31,12 +31,10 @@ from abbe.service.domain.packed_arrays import PackedCovariance, PackedReadings
 def finding_of(
     found: Discovery, case: Case, effects: tuple[Effect, ...], known_mm: Mapping[str, F1], thinning: FoundThinning | None = None
 ) -> Finding:
-    """Everything that is kept of a discovery, with what the judging runs say of it.
+    """The record of a discovery, including the result of the judging runs.
 
-    Parameters
-    ----------
-    known_mm : what the model book knew already, taken out before; it is added to the predictions again.
-    thinning : what became of long runs before the search; None: they were searched as they were read.
+    ``known_mm``: contribution of the model book's effects, mm by run label, which was subtracted before the search and is added to the
+    predictions again. ``thinning``: the decimation of long runs; None without any.
     """
     by_name = {e.name: e for e in effects}
     found = replace(found, predicted_mm={label: v + known_mm[label] for label, v in found.predicted_mm.items()})
@@ -70,7 +68,7 @@ def finding_of(
 
 
 def effect_found(named: NamedEffect, effect: Effect, by_name: Mapping[str, Effect]) -> EffectFound:
-    """One named effect with what its catalogue entry tells people."""
+    """One named effect with the texts of its catalogue entry."""
     units = {p.name: p.unit for p in effect.shape}
     return EffectFound(
         label=named.label,
@@ -122,12 +120,12 @@ def _run(found: Discovery, run: CaseRun) -> RunFit:
 
 
 def noise_mm_of(noise_mm: Mapping[str, float], kind: str) -> float:
-    """Noise of one reading of an instrument, mm; where none of its runs was fitted and its own is unknown, that of the noisiest."""
+    """Noise of one reading of an instrument, mm; that of the noisiest instrument if none of its runs was fitted."""
     return noise_mm.get(kind, max(noise_mm.values()))
 
 
 def rms(residual_mm: F1) -> float:
-    """Root mean square of the readings that the instrument did not flag (NaN where it did)."""
+    """Root mean square of the residuals, mm, without flagged readings (NaN)."""
     kept = residual_mm[np.isfinite(residual_mm)]
     return float(np.sqrt(np.mean(kept**2))) if kept.size else 0.0
 

@@ -21,7 +21,7 @@ NAMES = {
 COVERAGE = 2.0
 
 
-def linear_words(store: Store, made: StoredProposal) -> str:
+def drift_text(store: Store, made: StoredProposal) -> str:
     """The linear error that changed most since the solution before, with U; without one before the largest there is. Empty: none is known.
 
     Only solutions that were measured with the same table in force are compared. What both share (the laser's wavelength) counts twice in U.

@@ -1,4 +1,4 @@
-"""Runs that were never fitted, where nothing is missing in the fitted ones: which of them disagree by more than chance."""
+"""Runs outside the fit that disagree by more than chance although nothing is missing in the fitted runs."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from abbe.models.discovery.answer import Agreement
 from abbe.service.domain.finding import Finding
 
 ALARM = 0.01
-"""Of campaigns in which nothing is missing so many give an alarm, over all their runs together."""
+"""False alarm rate per campaign, over all its runs together."""
 SHOWN = 4
-"""Runs that are named; the others are counted."""
+"""Number of runs that are listed by name; the others are counted."""
 
 
 def disagreeing(finding: Finding) -> list[Agreement]:
-    """Never fitted runs that are farther off than noise and prediction allow, the worst first (`abbe.models.discovery.agreement`)."""
+    """Runs outside the fit that deviate by more than noise and prediction allow, worst first (`abbe.models.discovery.agreement`)."""
     return [a for a in finding.agreement if a.p < ALARM]
 
 
 def nothing_missing(finding: Finding) -> str:
-    """What is explained where nothing is missing in the fitted runs: the runs that were never fitted too, or which of them not."""
+    """The verdict when nothing is missing in the fitted runs, with the other runs that disagree or could not be judged."""
     off, open_ = disagreeing(finding), _unjudged(finding)
     if not off and not open_:
         return "the present model explains all runs to their noise"
@@ -32,7 +32,7 @@ def nothing_missing(finding: Finding) -> str:
 
 
 def _unjudged(finding: Finding) -> str:
-    """Runs that were never fitted and that nothing could be said of, by the reason why; empty where there are none."""
+    """Runs outside the fit that could not be judged, grouped by reason; empty without any."""
     by_reason: dict[str, list[str]] = {}
     for u in finding.unjudged:
         by_reason.setdefault(u.why, []).append(u.run)
@@ -40,5 +40,5 @@ def _unjudged(finding: Finding) -> str:
 
 
 def _few(runs: list[str]) -> str:
-    """The first of them, and how many more there are."""
+    """The first `SHOWN` runs and the number of the others."""
     return ", ".join(runs[:SHOWN]) + (f" and {len(runs) - SHOWN} more" if len(runs) > SHOWN else "")

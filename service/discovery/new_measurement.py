@@ -1,4 +1,4 @@
-"""Whether a model holds on a measurement that was made after it: predicted from the old runs alone, judged on the new ones."""
+"""Validate a model on a later measurement: predict it from the old runs only and compare."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from abbe.service.domain.model_book import ModelVersion
 
 @dataclass(frozen=True)
 class NewMeasurement:
-    """The gap on all new runs together, and run by run: by the model as it was before, by the model with what was found."""
+    """The gap on all new runs together and by run, before and after the finding entered the model."""
 
     gap: GapUm
     runs: dict[str, GapUm]
 
 
-def judged_anew(
+def validate_on(
     old: Campaign, new: Campaign, effects: tuple[Effect, ...], model: ModelVersion | None, *, thin: Thin = thinned
 ) -> NewMeasurement:
     """Predict a new campaign from an old one and the model book, and compare.
@@ -33,20 +33,20 @@ def judged_anew(
     Parameters
     ----------
     old : Campaign
-        What the model was found in. Only its identify runs are fitted.
+        Campaign of the discovery. Only its identify runs are fitted.
     new : Campaign
-        Measured later with the controller's clock running on. Nothing of it is fitted but what only it can tell: the zero of every laser
-        run, and where the cup of a new set-up stands.
+        Measured later while the controller's clock kept running. Only its own set-up values are fitted: the zero of every laser run, and
+        the cup position of a new set-up.
     model : ModelVersion, optional
-        The book's version with what was found. None: nothing was found, and before and after are the same.
+        The book version with the finding. None: nothing was found, and before and after are equal.
 
     Raises
     ------
     CampaignRefused
-        A new run cannot be what it says, or is a copy of an old one.
+        The data of a new run contradict its description, or it is a copy of an old one.
     """
     fresh = replace(new, runs=[run | {"role": "holdout"} for run in new.runs])
-    both = replace(joined(old, fresh), name=old.name)  # of the old name: heat and instruments are still those of that session
+    both = replace(joined(old, fresh), name=old.name)  # under the old name: thermal and instrument effects of that session still apply
     plain = simulate(prepare(both, effects, thin=thin))
     known = plain if model is None else simulate(prepare(both, effects, model, thin=thin))
     labels = [run["run_id"] for run in new.runs]
@@ -56,8 +56,8 @@ def judged_anew(
 
 
 def _gap(labels: list[str], plain: Simulation, known: Simulation, kinds: dict[str, str]) -> GapUm:
-    floor = np.concatenate([np.full(known.left_mm[k].size, noise_mm_of(known.noise_mm, kinds[k])) for k in labels])
-    before, after = ([simulation.left_mm[k] for k in labels] for simulation in (plain, known))
+    floor = np.concatenate([np.full(known.residual_mm[k].size, noise_mm_of(known.noise_mm, kinds[k])) for k in labels])
+    before, after = ([simulation.residual_mm[k] for k in labels] for simulation in (plain, known))
     return GapUm(before_um=_rms_um(before), after_um=_rms_um(after), floor_um=_rms_um([floor]))
 
 

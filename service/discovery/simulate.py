@@ -1,4 +1,4 @@
-"""What the present model says every run should read: fitted to the runs that may be fitted, the model book's effects included."""
+"""Predict every run with the present model, fitted to the identify runs, including the effects of the model book."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from abbe.service.domain.packed_arrays import PackedReadings
 FORMAT = "abbe-simulation/1"
 ROLES: tuple[Role, ...] = ("identify", "holdout")
 AGREE = 1.1
-"""Gap over noise up to which the two agree. Fitting and estimating the noise alone give up to 1.05."""
+"""Gap over noise up to which both agree. Fitting and noise estimation alone give up to 1.05."""
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """Readings of every run as the present model has them, and what measurement leaves of them.
+    """Predicted readings of every run and their residuals.
 
-    ``predicted_mm``: by run, sealed runs too, as the instrument would read it; ``left_mm``: reading less prediction once the runs have
-    set what is their own (the zero of a laser run, cup and bar length of a set-up that no fitted run shares), NaN where the
-    instrument flagged it; ``noise_mm``: of one reading, by instrument.
+    ``predicted_mm``: by run label, sealed runs included, as the instrument would read; ``residual_mm``: measured minus predicted, after
+    fitting each run's own set-up values (the zero of a laser run, cup and bar length of a set-up without a fitted run), NaN where the
+    instrument flagged the reading; ``noise_mm``: of one reading, by instrument.
     """
 
     predicted_mm: dict[str, F1]
-    left_mm: dict[str, F1]
+    residual_mm: dict[str, F1]
     noise_mm: dict[str, float]
 
 
@@ -41,24 +41,24 @@ def simulate(job: DiscoveryJob) -> Simulation:
     """Fit the present model to the identify runs and predict every run of the campaign."""
     problem = whiten(job.case, baseline_of(job.case))
     predicted = predictions(problem, solve(problem, ()))
-    seen = {r.path.setup for r in problem.runs}
-    left = left_together([r for r in job.case.runs if r.deviation_mm is not None], predicted, seen)
+    fitted_setups = {r.path.setup for r in problem.runs}
+    left = left_together([r for r in job.case.runs if r.deviation_mm is not None], predicted, fitted_setups)
     total = {label: p + job.known_mm[label] + job.table_mm.get(label, 0.0) for label, p in predicted.items()}
     return Simulation(total, left, {kind: c.sd_mm for kind, c in problem.colours.items()})
 
 
 def simulated_finding(job: DiscoveryJob, simulation: Simulation) -> Finding:
-    """The gap of every run and role: nothing was looked for, before and after are the same."""
+    """The gap of every run and role as a finding without a search: before and after are equal."""
     gaps: dict[str, GapUm] = {}
     for role in ROLES:
-        some = [r for r in job.case.of(role) if r.path.label in simulation.left_mm]
+        some = [r for r in job.case.of(role) if r.path.label in simulation.residual_mm]
         if some:
-            left = np.concatenate([simulation.left_mm[r.path.label] for r in some])
+            left = np.concatenate([simulation.residual_mm[r.path.label] for r in some])
             floor = np.concatenate([np.full(r.path.n, noise_mm_of(simulation.noise_mm, r.path.kind)) for r in some])
-            if np.isfinite(left).any():  # the instrument flagged every reading: nothing to compare
+            if np.isfinite(left).any():  # otherwise the instrument flagged every reading: nothing to compare
                 gap_um = rms(left) * 1e3
                 gaps[role] = GapUm(before_um=gap_um, after_um=gap_um, floor_um=rms(floor[np.isfinite(left)]) * 1e3)
-    packed = {label: PackedReadings.of(v) for label, v in simulation.left_mm.items()}
+    packed = {label: PackedReadings.of(v) for label, v in simulation.residual_mm.items()}
     return Finding(
         case=job.case.name,
         verdict="none",
@@ -71,7 +71,7 @@ def simulated_finding(job: DiscoveryJob, simulation: Simulation) -> Finding:
 
 def _run(run: CaseRun, simulation: Simulation) -> RunFit:
     floor_um = noise_mm_of(simulation.noise_mm, run.path.kind) * 1e3
-    left = simulation.left_mm.get(run.path.label)
+    left = simulation.residual_mm.get(run.path.label)
     gap_um = None if left is None else rms(left) * 1e3
     return RunFit(test=run.path.test, role=run.role, readings=run.path.n, floor_um=floor_um, rms_before_um=gap_um, rms_after_um=gap_um)
 
@@ -90,10 +90,10 @@ def simulation_doc(job: DiscoveryJob, simulation: Simulation) -> dict[str, Any]:
 
 
 def verdict_line(found: Finding) -> tuple[str, str, str]:
-    """Sign, word and sentence: how far the present model is from the readings. Whether that is more than chance, `abbe discover` says."""
+    """Sign, headline and text: the gap of the present model. `abbe discover` tests whether it exceeds chance."""
     worst = max((g.before_um / g.floor_um for g in found.gaps.values() if g.floor_um > 0.0), default=1.0)
     text = "; ".join(f"{role} runs {g.before_um:.2f} µm rms where {g.floor_um:.2f} µm is noise" for role, g in found.gaps.items())
     text = f"{text[:1].upper()}{text[1:]}."
     if worst < AGREE:
         return "ok", "Measured and simulated agree.", text
-    return "open", "Measured and simulated differ.", f"{text} What is missing, abbe discover looks for."
+    return "open", "Measured and simulated differ.", f"{text} abbe discover looks for what is missing."

@@ -1,4 +1,4 @@
-"""A positioning test of one axis alone: its repeats tell a slow drift, and which of several things drifts they cannot tell."""
+"""A positioning test of one axis: its repeats reveal a slow drift, but not which of several components drifts."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from abbe.models.effects.path import Path
 
 AXES = "XYZ"
 NEAR_MM = 0.05
-"""Positions closer than this are the same one, approached again."""
+"""Positions closer than this count as repeated visits of one position."""
 
 
 def _no_columns(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """It is judged by repeats alone and brings nothing into other campaigns."""
+    """No columns: only repeats judge this effect, and it contributes nothing to other campaigns."""
     return [np.zeros((p.n, 0)) for p in paths]
 
 
@@ -48,25 +48,25 @@ SLOW_DRIFT = Effect(
 
 
 def is_axis_test(case: Case) -> bool:
-    """Whether a campaign is a positioning test of one axis in one set-up, and nothing else."""
+    """Whether a campaign consists only of a positioning test of one axis in one set-up."""
     paths = [r.path for r in case.runs]
     beams = {tuple(np.round(np.abs(p.look[0]), 9)) for p in paths}
     return {p.test for p in paths} == {"laser_linear"} and len({p.setup for p in paths}) == 1 and len(beams) == 1
 
 
-def drift_found(case: Case) -> Discovery | None:
-    """What the repeats of an axis test say; None if no position was visited often enough.
+def axis_drift(case: Case) -> Discovery | None:
+    """Search the repeats of an axis test for a common drift; None if no position has enough visits.
 
-    Fitted to the identify runs; the holdout runs are predicted from their positions' means and the drift gone on.
+    The identify runs are fitted. The holdout runs are predicted from the mean of each position and the extrapolated drift.
     """
-    place, t, reading = _fitted(case)
+    place, t, reading = _identify_readings(case)
     drift = repeat_drift(place, t, reading)
     if drift is None:
         return None
     span = _drift_at(drift, t)
     judged = [r for r in case.runs if r.deviation_mm is not None]
-    before = {r.path.label: _left(r, place, reading, None) for r in judged}
-    after = {r.path.label: _left(r, place, reading - drift.drift_mm, span) for r in judged} if drift.named else before
+    before = {r.path.label: _residual_mm(r, place, reading, None) for r in judged}
+    after = {r.path.label: _residual_mm(r, place, reading - drift.drift_mm, span) for r in judged} if drift.named else before
     axis = AXES[int(np.argmax(np.abs(case.runs[0].path.look[0])))]
     where = Localization(tests=("laser_linear",), axes=(axis,), depends_on=("time",))
     table = (Significance("time", f"drift alike at all positions explains {drift.share:.0%} of the repeat variance", drift.share, drift.p),)
@@ -93,21 +93,21 @@ def drift_found(case: Case) -> Discovery | None:
 
 
 def drift_at(case: Case) -> dict[str, F1]:
-    """The drift that `drift_found` names at every reading of every run, mm, by label; it goes on beyond the fitted runs as it went last."""
-    place, t, reading = _fitted(case)
+    """Drift named by `axis_drift` at every reading of every run, mm, by run label; extrapolated linearly beyond the fitted runs."""
+    place, t, reading = _identify_readings(case)
     drift = repeat_drift(place, t, reading)
-    return {} if drift is None else {r.path.label: _gone_on(_drift_at(drift, t), r.path.at.t_s) for r in case.runs}
+    return {} if drift is None else {r.path.label: _extrapolated(_drift_at(drift, t), r.path.at.t_s) for r in case.runs}
 
 
-def _fitted(case: Case) -> tuple[F1, F1, F1]:
-    """Place, time and reading of the identify runs, in the order of time."""
+def _identify_readings(case: Case) -> tuple[F1, F1, F1]:
+    """Place, time and reading of the identify runs in chronological order."""
     runs = sorted(case.of("identify"), key=lambda r: float(r.path.at.t_s[0]))
     place, t, reading = (np.concatenate(v) for v in zip(*(_valid(r) for r in runs), strict=True))
     return place, t, reading
 
 
 def _named(drift: RepeatDrift, axis: str, where: Localization) -> NamedEffect:
-    tau = {} if drift.tau_s is None else {"tau_s": (drift.tau_s, drift.tau_s)}  # from a coarse list: known to a factor
+    tau = {} if drift.tau_s is None else {"tau_s": (drift.tau_s, drift.tau_s)}  # from a coarse grid: uncertain by a factor
     evidence = -0.5 * np.log(max(1.0 - drift.share, 1e-12)) * drift.drift_mm.size
     rivals = tuple((label, 0.0) for label in (f"spindle_thermal_drift:{axis}", "dead_path", f"axis_thermal_growth:{axis}"))
     size, u = drift.change_mm * 1e3, drift.u_change_mm * 1e3
@@ -120,38 +120,38 @@ def _next(axis: str) -> NextTest:
 
 
 def _valid(run: CaseRun) -> tuple[F1, F1, F1]:
-    """Place, time and reading of the readings that count."""
+    """Place, time and value of the valid readings."""
     assert run.deviation_mm is not None
     return places_of(run)[run.valid], run.path.at.t_s[run.valid], run.deviation_mm[run.valid]
 
 
 def places_of(run: CaseRun) -> F1:
-    """A number for position and side of every reading."""
+    """A number per reading that encodes its position and its side of approach, shape (n,)."""
     position = np.round(run.path.at.q_mm @ run.path.look[0] / NEAR_MM) * NEAR_MM
     return np.asarray(position + 1e6 * run.path.direction)
 
 
 def _drift_at(drift: RepeatDrift, t_s: F1) -> tuple[F1, F1]:
-    """Times and drift of the fitted readings, in the order of time."""
+    """Times and drift of the fitted readings in chronological order."""
     order = np.argsort(t_s, kind="stable")
     return t_s[order], drift.drift_mm[order]
 
 
 def _predicted(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
-    """Mean of the same place in the fitted runs, with the drift where there is one; beyond them it goes on as it went last."""
+    """Mean of the same place in the fitted runs plus the drift, if any, extrapolated linearly beyond them."""
     means = {p: float(level[place == p].mean()) for p in np.unique(place)}
     fallback = float(level.mean())
     out = np.array([means.get(p, fallback) for p in places_of(run)])
-    return out if drift is None else out + _gone_on(drift, run.path.at.t_s)
+    return out if drift is None else out + _extrapolated(drift, run.path.at.t_s)
 
 
-def _gone_on(drift: tuple[F1, F1], t_s: F1) -> F1:
+def _extrapolated(drift: tuple[F1, F1], t_s: F1) -> F1:
     t, d = drift
     slope = (d[-1] - d[-2]) / (t[-1] - t[-2]) if t[-1] > t[-2] else 0.0
     return np.asarray(np.interp(t_s, t, d) + slope * np.maximum(t_s - t[-1], 0.0))
 
 
-def _left(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
+def _residual_mm(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
     assert run.deviation_mm is not None
     return np.asarray(np.where(run.valid, run.deviation_mm - _predicted(run, place, level, drift), np.nan))
 

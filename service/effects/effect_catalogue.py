@@ -1,4 +1,4 @@
-"""All effects that are known by name: ours, and those that other packages offer (docs/how-to/own-effect.md)."""
+"""All named effects: built-in ones and those that other packages offer (docs/how-to/own-effect.md)."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ GROUP = "abbe.effects"
 
 @dataclass(frozen=True)
 class Plugins:
-    """Effects of other packages that passed the self-test, and why others were left out."""
+    """Plug-in effects that passed the self-test, and one error per rejected plug-in."""
 
     effects: tuple[Effect, ...]
     broken: tuple[EffectPluginBroken, ...]
 
 
 def catalogue() -> tuple[Effect, ...]:
-    """All effects that are known by name: ours, then those of other packages that passed the self-test."""
+    """All named effects: the built-in ones, then the plug-ins that passed the self-test."""
     return CATALOGUE + plugins().effects
 
 
 @cache
 def plugins() -> Plugins:
-    """Effects of other packages, looked up once per process, and why some were left out."""
+    """Plug-in effects, looked up once per process, and the rejected plug-ins."""
     return installed(e.name for e in CATALOGUE)
 
 
@@ -46,7 +46,7 @@ def effect_named(name: str) -> Effect:
     Raises
     ------
     EffectUnknown
-        There is none; what is spelt alike is told.
+        The catalogue has no such effect; the error suggests similar names.
     """
     found = {e.name: e for e in (*catalogue(), SLOW_DRIFT)}
     if name not in found:
@@ -58,17 +58,10 @@ def effect_named(name: str) -> Effect:
 
 
 def installed(known: Iterable[str]) -> Plugins:
-    """All effects that installed packages offer.
+    """All effects that installed packages offer; ``known``: names that the catalogue already uses.
 
-    Parameters
-    ----------
-    known : names that are taken: the catalogue's.
-
-    Returns
-    -------
-    Plugins
-        Never raises for what a plug-in does: one that cannot be imported, is no effect, has a name that is taken or fails the self-test of
-        the catalogue (`abbe.models.effects.self_test`) is left out, with one error that names it.
+    A faulty plug-in never raises. One that cannot be imported, is no `Effect`, reuses a name or fails the self-test
+    (`abbe.models.effects.self_test`) is left out, and one error names it.
     """
     taken, effects, broken = set(known), [], []
     for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value)):
@@ -86,7 +79,7 @@ def installed(known: Iterable[str]) -> Plugins:
 def _load(entry: EntryPoint) -> list[Effect]:
     try:
         thing: Any = entry.load()
-    except Exception as fault:  # whatever a stranger's module does on import, it must not take the product down
+    except Exception as fault:  # an error in a foreign module must not end the program
         raise _left_out(entry, f"{type(fault).__name__}: {fault}") from fault
     found = list(thing) if isinstance(thing, tuple | list) else [thing]
     for effect in found:
@@ -98,12 +91,12 @@ def _load(entry: EntryPoint) -> list[Effect]:
 
 
 def checked(effects: tuple[Effect, ...], taken: Iterable[str]) -> tuple[Effect, ...]:
-    """Effects that somebody gives by hand, after the self-test that plug-ins have to pass.
+    """Effects that a caller supplies, after the same self-test as plug-ins.
 
     Raises
     ------
     EffectPluginBroken
-        One breaks a rule, or has a name that is taken.
+        One breaks a rule, or reuses a name.
     """
     fault = _fault(list(effects), set(taken))
     if fault:
@@ -118,7 +111,7 @@ def _check(entry: EntryPoint, found: list[Effect], taken: set[str]) -> None:
 
 
 def _fault(found: list[Effect], taken: set[str]) -> str:
-    """The first rule that an effect breaks; empty: none."""
+    """The first rule that an effect breaks; empty if none."""
     names = [e.name for e in found]
     for effect in found:
         if effect.name in taken or names.count(effect.name) > 1:
@@ -126,7 +119,7 @@ def _fault(found: list[Effect], taken: set[str]) -> str:
         try:
             with np.errstate(all="ignore"):
                 faults = declaration_faults(effect) or signal_faults(effect, probe_paths())
-        except Exception as error:  # noqa: BLE001 - its own code runs here
+        except Exception as error:  # noqa: BLE001 - foreign code runs here
             return f"{effect.name}: {type(error).__name__}: {error}"
         if faults:
             return f"{effect.name}: {faults[0]}" + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else "")

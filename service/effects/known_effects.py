@@ -1,4 +1,4 @@
-"""Effects that a machine's model knows already: what they add to the readings of a campaign."""
+"""Effects that a machine's model already contains, and their contribution to the readings of a campaign."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from abbe.service.errors import ModelUnknown
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 LASTING = ("drive", "structure", "geometry")
-"""Families that stay with the machine. Heat has its own clock in every campaign, an instrument its own set-up: they are found anew."""
+"""Families that stay with the machine. Thermal and instrument effects differ between campaigns and are searched for anew."""
 
 
 def applies(entry: BookEffect, campaign: str) -> bool:
-    """Whether an effect of the model book is expected in a campaign's readings: it moves them, and it lasts or was found in just these."""
+    """Whether a book effect is expected in a campaign's readings: it shifts readings, and it is lasting or was found in this campaign."""
     moves = entry.kind == "mean" and len(entry.coefficients) > 0
     return moves and (entry.family in LASTING or entry.origin.campaign == campaign)
 
 
 def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case: Case) -> dict[str, F1]:
-    """Reading that known effects cause in every run, mm, by the run's label; runs of the case in their order.
+    """Contribution of known effects to the readings of every run, mm, by run label in the order of the case.
 
     Raises
     ------
     ModelUnknown
-        The catalogue has no such effect (any more), or it has another number of coefficients.
+        The catalogue no longer has the effect, or the effect has another number of coefficients.
     """
     total = {r.path.label: np.zeros(r.path.n) for r in case.runs}
     paths = tuple(r.path for r in case.runs)
@@ -59,7 +59,7 @@ def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case
 
 
 def _shown(columns: list[F2], count: int, fitted: Sequence[bool]) -> Mask:
-    """Which columns the coefficients are of, shape (k,): those that a fitted run shows, where not all of them."""
+    """Mask of the columns that the coefficients belong to, shape (k,): all of them, or those that a fitted run excites."""
     everything = np.ones(columns[0].shape[1], dtype=bool)
     if everything.size == count:
         return everything
@@ -68,7 +68,7 @@ def _shown(columns: list[F2], count: int, fitted: Sequence[bool]) -> Mask:
 
 
 def _usual(entry: EffectSize, coefficients: F1) -> float:
-    """What an instrument's new set-up is expected to have: the mean of the known ones where all agree in sign, else nothing."""
+    """Expected coefficient of an instrument's new set-up: the mean of the known ones if all have one sign, else zero."""
     alike = len(coefficients) > 1 and bool(np.all(coefficients > 0.0) or np.all(coefficients < 0.0))
     return float(np.mean(coefficients)) if entry.family == "instrument" and alike and not entry.forms else 0.0
 
@@ -82,6 +82,6 @@ def _columns(effect: Effect, entry: EffectSize, paths: tuple[Path, ...]) -> list
 
 
 def without(case: Case, known_mm: dict[str, F1]) -> Case:
-    """The case with what is known already taken out of its readings."""
+    """The case with the known contributions, mm by run label, subtracted from its readings."""
     runs = tuple(r if r.deviation_mm is None else replace(r, deviation_mm=r.deviation_mm - known_mm[r.path.label]) for r in case.runs)
     return replace(case, runs=runs)

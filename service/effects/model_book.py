@@ -1,4 +1,4 @@
-"""The model book: versions of what is known of a machine beyond its 21 error motions, where each effect came from, and the way back."""
+"""The model book: versions of a machine's effects beyond its 21 error motions, the origin of each effect, and reverting."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from abbe.service.errors import ModelUnknown
 from abbe.service.storage.store import Store
 
 ALIKE = 2.0
-"""Non-linear values that differ by less than so many standard uncertainties are the same: their columns are."""
+"""Non-linear values that differ by fewer standard uncertainties than this count as equal, so their columns are the same."""
 OPPOSITE = -0.8
-"""Cosine between two findings' coefficients from which on the later one takes the earlier back; one in part of them is another change."""
+"""Below this cosine between two findings' coefficients the later finding reverses the earlier one; above it, it is another change."""
 FORM = 0.1
-"""No machine is true to a formula: standard uncertainty of coefficients from their form, relative, as of a geometry's strength."""
+"""Relative standard uncertainty of coefficients because no machine follows a formula exactly, as for the strength of a geometry effect."""
 LOOK = "`abbe model list MACHINE` shows what there is"
 REMEDIES = {
     "table": "compensation tables",
@@ -36,7 +36,7 @@ REMEDIES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelSize:
-    """Strength of all entries of a label together and its standard uncertainty, in ``unit``."""
+    """Total strength of all entries of a label and its standard uncertainty, in ``unit``."""
 
     strength: float
     u: float
@@ -45,7 +45,7 @@ class LabelSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """A label that is new, gone or of another size in the second of two versions."""
+    """A label that the second of two versions adds, drops or resizes."""
 
     label: str
     before: LabelSize | None
@@ -53,21 +53,21 @@ class Difference:
 
     @property
     def what(self) -> str:
-        """In a word."""
+        """``new``, ``gone`` or ``changed``."""
         return "new" if self.before is None else "gone" if self.after is None else "changed"
 
     @property
     def unit(self) -> str:
-        """Of the sizes."""
+        """Unit of the sizes."""
         size = self.before or self.after
         return "" if size is None else size.unit
 
 
 def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
-    """How large several entries of one label are together: coefficients add up, a size without a sign (an rms, a length) does not.
+    """Total size of several entries of one label: coefficients add up, unsigned sizes (an rms, a length) do not.
 
-    Where values agree and no form was needed, the effect's own strength of the summed coefficients, stated whole as the
-    entries are (`Effect.unseen`); else, and for an effect that the catalogue does not have, the sum of the strengths.
+    If the non-linear values agree and no form was needed, the strength of the summed coefficients, scaled to the whole strength that the
+    entries state (`Effect.unseen`). Otherwise, and for an effect that is not in the catalogue, the sum of the strengths.
     """
     u, unit = float(np.hypot.reduce([e.u_strength for e in entries])), entries[-1].unit
     if effect is None or len(entries) == 1 or entries[0].forms or not _addable(entries):
@@ -80,10 +80,10 @@ def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
 
 
 def cancels(entries: Sequence[EffectSize], by_name: Mapping[str, Effect]) -> bool:
-    """Whether the entries of a label are nothing together within their uncertainty: what was found there was mended.
+    """Whether the entries of a label add up to zero within their uncertainty, that is, the cause was repaired.
 
-    Strengths of opposite sign cancel as numbers. Sizes without a sign never do, however unsure; their coefficients do where they point
-    against each other and what is left is no more than their noise.
+    Signed strengths cancel as numbers. Unsigned sizes never do, however uncertain; they cancel if their coefficients have opposite
+    directions and the remainder does not exceed the noise.
     """
     strengths = [e.strength for e in entries]
     if min(strengths) < 0.0 < max(strengths):
@@ -102,7 +102,7 @@ def cancels(entries: Sequence[EffectSize], by_name: Mapping[str, Effect]) -> boo
 
 
 def _addable(entries: Sequence[EffectSize]) -> bool:
-    """Whether all entries have coefficients of the same columns."""
+    """Whether the coefficients of all entries belong to the same columns."""
     first = entries[0]
     return bool(first.coefficients) and all(
         len(e.coefficients) == len(first.coefficients) and e.forms == first.forms and _alike(e, first) for e in entries
@@ -121,7 +121,7 @@ def _coefficients(entry: EffectSize) -> F1:
 
 
 def versions(store: Store, machine: str | None = None) -> list[ModelVersion]:
-    """All versions of a machine's model, or of all machines, oldest first."""
+    """All versions of one machine's model, or of all machines' models, oldest first."""
     return [_parsed(one) for one in store.models.all(machine)]
 
 
@@ -131,7 +131,7 @@ def _parsed(one: ModelRecord) -> ModelVersion:
 
 
 def current(store: Store, machine: str) -> ModelVersion | None:
-    """The newest version of a machine's model; None if its book is empty."""
+    """The newest version of a machine's model; None without any."""
     found = store.models.all(machine)
     return _parsed(found[-1]) if found else None
 
@@ -142,7 +142,7 @@ def version(store: Store, machine: str, number: int) -> ModelVersion:
     Raises
     ------
     ModelUnknown
-        There is no such version, or no book of this machine.
+        The machine has no such version, or no model.
     """
     known = store.models.all(machine)
     found = next((m for m in known if m.version == number), None)
@@ -152,20 +152,20 @@ def version(store: Store, machine: str, number: int) -> ModelVersion:
     return _parsed(found)
 
 
-def grown(
+def extended_book(
     base: ModelVersion | None, finding: Finding, source: FindingSource, discovery: int | None, effects: tuple[Effect, ...] = ()
 ) -> ModelBook:
-    """The version that a finding brings: the known effects, and the new ones with the provenance of each.
+    """The book after a finding: the known effects and the new ones, each with its provenance.
 
-    An effect that was taken out of the readings before stays and what was found beside it is added; one that is found anew in every
-    campaign (heat, instruments) replaces its older entry. What adds up to nothing within its uncertainty was repaired and leaves the book.
+    An effect that was subtracted from the readings stays, and the finding is added to it. A thermal or instrument effect replaces its older
+    entry. A label whose entries cancel within their uncertainty was repaired and leaves the book.
 
     Parameters
     ----------
     discovery : int, optional
-        Number of the discovery that found it.
+        Number of the discovery that made the finding.
     effects : tuple of Effect
-        The catalogue: how large the sum of two findings of one label is (`total`).
+        The catalogue, which defines the size of several findings of one label (`total`).
     """
     origin = Origin(campaign=source.campaign, discovery=discovery)
     new = [_entry(e, origin) for e in finding.effects]
@@ -190,7 +190,7 @@ def _entry(effect: EffectFound, origin: Origin) -> BookEffect:
 
 
 def _without_repaired(entries: list[BookEffect], effects: tuple[Effect, ...]) -> tuple[tuple[BookEffect, ...], tuple[str, ...]]:
-    """Entries without the labels whose parts cancel within their uncertainty, and these labels."""
+    """Entries without the repaired labels (`cancels`), and these labels."""
     by_name = {e.name: e for e in effects}
     labels = dict.fromkeys(e.label for e in entries)
     gone = tuple(label for label in labels if cancels([e for e in entries if e.label == label], by_name))
@@ -198,14 +198,14 @@ def _without_repaired(entries: list[BookEffect], effects: tuple[Effect, ...]) ->
 
 
 def revert(store: Store, machine: str, number: int) -> int:
-    """Make an older version the current one again. Nothing is deleted: it is appended as a new version.
+    """Append a copy of an older version as the current one; nothing is deleted.
 
     Raises
     ------
     ModelUnknown
-        There is no such version, or it is the current one.
+        The version does not exist, or is the current one.
     ModelMovedOn
-        A newer version was added meanwhile; nothing is written.
+        Another process added a version meanwhile; nothing is written.
     """
     old, newest = version(store, machine, number), current(store, machine)
     if newest is None or newest.version == number:
@@ -215,7 +215,7 @@ def revert(store: Store, machine: str, number: int) -> int:
 
 
 def differences(first: ModelVersion, second: ModelVersion, effects: tuple[Effect, ...] = ()) -> list[Difference]:
-    """What the second version has more, less or of another size than the first, by label; strengths in the effect's unit."""
+    """Labels that the second version adds, drops or resizes; strengths in the effect's unit."""
     by_name = {e.name: e for e in effects}
     before, after = _sizes(first, by_name), _sizes(second, by_name)
     found = [Difference(label=label, before=before.get(label), after=after.get(label)) for label in dict.fromkeys((*before, *after))]
@@ -223,7 +223,7 @@ def differences(first: ModelVersion, second: ModelVersion, effects: tuple[Effect
 
 
 def _sizes(one: ModelVersion, by_name: dict[str, Effect]) -> dict[str, LabelSize]:
-    """Size of every label; entries of one label add up."""
+    """Total size by label."""
     same: dict[str, list[BookEffect]] = {}
     for e in one.book.effects:
         same.setdefault(e.label, []).append(e)
@@ -231,11 +231,11 @@ def _sizes(one: ModelVersion, by_name: dict[str, Effect]) -> dict[str, LabelSize
 
 
 def no_table_lines(known: ModelVersion | None) -> list[str]:
-    """Effects of the current model that no static table takes out, with what does: for people who are about to write tables."""
+    """One line for each effect of the current model that no static table corrects, with its remedy."""
     if known is None:
         return []
     return [
-        f"{e.words} (model version {known.version}) is no matter for tables but for {REMEDIES[e.remedy]}: {e.remedy_text}"
+        f"{e.words} (model version {known.version}) needs {REMEDIES[e.remedy]}, not tables: {e.remedy_text}"
         for e in known.book.effects
         if e.remedy != "table"
     ]

@@ -1,1 +1,1 @@
-"""From a campaign to error motions with uncertainty: solved, judged, stored, predicted from."""
+"""From a campaign to error motions with uncertainty: solve, judge, store and predict."""

@@ -1,4 +1,4 @@
-"""What a table cannot take out is taken out of the readings before tables are made from them, and named with its remedy."""
+"""Subtract the effects that a table cannot correct from the readings before tables are made, and name the remedy of each."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 
 from abbe.models.effects.effect import Effect
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.campaign_data.provenance import changed, machine_digest
+from abbe.service.campaign_data.provenance import machine_digest, with_changed_columns
 from abbe.service.domain.finding import EffectSize
 from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.known_effects import applies, readings_of
 from abbe.service.effects.model_book import current, no_table_lines
-from abbe.service.identification.table_removal import TableThen, as_left
+from abbe.service.identification.table_removal import CampaignTable, remove_table
 from abbe.service.runs.cases import case_of
 from abbe.service.storage.store import Store
 
 
 @dataclass(frozen=True)
-class TakenOut:
-    """Runs without what the model book says is no matter for tables.
+class RemovedEffects:
+    """A campaign without the effects that tables cannot correct.
 
-    ``labels``: the effects that were taken out of the readings; ``lines``: every effect that a table cannot take out, with its remedy, or
-    why the book was not used; ``version``: of the model, None without a book; ``in_force``: the table whose side effects were taken out
-    (`abbe.service.identification.table_removal.as_left`), None for none; ``not_taken``: why those of a table are still in the readings,
-    empty if they are not.
+    ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the book was not used;
+    ``version``: of the model, None without a book; ``in_force``: the active table whose side effects were subtracted
+    (`abbe.service.identification.table_removal.remove_table`), None without one; ``not_removed``: why the side effects of a table remain
+    in the readings, empty otherwise.
     """
 
     campaign: Campaign
@@ -36,68 +36,70 @@ class TakenOut:
     lines: tuple[str, ...]
     version: int | None
     in_force: TableTakenOut | None = None
-    not_taken: str = ""
+    not_removed: str = ""
 
     @property
     def doc(self) -> dict[str, Any]:
-        """For the document of a solution; empty without a book and without a table."""
-        told: dict[str, Any] = {} if self.in_force is None else {"table_taken_out": self.in_force.model_dump(mode="json")}
-        told |= {"table_not_taken_out": self.not_taken} if self.not_taken else {}
+        """Part of a solution's document; empty without a book and without a table."""
+        doc: dict[str, Any] = {} if self.in_force is None else {"table_taken_out": self.in_force.model_dump(mode="json")}
+        doc |= {"table_not_taken_out": self.not_removed} if self.not_removed else {}
         if self.version is None:
-            return told
-        return told | {"machine_model": {"version": self.version, "taken_out": list(self.labels), "not_for_tables": list(self.lines)}}
+            return doc
+        return doc | {"machine_model": {"version": self.version, "taken_out": list(self.labels), "not_for_tables": list(self.lines)}}
 
 
-def taken_out(store: Store, campaign: Campaign, then: TableThen, effects: tuple[Effect, ...] | None = None) -> TakenOut:
-    """Take what is no matter for tables out of a campaign's readings.
+def remove_effects(store: Store, campaign: Campaign, table: CampaignTable, effects: tuple[Effect, ...] | None = None) -> RemovedEffects:
+    """Subtract from a campaign's readings what tables cannot correct.
 
-    That is what the table ``then``, in force while it was measured, did beyond smooth corrections, and lasting effects whose remedy is no
-    table, as the machine's current model has them.
+    That is the effect of ``table``, active during the measurement, beyond smooth corrections, and the lasting effects of the
+    machine's current model whose remedy is not a table.
 
     Raises
     ------
     CampaignRefused
-        A table was in force, and a run cannot be what it says.
+        A table was active, and the data of a run contradict its description.
     ModelUnknown
-        The book knows an effect that this catalogue does not.
+        The book contains an effect that is not in the catalogue.
     """
-    left = as_left(campaign, then.table)
-    return replace(_less_known(store, left, effects), in_force=left.removed, not_taken=then.why)
+    left = remove_table(campaign, table.table)
+    return replace(_without_book_effects(store, left, effects), in_force=left.removed, not_removed=table.why)
 
 
-def _less_known(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None) -> TakenOut:
+def _without_book_effects(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None) -> RemovedEffects:
     record = current(store, campaign.site.name)
     if record is None:
-        return TakenOut(campaign, (), (), None)
+        return RemovedEffects(campaign, (), (), None)
     if record.book.machine_digest != machine_digest(campaign.site.machine):
         line = f"model version {record.version} of {campaign.site.name} is of another geometry and was not used"
-        return TakenOut(campaign, (), (line,), record.version)
+        return RemovedEffects(campaign, (), (line,), record.version)
     chosen = [e for e in record.book.effects if e.remedy != "table" and applies(e, campaign.name)]
     lines = tuple(no_table_lines(record))
     if not chosen:
-        return TakenOut(campaign, (), lines, record.version)
-    left = less_effects(campaign, chosen, f"model version {record.version}", effects)
-    return TakenOut(left, tuple(e.label for e in chosen), lines, record.version)
+        return RemovedEffects(campaign, (), lines, record.version)
+    left = subtract_effects(campaign, chosen, f"model version {record.version}", effects)
+    return RemovedEffects(left, tuple(e.label for e in chosen), lines, record.version)
 
 
-def less_effects(campaign: Campaign, entries: Sequence[EffectSize], whose: str, effects: tuple[Effect, ...] | None = None) -> Campaign:
-    """A campaign without what named effects do to its readings; ``whose``: in words, where they are from.
+def subtract_effects(campaign: Campaign, entries: Sequence[EffectSize], origin: str, effects: tuple[Effect, ...] | None = None) -> Campaign:
+    """Subtract the contribution of named effects from a campaign's readings; ``origin``: their origin, for the record of each run.
 
     Raises
     ------
     ModelUnknown
-        The catalogue does not know one of them.
+        One of them is not in the catalogue.
     """
     if not entries:
         return campaign
     case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
     known_mm = readings_of(entries, effects or catalogue(), case)
-    words = f"{whose}: {', '.join(e.label for e in entries)}"
-    return replace(campaign, runs=[_less(run, known_mm[run["run_id"]], words) for run in campaign.runs])
+    removed = f"{origin}: {', '.join(e.label for e in entries)}"
+    return replace(campaign, runs=[_subtracted(run, known_mm[run["run_id"]], removed) for run in campaign.runs])
 
 
-def _less(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]], words: str) -> dict[str, Any]:
+def _subtracted(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]], removed: str) -> dict[str, Any]:
     reading = run["columns"]["deviation_mm"]
     if reading is None:
         return run
-    return changed(run, run["columns"] | {"deviation_mm": (np.asarray(reading, dtype=np.float64) - known_mm).tolist()}, words)
+    return with_changed_columns(
+        run, run["columns"] | {"deviation_mm": (np.asarray(reading, dtype=np.float64) - known_mm).tolist()}, removed
+    )

@@ -1,4 +1,4 @@
-"""Where many independent jobs are computed: here, in processes of this computer, or on a Dask cluster. What a job gives is the same."""
+"""Executors for many independent jobs: in this process, in processes of this computer, or on a Dask cluster, with the same results."""
 
 from __future__ import annotations
 
@@ -16,57 +16,46 @@ R = TypeVar("R")
 
 
 class Executor(Protocol):
-    """Does jobs. Function, jobs and results are handed to other processes: a function of a module, and plain values."""
+    """Runs jobs. The function must belong to a module, and jobs and results must be plain values, because other processes receive them."""
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
-        """Results in the order of the jobs. An error of a job is raised when its turn comes."""
+        """Results in the order of the jobs. The error of a job is raised in place of its result."""
         ...
 
 
-class Here:
-    """One after the other in this process."""
+class SerialExecutor:
+    """Runs jobs one after the other in this process."""
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
         """Results in the order of the jobs."""
         return map(work, jobs)
 
 
-class Processes:
-    """In processes of this computer, each fresh: nothing of this one (open databases, threads) is carried over.
-
-    Parameters
-    ----------
-    workers : int
-        How many. More than cores gain nothing.
-    """
+class ProcessExecutor:
+    """Runs jobs in ``workers`` new processes of this computer, which inherit neither open databases nor threads."""
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
         """Results in the order of the jobs."""
-        with started_safely():  # all of them start here; making the pool starts the first, which watches over what they share
+        with started_safely():  # all processes start here; creating the pool starts the resource tracker
             pool = ProcessPoolExecutor(self._workers, mp_context=get_context("spawn"))
             found = pool.map(work, jobs)
         with pool:
             yield from found
 
 
-class Dask:
-    """On a Dask cluster (extra ``fleet``).
+class DaskExecutor:
+    """Runs jobs on a Dask cluster (extra ``fleet``); ``address``: of its scheduler, e.g. ``tcp://127.0.0.1:8786``.
 
-    Its workers need this version of Abbe, its extra, and the database by the same URL. Whoever reaches its scheduler can run programs on
-    it: keep it in a network of its own, or use TLS (``tls://``).
-
-    Parameters
-    ----------
-    address : str
-        Of the scheduler, e.g. ``tcp://127.0.0.1:8786``.
+    The workers need this version of Abbe with its extra, and the database under the same URL. Anyone who can connect to the scheduler can
+    run programs on the cluster: keep it in a separate network, or use TLS (``tls://``).
 
     Raises
     ------
     ConfigError
-        The extra is not installed, or there is no scheduler.
+        The extra is not installed, or no scheduler answers.
     """
 
     def __init__(self, address: str) -> None:
@@ -84,6 +73,6 @@ class Dask:
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
         """Results in the order of the jobs."""
         with closing(self._client) as client:
-            # pure=False: equal jobs asked for twice are computed twice, as elsewhere.
+            # pure=False: Dask computes equal jobs again, like the other executors.
             for future in client.map(work, list(jobs), pure=False):
                 yield future.result()

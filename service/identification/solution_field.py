@@ -1,4 +1,4 @@
-"""A stored solution as a map of the machine's volume: which motions may be asked for alone, and deviation with U at every node."""
+"""A stored solution as a map of the machine's volume: the motions that can be shown separately, and deviation with U at every node."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ UM = 1e3
 
 @dataclass(frozen=True)
 class StoredField:
-    """A solution's field. ``hidden``: motions that its runs do not show by themselves, and why."""
+    """The deviation field of a solution. ``hidden``: motions that its runs do not show separately, and why."""
 
     number: int
     known: KnownField
     hidden: Mapping[str, str]
     statuses: Mapping[str, str]
     means: Mapping[str, tuple[float, float]]
-    """Scales (EXX, mm/mm) and squareness (C0Y, rad) averaged over the volume, with standard uncertainty: known where motions are not."""
+    """Scales (EXX, mm/mm) and squareness (C0Y, rad), means over the volume with standard uncertainty; known even if motions are not."""
 
     @property
     def motions(self) -> list[str]:
-        """All motions of the model, in its order."""
+        """All motions in the model's order."""
         return list(dict.fromkeys(t.motion for t in self.known.terms))
 
-    def alone(self, motions: Iterable[str]) -> list[str]:
-        """Chosen motions in the model's order.
+    def observable_motions(self, motions: Iterable[str]) -> list[str]:
+        """Chosen motions in the model's order, each checked to be observable separately.
 
         Raises
         ------
         NotObservable
-            One of them is not shown by these runs by itself.
+            The runs do not show one of them separately.
         Unusable
             The solution does not have one of them.
         """
         wanted = list(dict.fromkeys(motions))
-        strange = [name for name in wanted if name not in self.motions]
-        if strange:
-            raise Unusable(f"solution {self.number} has no motion {', '.join(strange)}", "ask for motions of its model")
+        unknown = [name for name in wanted if name not in self.motions]
+        if unknown:
+            raise Unusable(f"solution {self.number} has no motion {', '.join(unknown)}", "ask for motions of its model")
         lost = [name for name in wanted if name in self.hidden]
         if lost:
             raise NotObservable(
@@ -67,16 +67,16 @@ class StoredField:
 class NodeMap:
     """Deviation at the nodes of an even grid, best-fit rigid motion removed, µm.
 
-    ``u_um``: standard uncertainty of dX, dY, dZ and of the length, shape (n, 4). ``told``: whether the ellipsoid that
-    holds the deviation with 95 % leaves out zero: where it does not, nobody knows whether and into which direction the machine errs there.
-    A length above its own U (k = 2) does not say so: a length is never negative, and noise in three components alone exceeds that often.
+    ``u_um``: standard uncertainty of dX, dY, dZ and of the length, shape (n, 4). ``significant``: whether the 95 % ellipsoid of the
+    deviation excludes zero; elsewhere neither the existence nor the direction of an error is established. A length above its own U (k = 2)
+    is no such criterion: a length is never negative, and noise in three components alone often exceeds U.
     """
 
     nodes: int
     points_mm: F2
     deviation_um: F2
     u_um: F2
-    told: NDArray[np.bool_]
+    significant: NDArray[np.bool_]
 
     @property
     def length_um(self) -> F1:
@@ -90,7 +90,7 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
     Raises
     ------
     Unusable
-        It was stored by a version that did not keep the covariance.
+        An older version stored the solution without its covariance.
     """
     solution = stored_solution(record.doc, record.id)
     if solution.prediction is None:
@@ -106,14 +106,14 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
 
 
 def node_map(stored: StoredField, nodes: int, motions: Sequence[str] = ()) -> NodeMap:
-    """Deviation and uncertainty at ``nodes`` times ``nodes`` times ``nodes`` points over the strokes; no motions: all together.
+    """Deviation and uncertainty on a grid of ``nodes`` points per axis over the strokes, of the given motions or of all together.
 
     Raises
     ------
     NotObservable, Unusable
-        As `StoredField.alone`.
+        As `StoredField.observable_motions`.
     """
-    chosen = stored.alone(motions) if motions else None
+    chosen = stored.observable_motions(motions) if motions else None
     points = volume_grid(stored.known.machine.stroke_mm, nodes)
     found = field_map(stored.known, points, chosen)
     u = standard_uncertainty_mm(found.deviation_mm, found.covariance_mm2)

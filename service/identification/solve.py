@@ -1,4 +1,4 @@
-"""Solve a campaign: runs to error parameters with uncertainty, and to what these runs cannot tell."""
+"""Solve a campaign: from runs to error parameters with uncertainty, and to what these runs cannot determine."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from abbe.models.solvers.priors import U_WAVELENGTH, Priors
 from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
 from abbe.service.campaign_data.campaign_checks import check_files, check_readings, refuse
 from abbe.service.campaign_data.campaign_issue import CampaignIssue
-from abbe.service.campaign_data.copied_runs import copies
-from abbe.service.campaign_data.provenance import measured_digest, taken_from
+from abbe.service.campaign_data.copied_runs import copy_issues
+from abbe.service.campaign_data.provenance import measured_digest, removals_of
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
-"""Set-up unknowns that cannot be off by five times their uncertainty: somebody calibrated them, or would have seen it."""
+"""Set-up unknowns that cannot be off by five times their uncertainty: they were calibrated, or the error would have been visible."""
 LASER_REMEDY = "look at beam, mirror and temperature of that set-up"
 UNUSUAL = {
     "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),
@@ -37,9 +37,9 @@ UNUSUAL = {
 }
 ALL_READINGS = 10**9
 PER_UNKNOWN = 2
-"""Readings that a campaign needs for every unknown that only readings can tell."""
+"""Readings that a campaign needs for every unknown without a prior."""
 SIX, TWENTY_ONE = 6 + 3, 21 + 3 + 18 + 3
-"""Unknowns of the smallest model of each kind: six, or 21 motions with slope and curvature; and the lost motion of three axes."""
+"""Unknowns of the smallest model of each kind: six, or 21 motions with slope and curvature, each with the lost motion of three axes."""
 HELIX_NOTE = (
     "Ten-parameter figures describe the machine about that sphere only, from that run alone; over the volume the joint solution is the one "
     "to use."
@@ -48,18 +48,18 @@ STEP_NOTE = (
     "Step-diagonal figures are the paper's, for comparison: their uncertainty holds reading noise and the laser's wavelength only. Tilt of "
     "the mirrors and angular errors of the axes bias them and are not in it; the joint solution knows both and is the one to use."
 )
-Say = Callable[[str], None]
+ProgressText = Callable[[str], None]
 STEP_PLACE_MM = 0.1
-"""A row farther from where its step leads belongs to another step."""
+"""Largest distance of a row from the end of its step; a farther row belongs to another step."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Joint solution plus the papers' own solutions of the same runs, for comparison.
+    """Joint solution and, for comparison, the papers' own solutions of the same runs.
 
-    ``flags``: what is odd about single runs without being wrong for certain. ``digests``: a hash of every run's data as measured, by its
-    name. ``tables``: the compensation table that each run was measured with, where it says so. ``taken``: what was taken out of the
-    readings. ``rows``: for every value of a run the first and the last row of its file (from 1) that went into it, shape (values, 2).
+    ``flags``: oddities of single runs that are not certainly wrong. ``digests``: hash of every run's data as measured, by run label.
+    ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of what was subtracted from the
+    readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2).
     """
 
     joint: JointSolution
@@ -70,50 +70,50 @@ class Solved:
     digests: dict[str, str] = field(default_factory=dict)
     rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
-    taken: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
 
 
-def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model | None = "rigid21", say: Say | None = None) -> Solved:
-    """Solve ``abbe-run/1`` objects together (role ``identify`` only), after it was checked that each can be what it says.
+def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model | None = "rigid21", progress: ProgressText | None = None) -> Solved:
+    """Solve ``abbe-run/1`` objects of the role ``identify`` together, after checking each for consistency.
 
-    ``model`` None: rigid21, or rigid6 where there are too few readings for it; a flag tells.
+    ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it.
 
     Raises
     ------
     NotObservable
-        There is no run to identify from.
+        No run has the role identify.
     CampaignRefused
-        A run is in another unit, has exchanged axes, is a copy, or is of another machine; or there are too few readings for the model.
+        A run has another unit, exchanged axes or another machine, or is a copy; or the readings are too few for the model.
     InstrumentsDisagree
-        A bar, cup or mirror would have to be impossibly wrong.
+        The readings imply an impossible error of a bar, cup or mirror.
     """
-    say = say or _silent
+    progress = progress or _silent
     used = [r for r in runs if r["role"] == "identify"]
     if not used:
         raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
-    say(f"{len(used)} runs: units, axes, copies, machine")
+    progress(f"{len(used)} runs: units, axes, copies, machine")
     model, smaller = (model, []) if model is not None else _affordable([run_data(r, blocks=ALL_READINGS) for r in used])
     flags = smaller + check_campaign(site, used, [r for r in runs if r["role"] == "holdout"], model)
     bars = [r for r in used if r["test"].startswith("ballbar")]
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
-    joint = solve_joint(site.machine, data, model=model, progress=say)
+    joint = solve_joint(site.machine, data, model=model, progress=progress)
     flags += check_instruments(joint, data)
-    spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not tell ten parameters
+    spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
     digests, tables = (
         {r["run_id"]: measured_digest(r) for r in used},
         {r["run_id"]: r["table"] for r in used if "crc" in r.get("table", {})},
     )
     return Solved(
-        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(taken_from(used))
+        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(removals_of(used))
     )
 
 
 def value_rows(runs: list[dict[str, Any]], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
-    """Rows of its file, from 1, that each value of a run was made of, (first, last) per value: long runs are averaged in blocks.
+    """First and last row of the run's file, from 1, that each value was made of, by run label, shape (values, 2).
 
-    A row belongs to the value whose mean time is nearest; rows marked invalid belong to none.
+    Long runs are averaged in blocks. A row belongs to the value with the nearest mean time; invalid rows belong to none.
     """
     out = {}
     for run, values in zip(runs, data, strict=True):
@@ -133,16 +133,16 @@ def _silent(_: str) -> None:
 
 
 def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str, Any]], model: Model) -> list[CampaignIssue]:
-    """Flags of the runs that are to be solved; ``others`` are only looked at for copies.
+    """Flags of the runs to solve; ``others`` are only checked for copies.
 
     Raises
     ------
     CampaignRefused
-        One line: which run, what is wrong, what to do.
+        A run is wrong; the message names the run, the mistake and the remedy.
     """
     flags = check_files(site.doc, used)
     known = {f.run for f in flags}
-    flags += [f for f in copies([*used, *others]) if f.run not in known]
+    flags += [f for f in copy_issues([*used, *others]) if f.run not in known]
     refuse(flags)
     data = [run_data(r, blocks=ALL_READINGS) for r in used]
     check_enough(data, model)
@@ -152,12 +152,12 @@ def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str
 
 
 def check_enough(data: list[RunData], model: Model) -> None:
-    """Refuse a campaign with fewer than two readings for every unknown that only readings can tell.
+    """Refuse a campaign with fewer than `PER_UNKNOWN` readings for every unknown without a prior.
 
     Raises
     ------
     CampaignRefused
-        How many there are, how many are needed, and which run has the fewest.
+        The message states the number of readings, the number needed, and the run with the fewest.
     """
     count, unknowns = sum(r.deviation_mm.size for r in data), _unknowns(data, model)
     if count < PER_UNKNOWN * unknowns:
@@ -174,7 +174,7 @@ def _unknowns(data: list[RunData], model: Model) -> int:
 
 
 def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
-    """The largest model that there are enough readings for, and the flag that tells where it is not the usual one."""
+    """The largest model that the readings support, and a flag if it is not rigid21."""
     count, wanted = sum(r.deviation_mm.size for r in data), PER_UNKNOWN * _unknowns(data, "rigid21")
     if count >= wanted:
         return "rigid21", []
@@ -183,12 +183,12 @@ def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
 
 
 def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[CampaignIssue]:
-    """Refuse a solution in which a bar, cup, mirror or the laser's scale would have to be impossibly wrong; other set-up errors are flags.
+    """Refuse a solution with an impossible error of a bar, cup, mirror or the laser's scale; other large set-up errors are flags.
 
     Raises
     ------
     InstrumentsDisagree
-        Which set-up unknown, and by how much.
+        The message states the set-up unknown and the size of its error.
     """
     setup = setup_unknowns(data, Priors())
     found = implausible(joint, dict(zip(setup.names, (float(v) for v in setup.prior_sd), strict=True)))
@@ -203,28 +203,28 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[C
 
 
 def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> CampaignIssue:
-    """A set-up error that is larger than a careful hand leaves, without being impossible."""
-    words, remedy = next(
-        (told for prefix, told in UNUSUAL.items() if name.startswith(prefix)), (name.replace("_", " "), "look at that set-up")
+    """Flag for a set-up error that is unusually large but possible."""
+    title, remedy = next(
+        (entry for prefix, entry in UNUSUAL.items() if name.startswith(prefix)), (name.replace("_", " "), "look at that set-up")
     )
-    run = _whole([r.label for r in data], name)
-    setup = None if run else _whole([r.setup for r in data], name)
+    run = _longest_contained([r.label for r in data], name)
+    setup = None if run else _longest_contained([r.setup for r in data], name)
     if run:
-        return CampaignIssue(run, f"{words} is {times:.0f} times what is usual", remedy, False)
+        return CampaignIssue(run, f"{title} is {times:.0f} times what is usual", remedy, False)
     first = next((r.label for r in data if r.setup == setup), name)
-    return CampaignIssue(first, f"{words} of set-up {setup} is {times:.0f} times what is usual", remedy, False)
+    return CampaignIssue(first, f"{title} of set-up {setup} is {times:.0f} times what is usual", remedy, False)
 
 
-def _whole(names: list[str], unknown: str) -> str | None:
-    """The longest of the names that stands in the name of an unknown as a whole word between underscores: B1 is not in cup_B12_x."""
+def _longest_contained(names: list[str], unknown: str) -> str | None:
+    """The longest of the names that occurs in ``unknown`` as a whole word between underscores: B1 does not occur in cup_B12_x."""
     found = [n for n in names if re.search(rf"_{re.escape(n)}(_|$)", unknown)]
     return max(found, key=len) if found else None
 
 
 def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """The papers' step-diagonal figures per step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
+    """The papers' step-diagonal results by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
 
-    End errors of the nine curves (um), largest closure (um; its u is that of one closure), squareness contrasts (urad).
+    End errors of the nine curves (um), largest closure (um, with the u of one closure), squareness contrasts (urad).
     """
     out = {}
     for order in ("XYZ", "ZYX"):
@@ -236,7 +236,7 @@ def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def _whole_way_out(run: dict[str, Any], order: str) -> bool:
-    """Whether the first 3 n + 1 rows are valid and stand where the steps of this order lead: else later rows are another's."""
+    """Whether the first 3 n + 1 rows are valid and at the ends of the steps in this order; otherwise later rows belong to other steps."""
     setup, columns = run["setup"], run["columns"]
     n = int(setup["steps"])
     points = np.column_stack([np.asarray(columns[f"{a}_mm"], dtype=np.float64)[: 3 * n + 1] for a in "xyz"])
@@ -267,7 +267,7 @@ def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, flo
 
 
 def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:
-    """Rms of a held-out ball-bar run that the solution does not explain (cup and length refitted), mm."""
+    """Rms residual of a held-out ball-bar run after refitting cup and length, mm."""
     data = run_data(run)
     n = bar_normals(data)
     lost = -0.5 * data.sign * np.array([v for v, _ in solved.joint.backlash_mm().values()])

@@ -1,4 +1,4 @@
-"""A solution as it is stored (`abbe-solution/1`), and as lines for people. Every figure has its uncertainty."""
+"""A solution as stored (`abbe-solution/1`) and as lines for people, each value with its uncertainty."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ FORMAT: Literal["abbe-solution/1"] = "abbe-solution/1"
 Word = Literal["good", "usable with care", "mostly assumption"]
 HIDDEN_NOTE = "not observable by itself: for this tool only"
 NODES = 6
-"""Nodes per axis of the grid over the strokes on which the uncertainty is stated."""
+"""Nodes per axis of the grid over the strokes on which the uncertainty is evaluated."""
 LISTED = 20
-"""So many outliers and correlations are listed for people; the document holds all outliers."""
+"""Number of outliers and correlations in lists for people; the document holds all outliers."""
 
 
 @dataclass(frozen=True)
-class Account:
-    """A solution with its observability, uncertainty and budget. ``prediction`` is over the whole volume, best-fit rigid motion removed."""
+class Assessment:
+    """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed."""
 
     solved: Solved
     observability: Observability
@@ -72,16 +72,16 @@ class Account:
         return self.solved.joint
 
     def predict(self, points_mm: F2) -> Prediction:
-        """Deviation and uncertainty elsewhere, in the same frame."""
+        """Deviation and uncertainty at other points, shape (n, 3), in the same frame."""
         return predict_deviation(self.sources, points_mm, frame=volume_frame(self.joint.machine))
 
 
-def account(solved: Solved) -> Account:
-    """Ask a solution what it knows: observability, uncertainty over the volume, budget."""
+def assess(solved: Solved) -> Assessment:
+    """Assess a solution: observability, uncertainty over the volume, budget."""
     joint = solved.joint
     sources = error_sources(joint)
     prediction = predict_deviation(sources, volume_grid(joint.machine.stroke_mm, NODES), frame=volume_frame(joint.machine))
-    return Account(
+    return Assessment(
         solved,
         observability_of(joint),
         sources,
@@ -99,14 +99,14 @@ def model_key(joint: JointSolution) -> str:
     return f"{joint.model}/legendre{joint.order}" + ("+order-by-heldout" if joint.order_choice else "+order-given")
 
 
-def not_observable(found: Account) -> list[str]:
-    """In words: what the runs cannot tell apart, why, and what would show it."""
+def not_observable(found: Assessment) -> list[str]:
+    """What the runs cannot separate, why, and which measurement would."""
     return [g.text for g in found.observability.hidden]
 
 
-def solution_of(solved: Solved | Account) -> SolutionFile:
-    """The solution as it is stored: parameters with uncertainty in SI-like units, what is not observable, tests, versions, digests."""
-    found = solved if isinstance(solved, Account) else account(solved)
+def solution_of(solved: Solved | Assessment) -> SolutionFile:
+    """The solution as stored: parameters with uncertainty, unobservable motions, residual tests, versions, digests."""
+    found = solved if isinstance(solved, Assessment) else assess(solved)
     joint, o, e = found.joint, found.observability, found.joint.estimate
     key = model_key(joint)
     return SolutionFile(
@@ -149,32 +149,32 @@ def solution_of(solved: Solved | Account) -> SolutionFile:
     )
 
 
-def solution_doc(solved: Solved | Account) -> Doc:
+def solution_doc(solved: Solved | Assessment) -> Doc:
     """`solution_of` as JSON."""
     return as_doc(solution_of(solved))
 
 
 def as_doc(solution: SolutionFile) -> Doc:
-    """A solution as JSON; what was never stated is left out."""
+    """A solution as JSON, without unset fields."""
     return solution.model_dump(mode="json", exclude_unset=True)
 
 
-def judged(found: Account) -> Verdict:
+def solution_verdict(found: Assessment) -> Verdict:
     """The verdict on a solution (`abbe.service.identification.solve_verdict`)."""
     flagged = len({t.run for t in found.joint.residual_tests if t.flagged})
     return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
 
 
-def _verdict(found: Account) -> VerdictValue:
-    own = judged(found)
+def _verdict(found: Assessment) -> VerdictValue:
+    own = solution_verdict(found)
     layout = layout_line(found.observability.number)
     return VerdictValue(word=cast(Word, own.word), text=own.text, reasons=list(own.reasons), layout=layout)
 
 
-def _inputs(found: Account, model: str) -> Inputs:
+def _inputs(found: Assessment, model: str) -> Inputs:
     machine = machine_digest(found.joint.machine)
     return Inputs(
-        digest=campaign_digest(found.solved.digests, "\n".join([model, *found.solved.taken]), machine),
+        digest=campaign_digest(found.solved.digests, "\n".join([model, *found.solved.removed]), machine),
         machine=machine,
         runs=found.solved.digests,
         tables=[TableInForce(**table) for table in distinct(found.solved.tables.values())],
@@ -212,7 +212,7 @@ def _residual_tests(joint: JointSolution) -> list[ResidualTestResult]:
     ]
 
 
-def _uncertainty(found: Account) -> Uncertainty:
+def _uncertainty(found: Assessment) -> Uncertainty:
     p, at = found.prediction, worst_point(found.prediction)
     return Uncertainty(
         frame="best-fit rigid motion over the strokes removed",
@@ -235,15 +235,15 @@ def point(values: F1) -> Point:
     return x, y, z
 
 
-def _budget_line(found: Account, line: BudgetLine) -> BudgetLineValue:
-    """A source with the type of its evaluation and its degrees of freedom; None: stated, or the allowance for them."""
+def _budget_line(found: Assessment, line: BudgetLine) -> BudgetLineValue:
+    """A source with its evaluation type and degrees of freedom; None for infinite ones."""
     source = found.sources.source(line.name)
     dof = float(source.dof) if np.isfinite(source.dof) else None
     return BudgetLineValue(source=line.name, words=line.words, u_um=line.u_mm * 1e3, share=line.share, type=source.evaluation, dof=dof)
 
 
-def worst_line(found: Account) -> str:
-    """Where the deviation is known worst, in one line."""
+def worst_line(found: Assessment) -> str:
+    """One line about the point with the largest uncertainty."""
     p, at = found.prediction, worst_point(found.prediction)
     place = ", ".join(f"{v:.0f}" for v in p.points_mm[at])
     return (
@@ -253,7 +253,7 @@ def worst_line(found: Account) -> str:
 
 
 def noise_lines(joint: JointSolution) -> list[str]:
-    """Noise found per instrument, and what repeats alone say of it."""
+    """Estimated noise of each instrument, and its estimate from repeats alone."""
     names = {"bar": "ball-bar", "laser": "laser"}
     out = []
     for kind, sigma in joint.noise_mm.items():
@@ -264,7 +264,7 @@ def noise_lines(joint: JointSolution) -> list[str]:
 
 
 def _rows(solved: Solved, outlier: Outlier) -> list[int]:
-    """First and last row of the run's columns, from 1, that went into the value."""
+    """First and last row of the run's columns, from 1, that the value was made of."""
     rows = solved.rows.get(outlier.run)
     return [] if rows is None or outlier.index >= len(rows) else [int(v) for v in rows[outlier.index]]
 
@@ -274,17 +274,17 @@ def _time(joint: JointSolution, outlier: Outlier) -> float:
 
 
 def outlier_lines(solved: Solved) -> list[str]:
-    """Readings that count less, largest first, with their rows in the run's file."""
+    """Outliers with reduced weight, largest first, with their rows in the run's file."""
     joint = solved.joint
     lines = [
-        f"run {o.run}, {_where(_rows(solved, o))} (t = {_time(joint, o):.1f} s): {abs(o.size):.1f} sigma, counts {o.weight:.0%}"
+        f"run {o.run}, {_rows_text(_rows(solved, o))} (t = {_time(joint, o):.1f} s): {abs(o.size):.1f} sigma, counts {o.weight:.0%}"
         for o in joint.outliers[:LISTED]
     ]
     more = len(joint.outliers) - len(lines)
     return [*lines, f"and {more} more"] if more > 0 else lines
 
 
-def _where(rows: list[int]) -> str:
+def _rows_text(rows: list[int]) -> str:
     if not rows:
         return "a value"
     first, last = rows
@@ -292,7 +292,7 @@ def _where(rows: list[int]) -> str:
 
 
 def residual_lines(joint: JointSolution) -> list[str]:
-    """What the tests of the residuals found, one line per run, most significant run first."""
+    """Flagged residual tests, one line per run, most significant run first."""
     found: dict[str, list[str]] = {}
     for test in sorted((t for t in joint.residual_tests if t.flagged), key=lambda t: t.p_adjusted):
         found.setdefault(test.run, []).append(test.text.removeprefix(f"{test.run}: "))

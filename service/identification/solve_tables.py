@@ -1,4 +1,4 @@
-"""What tables could make of a solution, the 3-D grid as a file, and the check of the stated uncertainty by trials: all on request only."""
+"""On request: the errors that each kind of table leaves, the 3-D grid as a file, and a Monte Carlo check of the stated uncertainty."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, vali
 from abbe.models.uncertainty.prediction import worst_point
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
-from abbe.service.identification.solve_report import Account, judged, point
+from abbe.service.identification.solve_report import Assessment, point, solution_verdict
 
-Say = Callable[[str], None]
+ProgressText = Callable[[str], None]
 GRID_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,u_dx_um,u_dy_um,u_dz_um,compensated"
 SEED, TRIALS = 101, 400_000
 
 
-def table_rows(found: Account, lsb_mm: float) -> list[TableRow]:
-    """What every kind of table leaves of the errors of distances, µm, with standard uncertainties; rounded to the machine's unit."""
+def table_rows(found: Assessment, lsb_mm: float) -> list[TableRow]:
+    """Errors of distances that every kind of table leaves, µm, with standard uncertainties; tables rounded to the machine's unit."""
     out = []
     for row in achievable(found.joint, lsb_mm=lsb_mm, sources=found.sources):
         d = row.distances
-        figures = {k: getattr(d, k.replace("_um", "_mm")) * 1e3 for k in ("rms_um", "u_rms_um", "q95_um", "u_q95_um", "max_um", "u_max_um")}
-        out.append(TableRow(kind=row.kind, entries=row.entries, unknown_um=d.unknown_mm * 1e3, **figures))
+        values = {k: getattr(d, k.replace("_um", "_mm")) * 1e3 for k in ("rms_um", "u_rms_um", "q95_um", "u_q95_um", "max_um", "u_max_um")}
+        out.append(TableRow(kind=row.kind, entries=row.entries, unknown_um=d.unknown_mm * 1e3, **values))
     return out
 
 
-def machine_grid(found: Account, nodes: int, lsb_mm: float) -> GridTable:
-    """The 3-D grid of corrections, rounded to the machine's unit, where the error is larger than its uncertainty.
+def machine_grid(found: Assessment, nodes: int, lsb_mm: float) -> GridTable:
+    """The 3-D grid of corrections where the error exceeds its uncertainty, rounded to the machine's unit.
 
     Raises
     ------
     TableRefused
-        The solution's own verdict or an open flag forbids it, or nothing can be compensated.
+        The solution's verdict or an open flag forbids it, or nothing can be compensated.
     """
     if found.solved.flags:
         first = found.solved.flags[0]
         raise TableRefused(
             f"no grid from a solution with open flags: run {first.run}: {first.what}", f"{first.remedy}; nothing was written"
         )
-    told = judged(found)
-    if told.sign == "bad":
-        raise TableRefused(f"no grid from a solution that is {told.word}: {told.reasons[0]}", "measure more; nothing was written")
+    verdict = solution_verdict(found)
+    if verdict.sign == "bad":
+        raise TableRefused(f"no grid from a solution that is {verdict.word}: {verdict.reasons[0]}", "measure more; nothing was written")
     counts = (nodes, nodes, nodes)
     mask = compensable_nodes(found.joint, counts, inputs=found.sources.inputs)
     table = quantise_grid(grid_table(found.joint, counts, compensable=mask, sources=found.sources), lsb_mm)
@@ -57,15 +57,15 @@ def machine_grid(found: Account, nodes: int, lsb_mm: float) -> GridTable:
 
 
 def grid_text(table: GridTable) -> str:
-    """The grid as CSV, one node a line, X slowest. ``dx_um`` to ``dz_um``: what is added to the command; ``u_``: standard uncertainty."""
+    """The grid as CSV, one node per line, X slowest. ``dx_um`` to ``dz_um``: added to the command; ``u_``: standard uncertainty."""
     values = np.column_stack([table.correction_mm.reshape(-1, 3) * 1e3 + 0.0, table.u_mm.reshape(-1, 3) * 1e3])
     rows = zip(nodes_mm(table.position_mm), values, table.compensated.reshape(-1), strict=True)
     lines = [",".join([*(f"{v:.10g}" for v in p), *(f"{v:.6g}" for v in d), str(int(c))]) for p, d, c in rows]
     return "\n".join([GRID_HEADER, *lines]) + "\n"
 
 
-def monte_carlo(found: Account, say: Say) -> MonteCarloCheck:
-    """GUM Supplement 1 at the worst known point: the stated 95 % intervals against trials of all inputs, limits as rectangular."""
+def monte_carlo(found: Assessment, progress: ProgressText) -> MonteCarloCheck:
+    """Check the stated 95 % intervals at the worst known point by Monte Carlo trials (GUM Supplement 1), limits as rectangular."""
     p, at = found.prediction, worst_point(found.prediction)
     trials = campaign_trials(found.sources, p.points_mm[at : at + 1], frame=volume_frame(found.joint.machine), distributions=LIMITS)
     draw, done = trials.linear(), 0
@@ -73,18 +73,18 @@ def monte_carlo(found: Account, say: Say) -> MonteCarloCheck:
     def counted(rng: np.random.Generator, n: int) -> F2:
         nonlocal done
         done += n
-        say(f"Monte Carlo: {done} trials")
+        progress(f"Monte Carlo: {done} trials")
         return draw(rng, n)
 
     drawn = adaptive(counted, np.random.default_rng(SEED), digits=1, share=VALIDATION_SHARE, largest=TRIALS)
     valid = validate(p.deviation_mm[at], p.expanded_mm[at], drawn).valid
     half = 0.5 * (drawn.symmetric.high - drawn.symmetric.low) * 1e3
     stated = p.expanded_mm[at] * 1e3
-    figures = "; ".join(f"{a} stated ± {s:.2f}, found ± {h:.2f}" for a, s, h in zip("XYZ", stated, half, strict=True))
+    intervals = "; ".join(f"{a} stated ± {s:.2f}, found ± {h:.2f}" for a, s, h in zip("XYZ", stated, half, strict=True))
     if valid.all():
-        word = "the stated uncertainty is right to one digit"
+        claim = "the stated uncertainty is right to one digit"
     else:
-        word = "the stated uncertainty is larger than needed" if (stated >= half)[~valid].all() else "the stated uncertainty is too small"
+        claim = "the stated uncertainty is larger than needed" if (stated >= half)[~valid].all() else "the stated uncertainty is too small"
     return MonteCarloCheck(
         trials=drawn.trials,
         at_mm=point(p.points_mm[at]),
@@ -92,5 +92,5 @@ def monte_carlo(found: Account, say: Say) -> MonteCarloCheck:
         found_um=point(half),
         valid=[bool(v) for v in valid],
         settled=bool(drawn.settled.all()),
-        text=f"Monte Carlo (GUM Supplement 1, {drawn.trials} trials) at the worst known point, 95 % intervals in µm: {figures}: {word}.",
+        text=f"Monte Carlo (GUM Supplement 1, {drawn.trials} trials) at the worst known point, 95 % intervals in µm: {intervals}: {claim}.",
     )

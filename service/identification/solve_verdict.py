@@ -1,4 +1,4 @@
-"""One word for a solution, no better than what it states itself: layout of the campaign, uncertainty that was reached, open questions."""
+"""The verdict on a solution from the layout of the campaign, the reached uncertainty, and open flags."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENOUGH, HALF = 0.8, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``word``: one of `WORDS`; ``text``: what it rests on, with figures; ``reasons``: what holds it down."""
+    """``word``: one of `WORDS`; ``text``: its basis in numbers; ``reasons``: why it is not better."""
 
     word: str
     text: str
@@ -29,22 +29,22 @@ class Verdict:
 
 
 def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0) -> Verdict:
-    """What may be done with a solution.
+    """Judge what a solution can be used for.
 
-    The layout says how good it can be. Where the model does not fit, the uncertainty that was reached is far larger, and counts.
+    The layout limits the verdict. If the model does not fit, the reached uncertainty far exceeds that limit, and counts.
 
     Parameters
     ----------
     number : Number
-        The observability number: what the layout allows.
+        The observability number: the limit of the layout.
     prediction : Prediction
         Over the volume, rigid motion removed.
     share : float
-        Part of the volume where the error is larger than its uncertainty.
+        Share of the volume where the error exceeds its uncertainty.
     flags : int
-        Open flags of runs.
+        Number of open flags.
     not_noise : int
-        Runs with residuals that are not noise.
+        Number of runs with residuals that are not noise.
     """
     u, error = float(prediction.u_vector_mm.max()), float(np.sqrt(np.mean(np.sum(prediction.deviation_mm**2, axis=1))))
     reached = number.before_mm / u if u > 0.0 else np.inf
@@ -69,5 +69,5 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
 
 
 def layout_line(number: Number) -> str:
-    """The observability number as what it is: a property of the layout, not of the readings."""
+    """The observability number as text: a property of the layout, not of the readings."""
     return "What the layout of the campaign allows, if the model fits: " + number.text.replace(f" ({number.verdict})", "")

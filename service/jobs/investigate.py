@@ -23,20 +23,20 @@ from abbe.service.compensation.proposals import StoredProposal, check_temperatur
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
-from abbe.service.discovery.changed_since import since_of
-from abbe.service.discovery.changed_words import changed_words
+from abbe.service.discovery.changed_since import reference_solution
+from abbe.service.discovery.changed_text import changed_text
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
-from abbe.service.discovery.discovery_words import size_text, verdict_of
-from abbe.service.discovery.linear_change import linear_words
+from abbe.service.discovery.discovery_text import size_text, verdict_of
+from abbe.service.discovery.linear_change import drift_text
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import REMEDIES, current
 from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
-from abbe.service.identification.table_removal import table_then
+from abbe.service.identification.table_removal import campaign_table
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
@@ -119,7 +119,7 @@ async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -
         raise
     _, word, text = verdict_of(finding)
     names = ", ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
-    changes = changed_words(finding.changed)
+    changes = changed_text(finding.changed)
     doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {text}", changes) if t), "discovery": number}
     return await note(AlarmKind.DISCOVERED, doc | _objections(finding, context.store, context.site.name))
 
@@ -127,8 +127,8 @@ async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -
 def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, Finding]:
     store = context.store
     measured = from_store(store, campaign)
-    book, since = current(store, context.site.name), since_of(store, measured)
-    job = prepare(measured, catalogue(), book, table=table_then(store, measured), since=since)
+    book, since = current(store, context.site.name), reference_solution(store, measured)
+    job = prepare(measured, catalogue(), book, table=campaign_table(store, measured), since=since)
     journal = journal_of(store, job)
     return journal.id, discover(job, journal, search, context.progress)
 
@@ -200,7 +200,7 @@ def promise_text(store: Store, made: StoredProposal) -> str:
     left_out = "".join(f"; not in the tables: {line}" for line in made.proposed.not_for_tables)
     return (
         f"proposal {made.number} waits for approval: {p.before_mm * 1e3:.1f} → {p.after_mm * 1e3:.1f} µm rms, better by "
-        f"{gain:.1f} ± {expanded:.1f} µm (U, k = 2); {largest(compare(store, made.number, 'ACTIVE'))}{linear_words(store, made)}{left_out}"
+        f"{gain:.1f} ± {expanded:.1f} µm (U, k = 2); {largest(compare(store, made.number, 'ACTIVE'))}{drift_text(store, made)}{left_out}"
     )
 
 

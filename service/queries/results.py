@@ -132,7 +132,7 @@ def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) 
         z_mm=z,
         deviation_um=[(dx, dy, dz) for dx, dy, dz in found.deviation_um.round(3).tolist()],
         expanded_um=[(ux, uy, uz, u) for ux, uy, uz, u in (2.0 * found.u_um).round(3).tolist()],
-        told=found.told.tolist(),
+        told=found.significant.tolist(),
         hidden=[HiddenMotion(motion=name, reason=why) for name, why in stored.hidden.items()],
     )
 

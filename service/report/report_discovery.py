@@ -11,11 +11,11 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.campaign_data.decimation import thinned
-from abbe.service.discovery.changed_words import changed_lines, changed_words
+from abbe.service.discovery.changed_text import changed_lines, changed_text
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
 from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import stored_steps
-from abbe.service.discovery.discovery_words import (
+from abbe.service.discovery.discovery_text import (
     ROLES,
     book_lines,
     next_of,
@@ -157,7 +157,7 @@ def _document(
 def _verdict(finding: Finding) -> tuple[str, str, str]:
     """Verdict of the finding, with the changes since an earlier solution, if one could be compared."""
     sign, word, text = verdict_of(finding)
-    changes = changed_words(finding.changed)
+    changes = changed_text(finding.changed)
     return sign, word, f"{text} {changes[:1].upper()}{changes[1:]}." if changes else text
 
 

@@ -13,7 +13,7 @@ from abbe.models.solvers.observations import nominal_reading
 from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import AbbeError, MeasurementFault
-from abbe.service.identification.solve_report import HIDDEN_NOTE, Account
+from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment
 from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import ParameterRow, PolarTrace, ResidualSeries
 from abbe.service.rendering.numbers import plain
@@ -41,7 +41,7 @@ class SolutionResult:
 
     doc: Doc
     number: int | None = None
-    account: Account | None = None
+    account: Assessment | None = None
 
     @property
     def name(self) -> str:

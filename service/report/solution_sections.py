@@ -12,7 +12,7 @@ from abbe.models.compensation.summary import SCALE_NOTE, mean_linear
 from abbe.models.geometry.bases import term_values
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
-from abbe.service.identification.solve_report import HIDDEN_NOTE, Account, noise_lines, outlier_lines, residual_lines, worst_line
+from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment, noise_lines, outlier_lines, residual_lines, worst_line
 from abbe.service.identification.solve_verdict import layout_line
 from abbe.service.rendering.document import Block, Lines, Picture, Section, TextTable
 from abbe.service.rendering.model import (
@@ -37,7 +37,7 @@ PLANES = ((0, 1, 2), (0, 2, 1))
 """Axes across and up of each slice, and the axis that stands in the middle of its stroke."""
 
 
-def solution_sections(found: Account, doc: dict[str, Any]) -> list[Section]:
+def solution_sections(found: Assessment, doc: dict[str, Any]) -> list[Section]:
     """Sections of a solution, printed before the figures of the report.
 
     ``doc``: its `abbe.service.identification.solve_report.solution_doc`, with tables and Monte Carlo if requested.
@@ -52,12 +52,12 @@ def solution_sections(found: Account, doc: dict[str, Any]) -> list[Section]:
     ]
 
 
-def residual_sections(found: Account) -> list[Section]:
+def residual_sections(found: Assessment) -> list[Section]:
     """Sections of the residuals of a solution, run by run."""
     return [Section("Residuals", _residuals(found)), Section("Runs of the solution", [run_table(solution_runs(found.joint))])]
 
 
-def _parameters(found: Account) -> list[Block]:
+def _parameters(found: Assessment) -> list[Block]:
     rows = solution_rows(found)
     hidden = {m.name for m in found.observability.motions if m.status == "not observable"}
     ranked = contributions(found.joint)
@@ -68,14 +68,14 @@ def _parameters(found: Account) -> list[Block]:
     return [*out, parameter_table([r for r in rows if r.note != SETUP_NOTE]), *setup_section(rows)]
 
 
-def solution_rows(found: Account) -> list[ParameterRow]:
+def solution_rows(found: Assessment) -> list[ParameterRow]:
     """Rows of parameters; those of motions that are not observable carry a note (valid for this tool only)."""
     status = {m.name: m.status for m in found.observability.motions}
     rows = parameter_rows(found.joint)
     return [replace(r, note=f"{r.note}; {HIDDEN_NOTE}") if status.get(r.name) == "not observable" else r for r in rows]
 
 
-def _motions(found: Account) -> list[Block]:
+def _motions(found: Assessment) -> list[Block]:
     curves = motion_curves(found)
     units = list(dict.fromkeys(c.unit for c in curves))
     caption = (
@@ -85,7 +85,7 @@ def _motions(found: Account) -> list[Block]:
     return [Picture(caption, [motion_bands([c for c in curves if c.unit == u], key=f"motions-{i}") for i, u in enumerate(units)], "wide")]
 
 
-def _observability(found: Account, shares: Sequence[MotionShare]) -> list[Block]:
+def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Block]:
     caption = (
         "Full bar: these runs tell the motion by themselves. Outline only: part of it looks like something else in every reading, however "
         "long the bar; it belongs in no table of its own."
@@ -103,7 +103,7 @@ def _observability(found: Account, shares: Sequence[MotionShare]) -> list[Block]
     return out
 
 
-def _volume(found: Account) -> list[Block]:
+def _volume(found: Assessment) -> list[Block]:
     slices = [_slice(found, plane) for plane in PLANES]
     step = common_step(slices)
     maps = [slice_plot(s, step, key=f"slice-{i}", heading=f"U of the predicted vector, {s.at}") for i, s in enumerate(slices)]
@@ -133,7 +133,7 @@ def _tables(doc: dict[str, Any]) -> list[Section]:
     return out
 
 
-def _residuals(found: Account) -> list[Block]:
+def _residuals(found: Assessment) -> list[Block]:
     joint = found.joint
     return [
         Section("Not noise", [Lines(residual_lines(joint) or ["No test of the residuals found more than noise."])]),
@@ -143,7 +143,7 @@ def _residuals(found: Account) -> list[Block]:
     ]
 
 
-def motion_curves(found: Account) -> list[MotionCurve]:
+def motion_curves(found: Assessment) -> list[MotionCurve]:
     """Every error motion as a function over its stroke, with its standard uncertainty, µm or µrad."""
     joint = found.joint
     stroke = joint.machine.stroke_mm
@@ -162,7 +162,7 @@ def motion_curves(found: Account) -> list[MotionCurve]:
     return out
 
 
-def _slice(found: Account, plane: tuple[int, int, int]) -> Slice:
+def _slice(found: Assessment, plane: tuple[int, int, int]) -> Slice:
     across, up, fixed = plane
     stroke = found.joint.machine.stroke_mm
     x, y = (np.linspace(stroke[a, 0], stroke[a, 1], SLICE_NODES) for a in (across, up))
@@ -173,7 +173,7 @@ def _slice(found: Account, plane: tuple[int, int, int]) -> Slice:
     return Slice(AXES[across], AXES[up], f"{AXES[fixed]} = {stroke[fixed].mean():.0f} mm", x, y, values)
 
 
-def _gain(found: Account, fixed: int) -> Slice:
+def _gain(found: Assessment, fixed: int) -> Slice:
     """Noise gain over the plane in the middle of one axis."""
     plane = found.observability.plane(fixed, SLICE_NODES)
     values = plane.volume.gain.reshape(SLICE_NODES, SLICE_NODES)
@@ -181,7 +181,7 @@ def _gain(found: Account, fixed: int) -> Slice:
     return Slice(AXES[plane.first], AXES[plane.second], at, plane.first_mm, plane.second_mm, values)
 
 
-def _correlations(found: Account) -> Correlations:
+def _correlations(found: Assessment) -> Correlations:
     """Correlations of the most correlated parameters, in the order of the model."""
     e = found.joint.estimate
     chosen: list[str] = []

@@ -1,1 +1,1 @@
-"""Runs: how samples are packed, how they become columns, and how they leave and enter as exchange files."""
+"""Runs: packing of samples, conversion to columns, and exchange files."""

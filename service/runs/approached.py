@@ -1,7 +1,7 @@
-"""From which side the axis of a positioning test came to a place where two rows stand: it may have gone beyond and come back (ISO 230-2).
+"""Side from which the axis of a positioning test approached a place with two rows: it may have overrun and come back (ISO 230-2).
 
-Rows say where the axis stood, not how it got there. One that stands at a place with ``direction`` +1 and then -1 either never moved, or
-went beyond the place and came back between the rows.
+Rows state where the axis stood, not how it got there. An axis at one place with ``direction`` +1 and then -1 either never moved, or overran
+the place and came back between the rows.
 """
 
 from __future__ import annotations
@@ -14,22 +14,27 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import REST_MM
 
 BEYOND_MM = 5.0
-"""So far beyond a place an axis is taken to have turned: farther than any lost motion."""
+"""Assumed overrun beyond a place: more than any lost motion."""
 NEAR_MM = 0.05
-"""Positions closer than this are the same one."""
+"""Positions closer than this are the same place."""
 FEWEST = 3
-"""Places seen from both sides that tell how far the two differ."""
+"""Places approached from both sides that are needed to estimate their difference."""
 
 
-def came_from(run: dict[str, Any], q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dtype[np.intp]]]:
-    """Positions with the turns that the rows leave out, shape (m, 3), and which of them are the rows, shape (n,).
+def with_reversals(run: dict[str, Any], q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+    """Insert the reversals that the rows of a ``laser_linear`` run omit; other tests are returned unchanged.
 
     Parameters
     ----------
     run : dict
-        ``abbe-run/1``; anything but a ``laser_linear`` comes back as it is.
+        ``abbe-run/1`` object.
     q_mm : array, shape (n, 3)
         Its positions.
+
+    Returns
+    -------
+    path, rows
+        Positions with the reversals, shape (m, 3), and the index in it of every row, shape (n,).
     """
     rows, direction = np.arange(len(q_mm)), run["columns"].get("direction")
     if run["test"] != "laser_linear" or direction is None or not np.isfinite(q_mm).all() or run["setup"].get("end_mm") is None:
@@ -54,7 +59,7 @@ def _along(run: dict[str, Any]) -> F1:
 
 
 def _went_beyond(run: dict[str, Any], q_mm: F2, way: F1, turned: np.ndarray[tuple[int], np.dtype[np.intp]]) -> bool:
-    """Whether the two readings at turns differ as those of the other places do from one side to the other, and not as repeats do."""
+    """Whether the two readings at a reversal differ like readings from opposite sides at the other places, rather than like repeats."""
     if run["columns"]["deviation_mm"] is None:
         return False
     y = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)

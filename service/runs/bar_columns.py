@@ -1,7 +1,7 @@
-"""Ball-bar samples become columns: every reading gets the commanded position at which it was taken.
+"""Convert ball-bar samples to columns: every reading gets the commanded position at which it was taken.
 
-The controller's "path running" output is wired into the bar's box, which samples it together with the reading. The first sample that has
-it set was taken within one period after the path began; nothing here depends on when bytes arrived at the computer.
+The controller's "path running" output is wired to the bar's box, which samples it together with the reading. The first sample with this
+input set was taken within one period after the path began; nothing here depends on arrival times at the computer.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DURATION_TOLERANCE = 0.01
 
 
 def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
-    """What the sync line says of a run; None if no sample has it set."""
+    """Edges of the sync line in a run; None if no sample has it set."""
     at = [k for k, sample in enumerate(samples) if on_path(sample.status)]
     if not at:
         return None
@@ -33,8 +33,8 @@ def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
     return Edges(samples[first].device_us, samples[last].device_us, 1.0 / float(start["rate_hz"]), begins and ends)
 
 
-def begins_seen(samples: Sequence[BarSample]) -> bool:
-    """Whether the sample before the first one on the path is there: only then the path's beginning is known to the period."""
+def starts_in_stream(samples: Sequence[BarSample]) -> bool:
+    """Whether the sample before the first one on the path exists, so that the start of the path is known to one period."""
     first = next((k for k, sample in enumerate(samples) if on_path(sample.status)), 0)
     return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
 
@@ -47,11 +47,11 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     samples : sequence of BarSample
         All samples of the run, also those before and after the path.
     start : dict
-        Start document (abbe.service.runs.columns).
+        Start document (`abbe.service.runs.columns`).
     end : dict or None
-        End document; None for an interrupted run, which gives the columns it has.
+        End document; None for an interrupted run, which keeps its existing columns.
     complete : bool
-        Whether the path ran to its end, i.e. whether durations can be checked.
+        Whether the path ran to its end, so that durations can be checked.
     rate : float
         Seconds of the controller per second of the box (`abbe.service.runs.clocks`).
 
@@ -63,7 +63,7 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     Raises
     ------
     MeasurementFault
-        If no sample lies on the path, or feed, path and duration contradict each other.
+        No sample lies on the path, or feed, path and duration contradict each other.
     """
     path, rate_hz = start["path"], float(start["rate_hz"])
     feed_mm_s = path["feed_mm_min"] / 60.0
@@ -111,7 +111,7 @@ def _time_along_path(
     first = samples.index(along[0])
     start_was_lost = along[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else along[0].seq != 0
     if start_was_lost and end is not None and end.get("path_end_us"):
-        # The edge fell into a gap of the stream: the path's other edge tells the time as well.
+        # The first edge fell into a gap of the stream: use the other edge of the path.
         duration_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
         return np.asarray(duration_s - half_period_s - since_first_s[-1] + since_first_s)
     return np.asarray(since_first_s + half_period_s)
@@ -140,7 +140,7 @@ def _length_mm(points: Array) -> float:
 
 
 def _counts(points: Array, measured: Sequence[int] | None, arc_mm: Array) -> npt.NDArray[np.bool_]:
-    """Which readings lie between the first and the last point that count; feed-in and feed-out stay in the raw samples alone."""
+    """Mask of the readings between the first and last measured point; feed-in and feed-out stay in the raw samples only."""
     if measured is None:
         return np.ones(arc_mm.size, dtype=np.bool_)
     arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
@@ -149,6 +149,6 @@ def _counts(points: Array, measured: Sequence[int] | None, arc_mm: Array) -> npt
 
 def _position(points: Array, arc_mm: Array) -> Array:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    corners = points[np.concatenate(([True], steps > 0.0))]  # points given twice would make the arc length ambiguous
+    corners = points[np.concatenate(([True], steps > 0.0))]  # repeated points would make the arc length ambiguous
     arc = np.concatenate(([0.0], np.cumsum(steps[steps > 0.0])))
     return np.stack([np.interp(arc_mm, arc, corners[:, axis]) for axis in range(3)], axis=1)

@@ -1,4 +1,4 @@
-"""A campaign as the discovery takes it: run documents become paths, readings and roles (abbe.models.discovery.case)."""
+"""Convert a campaign for the discovery: run documents to paths, readings and roles (`abbe.models.discovery.case`)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
 from abbe.service.domain.run_file import ASSUMED_MODEL
 from abbe.service.errors import MeasurementFault
-from abbe.service.runs.approached import came_from
+from abbe.service.runs.approached import with_reversals
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
 SENSORS = ("x", "y", "z", "spindle", "air")
 AXES = "XYZ"
 FEED_SHARE = 0.1
-"""A motion is this near to its feed unless the feed is not what it says; chords are shorter than arcs by 2 % at most."""
+"""Largest relative difference between the actual and the stated feed; chords are shorter than arcs by 2 % at most."""
 CLOCKS_S = 60.0
-"""Nobody writes down to the second when a set-up was mounted."""
+"""Tolerance of the mounting time, which people do not note to the second."""
 
 
 def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any]]) -> Case:
@@ -31,7 +31,7 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any
     Raises
     ------
     MeasurementFault
-        A run has no direction to look along, or was measured before its set-up was mounted (named).
+        A run has no measuring direction, or was measured before its set-up was mounted.
     """
     vertical = AXES.index(str(campaign["machine"].get("vertical_axis", "Z")))
     instruments = campaign.get("instruments") or {}
@@ -41,14 +41,14 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any
         "laser": float((instruments.get("laser") or {}).get("resolution_mm") or RESOLUTION_MM["laser"]),
     }
     includes = (campaign.get("current_model") or {}).get("includes", ASSUMED_MODEL)
-    found = tuple(_run(run, machine, vertical, dead) for run in set_once(runs))
+    found = tuple(_run(run, machine, vertical, dead) for run in with_earliest_mounting(runs))
     return Case(str(campaign["campaign"]), machine, frozenset(includes), found, resolution)
 
 
-def set_once(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Runs of one set-up with its earliest ``t_set_s``: nothing was mounted between them, so a later one is only when that run began.
+def with_earliest_mounting(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give all runs of a set-up its earliest ``t_set_s``: the set-up was mounted once, and later values are only starts of runs.
 
-    To be done with all runs of a campaign, before any is left out: perhaps only the one that is left out knows when it was mounted.
+    Call this with all runs of a campaign before leaving any out, because an omitted run may hold the only mounting time.
     """
     earliest: dict[str, float] = {}
     for run in runs:
@@ -70,7 +70,7 @@ def _run(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: flo
 
 
 def path_of(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: float) -> Path:
-    """The path of one ``abbe-run/1`` object; its readings are not looked at."""
+    """The path of one ``abbe-run/1`` object, without its readings."""
     columns, setup, laser = run["columns"], run["setup"], run["test"].startswith("laser")
     t_s, feed = (np.asarray(columns[name], dtype=np.float64) for name in ("t_s", "feed_mm_min"))
     q = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
@@ -79,7 +79,7 @@ def path_of(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: 
     first = {s: v[:1] for s, v in temp.items()}
     at = driven(q, t_s, feed, dwelling=laser, temp_c=temp)
     if laser:
-        path, rows = came_from(run, q)
+        path, rows = with_reversals(run, q)
         sign = travel_sign(path)
         at = replace(at, sign=sign[rows], since_mm=since_reversal(path, sign)[rows])
     t_set = float(setup.get("t_set_s", t_s[0]))
@@ -112,7 +112,7 @@ def path_of(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: 
 
 
 def _driven_feed(q_mm: F2, t_s: F1, feed_mm_min: F1) -> F1:
-    """The feed as stated, or that of the motion itself where the two contradict each other: positions and clock are what was measured."""
+    """The stated feed, mm/min, or the feed from positions and times if both contradict each other."""
     took_s = np.diff(t_s)
     if not took_s.size or not (took_s > 0.0).all():
         return feed_mm_min
@@ -131,14 +131,14 @@ def _away(q_mm: F2, centre_mm: F1, label: str) -> F2:
 
 
 def _first(at: Places) -> Places:
-    """The first record of a laser run: what all others are relative to."""
+    """The first record of a laser run, to which all others are relative."""
     return Places(
         at.q_mm[:1], at.sign[:1], at.since_mm[:1], at.v_mm_s[:1], at.a_mm_s2[:1], at.t_s[:1], {s: v[:1] for s, v in at.temp_c.items()}
     )
 
 
 def _beam(setup: dict[str, Any], label: str) -> F1:
-    """Nominal beam, a unit vector: as stated, else along the test."""
+    """Nominal beam as a unit vector: as stated, else along the test."""
     beam = setup.get("nominal_beam")
     along = np.asarray(beam if beam is not None else np.subtract(setup["end_mm"], setup["start_mm"]), dtype=np.float64)
     if setup.get("axis") is not None and beam is None:

@@ -1,4 +1,4 @@
-"""Checks of exchange files. Every mistake is one FileFormatError: file, key, row, and what was expected."""
+"""Checks of exchange files. Every mistake raises a FileFormatError with file, key, row, and the expected value."""
 
 from __future__ import annotations
 
@@ -19,31 +19,21 @@ _OF_MOTION = ("mm", "um", "nm", "m", "rad", "urad", "mrad", "deg", "s", "ms", "u
 _OF_OTHERS = ("C", "K", "Pa", "hPa", "N", "kN", "Nm", "V", "mV", "A", "W", "kW", "percent", "permille", "ppm", "bits")
 UNITS = frozenset({*_OF_MOTION, *_OF_OTHERS})
 PLAIN = frozenset(("seq", "count", "no", "index", "id", "flag", "ratio", "status", "quality", "valid"))
-"""Last parts of names of columns that have no unit."""
+"""Suffixes of columns without a unit."""
 MAX_BYTES = 512 * 2**20
 
 
 def read_json(path: Path) -> Doc:
-    """Read a JSON object from a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    dict
-        Its content, keys in order.
+    """Read a JSON object from a file, keys in order.
 
     Raises
     ------
     FileFormatError
-        If it is missing, no plain file, too large, no UTF-8, or no JSON, as `abbe.service.runs.json_text.strict_json` reads it.
+        The file is missing, not a plain file, too large, not UTF-8, or not JSON (`abbe.service.runs.json_text.strict_json`).
     """
     try:
         text = read_plain(path, MAX_BYTES).decode("utf-8")
-        value = strict_json(text, path, finite=False)  # `check` says where a NaN stands
+        value = strict_json(text, path, finite=False)  # `check` reports the place of a NaN
     except FileNotFoundError:
         raise FileFormatError(f"{path}: no such file", "give a folder with campaign.json and its run files") from None
     except NotPlainError as err:
@@ -58,47 +48,31 @@ def read_json(path: Path) -> Doc:
 
 
 def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
-    """Check a document against one of the formats.
-
-    Parameters
-    ----------
-    path : Path
-        Named in errors.
-    document : dict
-        The document; it is not changed.
-    model : type
-        A model of abbe.service.domain.run_file.
+    """Check a document against a model of `abbe.service.domain.run_file`; ``path`` is named in errors.
 
     Raises
     ------
     FileFormatError
-        For the first mistake.
+        The document has a mistake; the first one is reported.
     """
     try:
-        # By way of JSON so that a list is a tuple, as in the file; NaN gets through json.dumps and is refused by the model.
+        # Through JSON, so that a list counts as a tuple, as in the file; json.dumps passes NaN, which the model refuses.
         model.model_validate_json(json.dumps(document))
     except ValidationError as err:
         raise _format_error(path, err) from None
     try:
         json.dumps(document, allow_nan=False)
     except ValueError:
-        _check_finite(path, document)  # in a key that the format does not know
+        _check_finite(path, document)  # the NaN is in a key outside the format
 
 
 def check_run(path: Path, document: Doc) -> None:
-    """Check a run file, its columns row by row.
-
-    Parameters
-    ----------
-    path : Path
-        Named in errors.
-    document : dict
-        The document.
+    """Check a run file, its columns row by row; ``path`` is named in errors.
 
     Raises
     ------
     FileFormatError
-        For the first mistake.
+        The document has a mistake; the first one is reported.
     """
     for part, model in (("setup", Setup), ("columns", Columns)):
         keys = document.get(part)
@@ -158,7 +132,7 @@ def _check_finite(path: Path, value: object, location: tuple[int | str, ...] = (
 
 def _format_error(path: Path, err: ValidationError) -> FileFormatError:
     errors = err.errors()
-    # Of a union ("a list or nothing") pydantic reports every branch; the deepest one is what the writer meant.
+    # Of a union ("a list or null") pydantic reports every branch; the deepest one is what the author meant.
     first = max((one for one in errors if one["loc"][:2] == errors[0]["loc"][:2]), key=lambda one: len(one["loc"]))
     location = tuple(
         part for part in first["loc"] if not (isinstance(part, str) and (part.startswith(("list[", "tuple[")) or part in _TYPE_TAGS))

@@ -1,7 +1,7 @@
-"""The clocks of a ball-bar run: how fast the box's clock runs against the controller's, and whether the sync line and the arrivals agree.
+"""The clocks of a ball-bar run: the rate of the box's clock against the controller's, and the agreement of sync line and arrivals.
 
-Where the box has a sync line, its two edges tie its clock to the controller's; the stamps and arrivals of both streams, which know nothing
-of that line, say the same by way of this computer's clock, or they do not, and that is said. Arrival times are used for nothing else.
+If the box has a sync line, its two edges tie its clock to the controller's. The stamps and arrivals of both streams are an independent
+check by way of this computer's clock; a disagreement is reported. Arrival times are used for nothing else.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord
 
 U_DELAY_S = 2e-3
-"""Standard uncertainty of the least delay of a link, which no arrival tells: 0 to 7 ms, an adapter's and the operating system's."""
+"""Standard uncertainty of a link's least delay, which arrivals do not show: 0 to 7 ms in the adapter and the operating system."""
 COLLECTS_MS = 16
-"""A serial adapter collects bytes for so long, and may keep step with the samples while it does."""
+"""Time for which a serial adapter collects bytes, possibly in step with the samples."""
 SURE = 3.0
-"""A drift or a disagreement counts from so many times its standard uncertainty."""
+"""A drift or a disagreement counts from this multiple of its standard uncertainty."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunClock:
-    """Seconds of the controller per second of the box, its standard uncertainty, where it is from, and what is to be said about it."""
+    """Seconds of the controller per second of the box, its standard uncertainty, and the ``timing`` document of the run."""
 
     rate: float
     u_rate: float
@@ -38,9 +38,9 @@ class RunClock:
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """The run as the sync line saw it: box time of the first and last sample with the level set, and their period.
+    """Edges of the sync line: box time of the first and last sample with the line set, and the sample period.
 
-    ``whole``: the samples beside both edges are there; else an edge was in a gap of the stream, and says nothing.
+    ``whole``: the samples next to both edges exist; otherwise an edge fell into a gap of the stream and cannot be used.
     """
 
     first_us: int
@@ -50,9 +50,9 @@ class Edges:
 
 
 def run_clock(chunks: Sequence[ChunkRecord], end: Doc | None, edges: Edges) -> RunClock:
-    """Rate of the box's clock against the controller's: from the sync line or from the arrivals, whichever knows it better.
+    """Rate of the box's clock against the controller's, from the sync line or the arrivals, whichever has the smaller uncertainty.
 
-    A drift that neither shows (three standard uncertainties) is taken for none and stays in ``u_rate``.
+    A drift below `SURE` standard uncertainties is not corrected; ``u_rate`` covers it.
     """
     found = _fits(chunks, end, edges.period_s)
     doc: Doc = {}
@@ -75,7 +75,7 @@ def run_clock(chunks: Sequence[ChunkRecord], end: Doc | None, edges: Edges) -> R
 
 
 def _fits(chunks: Sequence[ChunkRecord], end: Doc | None, period_s: float) -> tuple[ClockFit, ClockFit] | str:
-    """Both clocks over this computer's; or what is wrong, in words; or nothing where there is too little to say."""
+    """Fits of the box's and the controller's clock to this computer's; a text if a clock jumped, empty with too few pairs."""
     box = np.array([(c.last_device_us * 1e-6, c.last_host_s) for c in chunks], dtype=np.float64).reshape(-1, 2)
     cnc = np.array((end or {}).get("clock_pairs", []), dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
     for name, pairs in (("ball-bar's box", box), ("controller", cnc)):
@@ -92,9 +92,9 @@ def _fit(pairs: Any, grid_s: float) -> ClockFit:
 
 
 def _compared(fits: tuple[ClockFit, ClockFit], end: Doc | None, edges: Edges) -> Doc:
-    """Both edges of the sync line against where the arrivals put them, ms of controller time.
+    """Edges by the arrivals minus edges by the controller, ms of controller time.
 
-    Positive: they date the line's edge later than the controller says, so the path began (or ended) earlier than by the line.
+    Positive: the arrivals date the edge later than the controller does, so by them the path began (or ended) earlier.
     """
     doc: Doc = {"box_drift_ppm": fits[0].drift_ppm, "controller_drift_ppm": fits[1].drift_ppm}
     if not end or not end.get("path_end_us") or not edges.whole:

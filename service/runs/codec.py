@@ -1,7 +1,7 @@
-"""How samples are packed into chunks. Pure: bytes in, values out, nothing lost in between.
+"""Lossless packing of samples into chunks, as pure functions.
 
 ``bar/1``: zlib over ``<IQiH`` (seq, device_us, reading_nm, status) for each ball-bar sample.
-``json/1``: zlib over JSON lines, one record a line, floats as Python's ``repr`` writes them.
+``json/1``: zlib over JSON lines, one record per line, floats as written by Python's ``repr``.
 """
 
 from __future__ import annotations
@@ -18,47 +18,26 @@ from abbe.service.errors import StoreError
 BAR_CODEC = "bar/1"
 JSON_CODEC = "json/1"
 _SAMPLE = struct.Struct("<IQiH")
-_LEVEL = 1  # best speed; samples differ little from their neighbours, a higher level gains nothing worth its time
+_LEVEL = 1  # fastest; neighbouring samples differ little, so that a higher level is not worth its time
 
 
 def encode_bar(samples: Sequence[BarSample]) -> bytes:
-    """Pack ball-bar samples as ``bar/1``.
-
-    Parameters
-    ----------
-    samples : sequence of BarSample
-        In order.
-
-    Returns
-    -------
-    bytes
-        Payload of a chunk.
-    """
+    """Pack ball-bar samples in order as a chunk ``bar/1``."""
     return zlib.compress(pack_bar(samples), _LEVEL)
 
 
 def pack_bar(samples: Sequence[BarSample]) -> bytes:
-    """Ball-bar samples as ``<IQiH``, one after the other, not compressed."""
+    """Ball-bar samples as consecutive ``<IQiH``, uncompressed."""
     return b"".join(_SAMPLE.pack(one.seq, one.device_us, one.reading_nm, one.status) for one in samples)
 
 
 def decode_bar(payload: bytes) -> list[BarSample]:
-    """Unpack ``bar/1``.
-
-    Parameters
-    ----------
-    payload : bytes
-        Payload of a chunk.
-
-    Returns
-    -------
-    list of BarSample
-        In order.
+    """Unpack the samples of a chunk ``bar/1`` in order.
 
     Raises
     ------
     StoreError
-        If the bytes are not ``bar/1``.
+        The bytes are not ``bar/1``.
     """
     raw = _inflate(payload, BAR_CODEC)
     if len(raw) % _SAMPLE.size:
@@ -69,22 +48,12 @@ def decode_bar(payload: bytes) -> list[BarSample]:
 
 
 def encode_json(records: Iterable[dict[str, Any]]) -> bytes:
-    """Pack JSON objects as ``json/1``.
-
-    Parameters
-    ----------
-    records : iterable of dict
-        In order.
-
-    Returns
-    -------
-    bytes
-        Payload of a chunk.
+    """Pack JSON objects in order as a chunk ``json/1``.
 
     Raises
     ------
     StoreError
-        If a number is NaN or infinite.
+        A number is NaN or infinite.
     """
     try:
         lines = "\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False, separators=(",", ":")) for one in records)
@@ -94,22 +63,12 @@ def encode_json(records: Iterable[dict[str, Any]]) -> bytes:
 
 
 def decode_json(payload: bytes) -> list[dict[str, Any]]:
-    """Unpack ``json/1``.
-
-    Parameters
-    ----------
-    payload : bytes
-        Payload of a chunk.
-
-    Returns
-    -------
-    list of dict
-        In order.
+    """Unpack the objects of a chunk ``json/1`` in order.
 
     Raises
     ------
     StoreError
-        If the bytes are not ``json/1``.
+        The bytes are not ``json/1``.
     """
     text = _inflate(payload, JSON_CODEC)
     try:

@@ -1,18 +1,25 @@
-"""A stored run becomes an ``abbe-run/1`` document: the one place where raw samples turn into columns.
+"""Convert a stored run to an ``abbe-run/1`` document: the only place where raw samples become columns.
 
-Start document: ``setup`` and ``machine`` of the exchange format, ``ctrl0_us`` (zero of the campaign clock in controller time), and for
-ball-bar runs ``path`` {``feed_mm_min``, ``direction``, ``points_mm``} and ``rate_hz``. ``points_mm`` begins where the machine stands when
-the path starts. End document of a ball-bar run: ``path_start_us``, ``path_end_us`` (controller time). For a run without end document the
-path's start is taken from the start document: ``path_start_us``, else ``clock.ctrl_us``, else the setup's ``t_set_s``.
-``path.measured``: first and last point of ``points_mm`` between which readings count; without it all do. A ball-bar run whose
-setup says how many ``samples`` make a reading was read at standstill, point by point: it has no ``path``, and its
-records stand where those of a laser run do.
-``path.pieces`` (run, to_mm) and ``path.offset_mm``: the path was broken off and went on (abbe.service.sequences.path_resume);
-``points_mm`` is its rest, and the readings of the broken runs belong to it up to those lengths. The end document of a broken run says how
-far it came at constant feed: ``path_start_us``, ``good_us``, ``box_boot_id``.
-``clock_pairs`` of the end document: controller time (us) and arrival (host s) of its statuses; they check the sync line
-(abbe.service.runs.clocks; ``timing`` of the result says what came of it).
-``mounted_us`` is when cup or laser were mounted (controller time); the start document is written before.
+Start document:
+
+- ``setup`` and ``machine`` of the exchange format, and ``ctrl0_us``, the zero of the campaign clock in controller time;
+- of a ball-bar run ``rate_hz`` and ``path`` {``feed_mm_min``, ``direction``, ``points_mm``}; ``points_mm`` begins at the machine's position
+  at the start of the path;
+- ``path.measured``: first and last point of ``points_mm`` between which readings count; without it all count;
+- ``path.pieces`` (run, to_mm) and ``path.offset_mm`` of a path that was interrupted and resumed (`abbe.service.sequences.path_resume`):
+  ``points_mm`` is the rest of the path, and the readings of the interrupted runs belong to it up to those lengths.
+
+A ball-bar run whose ``setup`` states the number of ``samples`` per reading was read at standstill, point by point. It has no ``path``, and
+its records are stored like those of a laser run.
+
+End document:
+
+- ``path_start_us`` and ``path_end_us`` of a ball-bar run, in controller time. Without an end document, the start of the path is
+  ``path_start_us`` of the start document, else ``clock.ctrl_us``, else ``t_set_s`` of the set-up;
+- ``path_start_us``, ``good_us`` and ``box_boot_id`` of an interrupted run: how far it came at constant feed;
+- ``clock_pairs``: controller time (us) and arrival (host s) of statuses, which check the sync line (`abbe.service.runs.clocks`); ``timing``
+  of the result holds the outcome;
+- ``mounted_us``: mounting of cup or laser in controller time, after the start document was written.
 """
 
 from __future__ import annotations
@@ -26,19 +33,17 @@ from abbe.drivers.flags import bar_is_valid
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
-from abbe.service.runs.bar_columns import bar_columns, begins_seen, sync_edges
+from abbe.service.runs.bar_columns import bar_columns, starts_in_stream, sync_edges
 from abbe.service.runs.clocks import RunClock, run_clock
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.laser_columns import laser_columns
-from abbe.service.runs.pieces import SoFar, joined, pieces_of, read_so_far, up_to
+from abbe.service.runs.pieces import ReadProgress, counted_columns, joined, pieces_of, progress_of
 from abbe.service.storage.store import Store
-
-# Ball-bar readings at standstill become columns: one row for each point, the mean of the samples that were taken there.
 
 
 def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
-    """Turn the records of a point-by-point ball-bar test into columns.
+    """Convert the records of a point-by-point ball-bar test to columns: one row per point, the mean of its samples.
 
     Parameters
     ----------
@@ -46,7 +51,7 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
         ``ctrl_us`` (controller time, after the axes had settled), ``target_mm``, ``direction``, ``feed_mm_min``, and for every sample
         ``device_us``, ``reading_nm``, ``status``; in order.
     start : dict
-        Start document (abbe.service.runs.columns).
+        Start document.
 
     Returns
     -------
@@ -82,32 +87,20 @@ IMPORTED_CHANNEL = "columns"
 def load_run(store: Store, id_or_label: int | str) -> Doc:
     """Read a run from the store as an ``abbe-run/1`` document.
 
-    Parameters
-    ----------
-    store : Store
-        Open store.
-    id_or_label : int or str
-        As ``Store.run`` takes it.
-
-    Returns
-    -------
-    dict
-        The document.
-
     Raises
     ------
     StoreError
-        If the run is not there, damaged, or not complete enough to be understood.
+        The run is missing, damaged, or too incomplete.
     MeasurementFault
-        If its samples contradict its path.
+        Its samples contradict its path.
     """
     return whole_document(store, store.runs.find(id_or_label))
 
 
 def whole_document(store: Store, record: RunRecord) -> Doc:
-    """A run with the pieces that belong to it, as an ``abbe-run/1`` document; errors as of `load_run`.
+    """A run with its pieces as an ``abbe-run/1`` document; raises like `load_run`.
 
-    One that is not complete says so under ``state`` (`abbe.service.runs.coverage`).
+    An incomplete run has the key ``state`` (`abbe.service.runs.coverage`).
     """
     document = run_document(record, store.chunks.of_run(record.id))
     pieces = pieces_of(record.start_doc)
@@ -115,7 +108,7 @@ def whole_document(store: Store, record: RunRecord) -> Doc:
         return with_state(document, record)
     broken = [(store.runs.find(p.run), p.to_mm) for p in pieces]
     pieces_doc = [run_document(run, store.chunks.of_run(run.id)) for run, _ in broken]
-    parts = [up_to(run, one["columns"], to_mm) for (run, to_mm), one in zip(broken, pieces_doc, strict=True)]
+    parts = [counted_columns(run, one["columns"], to_mm) for (run, to_mm), one in zip(broken, pieces_doc, strict=True)]
     named = [{"run": run.label, "readings": len(part["t_s"])} for (run, _), part in zip(broken, parts, strict=True)]
     timing = document.get("timing", {}) | {"pieces": named}
     troubles = [f"in {run.label}: {text}" for (run, _), one in zip(broken, pieces_doc, strict=True) if (text := _trouble(one))]
@@ -128,49 +121,39 @@ def _trouble(document: Doc) -> str:
     return str(document.get("timing", {}).get("trouble", ""))
 
 
-def path_so_far(store: Store, run: int) -> SoFar | None:
-    """How far a path was read by its last broken run and the pieces before it; None if it has to begin again."""
+def path_progress(store: Store, run: int) -> ReadProgress | None:
+    """Progress of a path after its last interrupted run and the earlier pieces; None if it has to start again."""
     record = store.runs.find(run)
     if record.reason.startswith(StretchDiffers.code):
-        return None  # nobody knows which of the two was right
+        return None  # either of the two readings of the stretch may be wrong
     try:
         chunks = store.chunks.of_run(run)
         document = run_document(record, chunks)
         samples = [sample for chunk in _of(chunks, BAR_CHANNEL, BAR_CODEC) for sample in decode_bar(chunk.payload)]
-        found = read_so_far(record, document["columns"]) if begins_seen(samples) and not _trouble(document) else None
+        found = progress_of(record, document["columns"]) if starts_in_stream(samples) and not _trouble(document) else None
     except (StoreError, MeasurementFault):
-        found = None  # it cannot be read: it counts as nothing
+        found = None  # an unreadable run does not count
     if found is not None:
         return found
     earlier = pieces_of(record.start_doc)
-    return path_so_far(store, earlier[-1].run) if earlier else None
+    return path_progress(store, earlier[-1].run) if earlier else None
 
 
 def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
-    """Turn a run and its chunks into an ``abbe-run/1`` document.
+    """Convert a run and all its chunks, in order of seq within a channel, to an ``abbe-run/1`` document.
 
-    Parameters
-    ----------
-    record : RunRecord
-        The run.
-    chunks : sequence of ChunkRecord
-        All its chunks, in order of seq within a channel.
-
-    Returns
-    -------
-    dict
-        With plain lists of Python numbers; an imported run comes back exactly as it was, unknown keys included.
+    Columns are plain lists of Python numbers. An imported run is returned exactly as it was, including unknown keys.
 
     Raises
     ------
     StoreError
-        If start document or chunks cannot be understood.
+        The start document or a chunk is malformed.
     MeasurementFault
-        If its samples contradict its path.
+        The samples contradict the path.
     """
     imported = record.start_doc.get("imported")
     if imported is not None:
-        return dict(imported) | {"columns": unpack_columns(chunks)}  # the key stands in "imported" too, so its place is kept
+        return dict(imported) | {"columns": unpack_columns(chunks)}  # "imported" has the key too, which keeps its place
     document: Doc = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
     try:
         columns, timing = _measured(record, chunks)
@@ -179,13 +162,13 @@ def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
         ) from None
-    # which compensation table was active: a solution is only meaningful together with it, so it travels with the run
+    # A solution is meaningful only together with the active compensation table, so the run carries it.
     document |= {"table": record.start_doc["table"]} if "table" in record.start_doc else {}
     return document | ({"timing": timing} if timing else {})
 
 
 def _setup(start: Doc, end: Doc | None) -> Doc:
-    """The set-up with the instant at which it was mounted."""
+    """The set-up with its mounting time."""
     setup: Doc = start["setup"]
     if not end or "mounted_us" not in end:
         return setup
@@ -193,40 +176,18 @@ def _setup(start: Doc, end: Doc | None) -> Doc:
 
 
 def pack_columns(columns: Doc) -> list[dict[str, Any]]:
-    """Lay out imported columns as records for ``json/1``.
-
-    Parameters
-    ----------
-    columns : dict
-        Name to list (or None).
-
-    Returns
-    -------
-    list of dict
-        One record a column, in order.
-    """
+    """Imported columns (name to list or None) as records for ``json/1``, one per column in order."""
     return [{"name": name, "values": values} for name, values in columns.items()]
 
 
 def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
-    """Read imported columns back.
-
-    Parameters
-    ----------
-    chunks : sequence of ChunkRecord
-        Chunks of the run.
-
-    Returns
-    -------
-    dict
-        Name to list (or None), in the order of the file.
-    """
+    """Imported columns (name to list or None) from the chunks of a run, in the order of the file."""
     records = [record for chunk in _of(chunks, IMPORTED_CHANNEL, JSON_CODEC) for record in decode_json(chunk.payload)]
     return {record["name"]: record["values"] for record in records}
 
 
 def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> tuple[Doc, Doc]:
-    """The columns, and what is to be said of the clocks."""
+    """The columns and the ``timing`` document."""
     if record.test.startswith("ballbar") and "samples" not in record.start_doc.get("setup", {}):
         bar_chunks = _of(chunks, BAR_CHANNEL, BAR_CODEC)
         samples = [sample for chunk in bar_chunks for sample in decode_bar(chunk.payload)]

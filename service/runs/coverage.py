@@ -1,7 +1,7 @@
-"""How much of its commanded path a run has read, and whether it may be judged: the one rule for figures, reports, screens and comparisons.
+"""Share of its commanded path that a run has read, and whether it is judged: the common rule for results, reports, pages and comparisons.
 
-A run that was stopped, aborted, interrupted or failed gives no figure of its path, and neither does one that has read less than `LEAST`
-of it. A complete run with a few counted gaps stays judged. Runs that were measured in pieces count with all of them.
+A run that was stopped, aborted, interrupted or failed gives no result, and neither does one that has read less than `LEAST` of its path. A
+complete run with a few counted gaps is judged. A run that was measured in pieces counts with all of them.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from abbe.service.runs.helix_axis import about_axis, helix_axis
 from abbe.service.runs.pieces import arc_of
 
 LEAST = 0.9
-"""Share of the commanded path that a run has to have read, to be judged: what is left out may hold the largest deviation."""
+"""Least share of the commanded path for a judgement: the missing part may contain the largest deviation."""
 COMPLETE = "complete"
 KEY = "state"
-"""Where an ``abbe-run/1`` object says that it is not complete: ``status`` and, where it is known, ``covered`` (share of the path)."""
+"""Key of an incomplete ``abbe-run/1`` object: ``status`` and, if known, ``covered`` (share of the path)."""
 GAP_MM, GAP_SAMPLES = 5.0, 10.0
-"""Between two valid readings farther apart than both the path was not read."""
+"""Two valid readings farther apart than both limits leave the path between them unread."""
 LEAST_A_TURN = 8
-"""With fewer readings a turn the turns cannot be counted: so many are a turn that was read."""
+"""Least number of readings per turn; with fewer, this many count as one turn that was read."""
 GAP_STEPS, GAP_SHARE = 3.0, 0.15
-"""Of a file, whose commanded path is not known: what lies between neighbours farther apart than so many middle steps, and than this share
-of a laser run or of a turn, was not read."""
+"""For a file, whose commanded path is unknown: two neighbours farther apart than this many median steps, and than this share of a laser run
+or of a turn, leave the path between them unread."""
 
 
 def with_state(document: Doc, record: RunRecord, begun: Doc | None = None) -> Doc:
-    """A run as read from the store, and what a reader must know of its state; a complete one that was read whole stays as it is.
+    """Add the key ``state`` to a stored run that is incomplete or has not read enough of its path.
 
-    ``begun``: start document of the run that began the path, where this one went on with it.
+    ``begun``: start document of the run that began the path, if this one resumed it.
     """
     share = _of_path(document, begun or record.start_doc)
     status = record.visible_status
@@ -47,7 +47,7 @@ def with_state(document: Doc, record: RunRecord, begun: Doc | None = None) -> Do
 def covered_share(run: Mapping[str, Any]) -> float | None:
     """Share of its commanded path that a run has read, 0 to 1.
 
-    None where neither the store nor its set-up states a path; not a number for a helix that is too short to tell the axis it winds about.
+    None if neither the store nor the set-up states a path; NaN for a helix that is too short to determine its axis.
     """
     if KEY in run:
         share = run[KEY].get("covered")
@@ -56,23 +56,23 @@ def covered_share(run: Mapping[str, Any]) -> float | None:
 
 
 def not_judged(run: Mapping[str, Any]) -> str:
-    """Why an ``abbe-run/1`` object gives no figure: ``stopped: 4.5 % of the path; not judged``. Empty: it is judged."""
+    """Why an ``abbe-run/1`` object gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
     status = str((run.get(KEY) or {}).get("status", COMPLETE))
     share = covered_share(run)
     if status == COMPLETE and (share is None or share >= LEAST):
         return ""
-    word = "incomplete" if status == COMPLETE else status.replace("_", " ")
-    part = "" if share is None else "its share of the path cannot be told; " if np.isnan(share) else f"{100 * share:.1f} % of the path; "
-    return f"{word}: {part}not judged"
+    state = "incomplete" if status == COMPLETE else status.replace("_", " ")
+    part = "" if share is None else "its share of the path is unknown; " if np.isnan(share) else f"{100 * share:.1f} % of the path; "
+    return f"{state}: {part}not judged"
 
 
 def check_judged(run: Mapping[str, Any]) -> None:
-    """Refuse a run that gives no figure.
+    """Refuse a run that gives no result.
 
     Raises
     ------
     MeasurementFault
-        It was not measured to its end, or less than `LEAST` of its path was read.
+        The run did not reach its end, or has read less than `LEAST` of its path.
     """
     why = not_judged(run)
     if why:
@@ -80,7 +80,7 @@ def check_judged(run: Mapping[str, Any]) -> None:
 
 
 def _of_path(document: Doc, start: Doc) -> float | None:
-    """By what was commanded: the length of the path, or the number of standstills."""
+    """Share of the commanded path length, or of the planned standstills."""
     columns = document["columns"]
     if columns.get("deviation_mm") is None:
         return None
@@ -98,7 +98,7 @@ def _of_path(document: Doc, start: Doc) -> float | None:
 
 
 def _of_setup(run: Mapping[str, Any]) -> float | None:
-    """By the set-up of a run that came from a file: turns of a helix, angle of a circle, way out of a laser run."""
+    """Share according to the set-up of a run from a file: turns of a helix, angle of a circle, outward path of a laser run."""
     columns, setup = run["columns"], run["setup"]
     if columns.get("deviation_mm") is None:
         return None
@@ -132,7 +132,7 @@ def _turned(run: Mapping[str, Any], at: F2) -> float | None:
 
 
 def _read(x: F1, least: float) -> float:
-    """How far readings reach, less the gaps between neighbours that are too wide for their usual step."""
+    """Range of the readings minus the gaps that are too wide for their usual step."""
     steps = np.abs(np.diff(x))
     moved = steps[steps > 0.0]
     wide = steps[steps > max(least, GAP_STEPS * float(np.median(moved)))] if moved.size else steps
@@ -144,7 +144,7 @@ def _share(part: float, whole: float) -> float | None:
 
 
 def _read_mm(at: F2, step_mm: float) -> float:
-    """Length of path between valid readings that follow each other."""
+    """Path length between consecutive valid readings, without gaps, mm."""
     steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
     return float(steps[steps <= max(GAP_MM, GAP_SAMPLES * step_mm)].sum()) + step_mm
 

@@ -1,4 +1,4 @@
-"""An errors file (``abbe-errors/1``) as error motions that can be evaluated, with what the file says about its own limits."""
+"""Read an errors file (``abbe-errors/1``) as error motions, with its stated uncertainty and limits."""
 
 from __future__ import annotations
 
@@ -33,19 +33,10 @@ _KINDS: Mapping[str, type[BaseModel]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class KnownErrors:
-    """What an errors file says.
+    """Content of an errors file.
 
-    Parameters
-    ----------
-    motions : ErrorMotions
-    covariance : (names, matrix) or None
-        Parameters as `ErrorMotions.parameter_names` writes them.
-    uncertainty : str
-        One line: what the uncertainty covers, or why there is none.
-    not_observable : list of dict
-        As the file has them.
-    unused : list of str
-        One line for each key that means nothing here.
+    ``covariance``: parameter names as in `ErrorMotions.parameter_names`, and the matrix; ``uncertainty``: one line about its scope, or why
+    it is missing; ``not_observable``: as in the file; ``unused``: one line for each unknown key.
     """
 
     motions: ErrorMotions
@@ -55,7 +46,7 @@ class KnownErrors:
     unused: list[str]
 
     def warnings(self) -> list[str]:
-        """One line for each key that is not used, and for each combination of parameters that the measurement could not see."""
+        """One line for each unused key, and for each combination of parameters that the measurement could not observe."""
         return [*self.unused, *(f"not observable: {_combination(one)}" for one in self.not_observable)]
 
 
@@ -65,7 +56,7 @@ def read_errors(path: Path) -> KnownErrors:
     Raises
     ------
     FileFormatError
-        For the first mistake: file and key.
+        The file has a mistake; the message names the file and the first wrong key.
     """
     if not path.exists():
         raise FileFormatError(f"{path}: no such file", "give a file with error functions (abbe-errors/1)")
@@ -90,7 +81,7 @@ def axis_function(one: Mapping[str, Any]) -> AxisFunction:
     Raises
     ------
     ValueError
-        An impossible function: positions that do not rise, knots that decrease, no coefficient.
+        The function is impossible: positions that do not increase, decreasing knots, no coefficient.
     """
     if one["kind"] == "polynomial":
         return Polynomial(one["coefficients"], one["origin_mm"])
@@ -107,12 +98,12 @@ def _covariance(path: Path, given: Mapping[str, Any] | None, motions: ErrorMotio
     names = _names(path, given.get("parameters"))
     matrix = _matrix(path, given.get("matrix"), len(names))
     known = set(motions.parameter_names())
-    strange = [name for name in names if name not in known]
-    if strange:
-        more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         return (
             None,
-            f"no uncertainty: the covariance of the errors file speaks of {strange[0]!r}{more}, which is no parameter of its functions",
+            f"no uncertainty: the covariance of the errors file speaks of {unknown[0]!r}{more}, which is no parameter of its functions",
         )
     return (names, matrix), _covered(names, motions)
 
@@ -127,16 +118,16 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
 
 
 def _matrix(path: Path, rows: Any, size: int) -> F2:
-    where = f"{path}: covariance.matrix"
+    location = f"{path}: covariance.matrix"
     if not isinstance(rows, list) or not rows or not all(isinstance(row, list) for row in rows):
-        raise FileFormatError(f"{where}: expected rows of finite numbers, got {short_repr(rows)}")
-    strange = [value for row in rows for value in row if isinstance(value, bool) or not isinstance(value, int | float)]
-    if strange or any(len(row) != len(rows[0]) for row in rows):
-        raise FileFormatError(f"{where}: expected rows of numbers, all equally long, got {short_repr(strange[0] if strange else rows)}")
+        raise FileFormatError(f"{location}: expected rows of finite numbers, got {short_repr(rows)}")
+    invalid = [value for row in rows for value in row if isinstance(value, bool) or not isinstance(value, int | float)]
+    if invalid or any(len(row) != len(rows[0]) for row in rows):
+        raise FileFormatError(f"{location}: expected rows of numbers, all equally long, got {short_repr(invalid[0] if invalid else rows)}")
     if (len(rows), len(rows[0])) != (size, size):
-        raise FileFormatError(f"{where}: expected {size} x {size} numbers, got {len(rows)} rows of {len(rows[0])}")
+        raise FileFormatError(f"{location}: expected {size} x {size} numbers, got {len(rows)} rows of {len(rows[0])}")
     try:
-        return checked_covariance(np.array(rows, dtype=np.float64), size, where)
+        return checked_covariance(np.array(rows, dtype=np.float64), size, location)
     except ValueError as err:
         raise FileFormatError(str(err), "correct the matrix, or leave the covariance out") from None
 
@@ -153,7 +144,7 @@ def _covered(names: tuple[str, ...], motions: ErrorMotions) -> str:
 
 
 def _runs(key: str, indices: list[int]) -> list[str]:
-    """``EXX.1``, or ``EXX.1 to EXX.50`` for parameters that follow each other."""
+    """``EXX.1``, or ``EXX.1 to EXX.50`` for consecutive parameters."""
     ends: list[list[int]] = []
     for k in indices:
         if ends and k == ends[-1][-1] + 1:
@@ -164,7 +155,7 @@ def _runs(key: str, indices: list[int]) -> list[str]:
 
 
 def _unused(path: Path, document: Mapping[str, Any]) -> list[str]:
-    """Keys that the format does not know, at every place but ``not_observable``, which is repeated as it is."""
+    """One line for each unknown key, except below ``not_observable``."""
     places: list[tuple[str, Mapping[str, Any], Iterable[str]]] = [("", document, formats.ErrorsFile.model_fields)]
     places.append(("squareness_rad.", document["squareness_rad"], SQUARENESS))
     places += [(f"motions.{key}.", one, _KINDS[one["kind"]].model_fields) for key, one in document["motions"].items()]

@@ -1,4 +1,4 @@
-"""Campaign folders in and out: read everything, check everything, then store everything, or nothing; write aside, then rename."""
+"""Import and export of campaign folders. An import checks everything before it stores anything; an export is renamed into place."""
 
 from __future__ import annotations
 
@@ -26,17 +26,7 @@ COMPLETE = "complete"
 
 @dataclass(frozen=True, slots=True)
 class Folder:
-    """A campaign folder that was read and checked.
-
-    Parameters
-    ----------
-    campaign : dict
-        Content of ``campaign.json``.
-    runs : list of dict
-        Content of the run files, in the order of the campaign.
-    errors : dict or None
-        Content of the errors file that ``current_model`` names.
-    """
+    """Content of a checked campaign folder: ``campaign.json``, its run files in order, and the errors file of its ``current_model``."""
 
     campaign: Doc
     runs: list[Doc]
@@ -44,22 +34,12 @@ class Folder:
 
 
 def read_folder(folder: Path) -> Folder:
-    """Read and check a campaign folder.
-
-    Parameters
-    ----------
-    folder : Path
-        With ``campaign.json`` and its run files.
-
-    Returns
-    -------
-    Folder
-        Documents with everything that the files hold.
+    """Read and check a folder with ``campaign.json`` and its run files.
 
     Raises
     ------
     FileFormatError
-        For the first mistake in any file.
+        A file has a mistake; the first one is reported.
     """
     head = folder / CAMPAIGN_FILE
     if folder.exists() and not folder.is_dir():
@@ -90,26 +70,14 @@ def read_folder(folder: Path) -> Folder:
 
 
 def import_folder(store: Store, folder: Path) -> int:
-    """Store a campaign folder, all of it or, after any mistake, nothing.
-
-    Parameters
-    ----------
-    store : Store
-        Where to.
-    folder : Path
-        With ``campaign.json`` and its run files.
-
-    Returns
-    -------
-    int
-        Id of the campaign.
+    """Store a campaign folder, completely or not at all, and return the id of the campaign.
 
     Raises
     ------
     FileFormatError
-        For the first mistake in any file.
+        A file has a mistake; the first one is reported.
     StoreError
-        If a campaign of this name is there already.
+        The store already has a campaign of this name.
     """
     content = read_folder(folder)
     campaign, machine = content.campaign, content.campaign["machine"]
@@ -119,28 +87,14 @@ def import_folder(store: Store, folder: Path) -> int:
 
 
 def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
-    """Write a campaign as a folder. It appears complete or not at all.
-
-    Parameters
-    ----------
-    store : Store
-        Where from.
-    name_or_id : str or int
-        Campaign.
-    target : Path
-        Folder to make; an empty one may exist.
-
-    Returns
-    -------
-    Path
-        The folder.
+    """Write a campaign as the folder ``target``, completely or not at all, and return the folder.
 
     Raises
     ------
     FileFormatError
-        If the target exists and is not an empty folder, or cannot be written.
+        The target exists and is not an empty folder, or cannot be written.
     StoreError
-        If there is no such campaign, or its samples are damaged.
+        The store has no such campaign, or its samples are damaged.
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise FileFormatError(f"{target} exists and is not an empty folder: nothing was written", "give a new folder")
@@ -152,7 +106,7 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
     except OSError as err:
         raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a folder that may be written") from None
     try:
-        aside.chmod(0o755)  # mkdtemp makes private folders, this one is for others
+        aside.chmod(0o755)  # mkdtemp creates private folders; other users may read an export
         _write_folder(store, record, runs, aside)
         if target.exists():
             target.rmdir()
@@ -169,7 +123,7 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
     joined = {piece.run for run in runs if run.status == COMPLETE for piece in pieces_of(run.start_doc)}
     for run in runs:
         if run.id in joined:
-            continue  # its readings are in the run that it belongs to: one measurement must not count twice
+            continue  # its readings are part of the resumed run: a measurement must not count twice
         document = whole_document(store, run) if run.status == COMPLETE else run_document(run, store.chunks.of_run(run.id))
         entry = run.start_doc.get("entry") or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)

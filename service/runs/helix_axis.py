@@ -1,4 +1,4 @@
-"""The axis of a ball-bar path, and the angle about it: the one rule for reports, comparisons, screens and the live picture."""
+"""The axis of a ball-bar path and the angle about it: the common rule for reports, comparisons, pages and the live picture."""
 
 from __future__ import annotations
 
@@ -12,25 +12,22 @@ from abbe.models.machine import AXES
 from abbe.service.errors import MeasurementFault
 
 STRAIGHT = 0.8
-"""Along its axis a helix goes one way: its way forth is at least this share of all the way that it makes there."""
+"""Along its axis a helix advances: least ratio of net to total travel."""
 ROUND = 0.5
-"""Across its axis it goes round: its way forth is at most this share of all the way there. Less than a turn is no helix."""
+"""Across its axis a helix goes round: largest ratio of net to total travel. Less than a turn is no helix."""
 
 
 def helix_axis(setup: Mapping[str, Any], at_mm: F2) -> int | None:
-    """Axis that a helix winds about: as the set-up states it, else the one along which the commanded path advances.
+    """Axis of a helix, 0 to 2: as the set-up states it, else the axis along which the commanded path advances.
+
+    None if the set-up states no axis, and the path advances along none or along several.
 
     Parameters
     ----------
     setup : mapping
         Set-up of an ``abbe-run/1`` object.
     at_mm : array, shape (n, 3)
-        Commanded positions in the order of time, mm.
-
-    Returns
-    -------
-    int or None
-        0, 1 or 2; None where neither tells: the set-up states none, and the path advances along no axis or along several.
+        Commanded positions in chronological order, mm.
     """
     if setup.get("axis"):
         return AXES.index(str(setup["axis"]))
@@ -45,18 +42,18 @@ def helix_axis(setup: Mapping[str, Any], at_mm: F2) -> int | None:
 
 
 def about_axis(at_mm: F2, axis: int) -> F1:
-    """Angle of points about an axis, rad, shape (n,): from the axis that follows it to the one after that (about Z: from X to Y)."""
+    """Angle of points about an axis, rad, shape (n,), from the next axis towards the one after it (about Z: from X to Y)."""
     a, b = (axis + 1) % 3, (axis + 2) % 3
     return np.asarray(np.arctan2(at_mm[:, b], at_mm[:, a]), dtype=np.float64)
 
 
 def path_axis(run: Mapping[str, Any], at_mm: F2) -> int:
-    """Axis of a ball-bar run: of a circle the normal of its plane, of a helix by `helix_axis`.
+    """Axis of a ball-bar run: the normal of a circle's plane, or `helix_axis`.
 
     Raises
     ------
     MeasurementFault
-        Neither set-up nor path tells the axis of a helix: nothing is drawn about a guess.
+        Neither set-up nor path determines the axis of a helix.
     """
     setup = run["setup"]
     if run["test"] == "ballbar_circle":

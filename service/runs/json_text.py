@@ -1,4 +1,4 @@
-"""JSON text read strictly: what Python's own reader takes silently, or lets end in a traceback, is one FileFormatError."""
+"""Strict reading of JSON text: what Python's reader accepts silently, or ends with another exception, raises a FileFormatError."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import Any, NoReturn
 from abbe.service.errors import FileFormatError
 
 MAX_DIGITS = 308
-"""Longer integers are beyond float64 (and beyond 4300 digits Python refuses to read them at all)."""
+"""Longer integers exceed float64 (and Python refuses to read more than 4300 digits)."""
 
 
 def refuse_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """``object_pairs_hook`` of ``json.loads``: an object whose keys are all different.
+    """``object_pairs_hook`` of ``json.loads`` for objects with distinct keys.
 
     Raises
     ------
     ValueError
-        A key stands twice; of the two values only the last would have been seen.
+        A key occurs twice; Python would silently keep only the last value.
     """
     found: dict[str, Any] = {}
     for key, value in pairs:
@@ -31,21 +31,16 @@ def refuse_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def strict_json(text: str, path: Path, *, finite: bool = True) -> Any:
-    """Value of a JSON text.
+    """Value of a JSON text; ``path`` is named in errors.
 
-    Parameters
-    ----------
-    text : str
-    path : Path
-        File that the text comes from, for the messages.
-    finite : bool
-        Refuse ``NaN``, ``Infinity`` and numbers beyond float64 such as ``1e999``. Callers who check numbers themselves, and can say where
-        in the document one stands, give False.
+    ``finite``: refuse ``NaN``, ``Infinity`` and numbers beyond float64 such as ``1e999``. Callers that check numbers themselves, and can
+    name their place in the document, pass False.
 
     Raises
     ------
     FileFormatError
-        No JSON, a key twice in one object, nested too deeply, an integer of more than 308 digits, or (``finite``) a number that is none.
+        The text is no JSON, repeats a key in one object, is nested too deeply, has an integer of more than 308 digits, or (``finite``) a
+        number that is not finite.
     """
     strict: dict[str, Any] = {"parse_constant": _refuse, "parse_float": _finite} if finite else {}
     try:

@@ -1,4 +1,4 @@
-"""Laser records become columns: displacement along the beam minus what the commanded positions make of it."""
+"""Convert laser records to columns: displacement along the beam minus the nominal displacement of the commanded positions."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ MM_PER_COUNT = 1e-7
 
 
 def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
-    """Turn laser records into columns.
+    """Convert laser records to columns.
 
     Parameters
     ----------
     records : sequence of dict
         ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
-        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: nobody saw that standstill.
+        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: no reading at that standstill.
     start : dict
-        Start document (abbe.service.runs.columns).
+        Start document (`abbe.service.runs.columns`).
 
     Returns
     -------
     dict
-        Columns of ``abbe-run/1`` and ``status``, ``signal_permille``. The deviation is 0 at the first record, as there is no earlier one to
-        measure from; if that one is missing, it counts from where the laser was zeroed. A missing reading is a row with the commanded
-        position, deviation 0 and ``valid`` 0: later rows keep their places.
+        Columns of ``abbe-run/1`` and ``status``, ``signal_permille``. Deviations count from the first record, or from the laser's zero if
+        that record is missing. A missing reading is a row with the commanded position, deviation 0 and ``valid`` 0, so that later rows keep
+        their places.
     """
     first = records[0] if records else {}
     beam = start["setup"]["nominal_beam"]
@@ -49,5 +49,5 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
 def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[float]) -> float:
     if one.get("missing"):
         return 0.0
-    nominal_mm = sum(b * (now - then) for b, now, then in zip(beam, one["target_mm"], first["target_mm"], strict=True))
+    nominal_mm = sum(b * (now - before) for b, now, before in zip(beam, one["target_mm"], first["target_mm"], strict=True))
     return float((one["displacement_tenth_nm"] - first["displacement_tenth_nm"]) * MM_PER_COUNT - nominal_mm)

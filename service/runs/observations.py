@@ -1,4 +1,4 @@
-"""Runs as arrays for the solvers: the only place where measured columns become `RunData`."""
+"""Convert runs to arrays for the solvers: the only place where measured columns become `RunData`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.solvers.observations import RunData, Test, block_average, reading_noise_mm
 from abbe.service.errors import MeasurementFault
-from abbe.service.runs.approached import came_from
+from abbe.service.runs.approached import with_reversals
 
 BLOCKS = 400
-"""Values per ball-bar run that enter a solution: noise averages down, smooth errors stay."""
+"""Largest number of values per ball-bar run in a solution: averaging reduces noise and keeps smooth errors."""
 LEAST = 10
-"""Fewer valid readings than this are no measurement of anything."""
+"""Least number of valid readings of a run."""
 TESTS: dict[str, Test] = {"ballbar_helix": "helix", "ballbar_circle": "circle", "laser_diagonal": "diagonal", "laser_linear": "linear"}
 """Tests of run-format.md 3; plain diagonals are laser_diagonal without an order."""
 
@@ -26,8 +26,8 @@ def run_data(run: dict[str, Any], *, blocks: int = BLOCKS) -> RunData:
     Raises
     ------
     MeasurementFault
-        The run holds fewer than 10 valid readings, or none at all because it is sealed, or its test is none that this solver knows; or
-        something in it is no number, no length or no direction (named).
+        The run has fewer than 10 valid readings, is sealed, has a test unknown to the solver, or contains an invalid number, length or
+        direction.
     """
     try:
         return _run_data(run, blocks)
@@ -65,31 +65,31 @@ def _run_data(run: dict[str, Any], blocks: int) -> RunData:
 
 
 def _signs(run: dict[str, Any], axes_mm: F2) -> F2:
-    """Direction in which each axis last moved, from the rows that say where the machine was; an invalid one may not."""
-    there = np.isfinite(axes_mm).all(axis=1)
+    """Direction of each axis' last move, shape (n, 3), from the rows with finite positions; NaN for the others, which are invalid."""
+    known = np.isfinite(axes_mm).all(axis=1)
     out = np.full(axes_mm.shape, np.nan)
-    path, rows = came_from(run, axes_mm) if there.all() else (axes_mm[there], np.arange(int(there.sum())))
-    out[there] = travel_sign(path)[rows]
+    path, rows = with_reversals(run, axes_mm) if known.all() else (axes_mm[known], np.arange(int(known.sum())))
+    out[known] = travel_sign(path)[rows]
     return out
 
 
 def _since_first(deviation_mm: F1, *, first_valid: bool) -> F1:
-    """Laser deviations since the first VALID record.
+    """Laser deviations relative to the first valid record.
 
-    A laser run counts from its first record. Where that one is not valid the run begins with the next, and so must the counting: an offset
-    of everything after it would otherwise pass for an error of the zero.
+    A laser run counts from its first record. If that one is invalid, the deviations are shifted to the first valid one; otherwise the
+    common offset would look like an error of the zero.
     """
     return deviation_mm if first_valid else deviation_mm - deviation_mm[0]
 
 
 def _tool(setup: dict[str, Any]) -> F1 | None:
-    """Tool of this run if its set-up names one, else None (the machine's own)."""
+    """Tool of this run if its set-up states one, else None (the machine's own)."""
     tool = setup.get("tool_mm")
     return None if tool is None else np.asarray(tool, dtype=np.float64)
 
 
 def beam_of(setup: dict[str, Any], label: str) -> F1:
-    """Nominal beam, a unit vector: as stated, else along the test, from its start to its end (a laser_linear along its axis)."""
+    """Nominal beam as a unit vector: as stated, else from start to end of the test (of a ``laser_linear`` along its axis)."""
     if setup.get("nominal_beam") is not None:
         beam = np.asarray(setup["nominal_beam"], dtype=np.float64)
     else:
@@ -103,7 +103,7 @@ def beam_of(setup: dict[str, Any], label: str) -> F1:
 
 
 def bar_noise_mm(run: dict[str, Any]) -> float:
-    """Standard deviation of one valid ball-bar reading (`abbe.models.solvers.observations.reading_noise_mm`)."""
+    """Standard deviation of one valid ball-bar reading, mm (`abbe.models.solvers.observations.reading_noise_mm`)."""
     columns = run["columns"]
     values = np.asarray(columns["deviation_mm"], dtype=np.float64)
     return reading_noise_mm(values[np.asarray(columns.get("valid", np.ones(values.size))).astype(bool)])

@@ -1,4 +1,4 @@
-"""A path that was measured in pieces: how far broken runs have read it, and their readings and the last run's as one."""
+"""A path measured in pieces: the progress of interrupted runs, and joining their readings with those of the last run."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import RunRecord
 
 STRETCH_S, STRETCH_MM = 0.5, 5.0
-"""So long, and at least so far, is what is read twice."""
+"""Duration, and least length, of the stretch that is read twice."""
 LEAST_READINGS = 5
 MOST_LOST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class RunPiece:
-    """A run that was broken off, and up to where on the whole path (mm from its first point) its readings count."""
+    """An interrupted run, and the position on the whole path up to which its readings count, mm from the first point."""
 
     run: int
     to_mm: float
 
 
 @dataclass(frozen=True, slots=True)
-class SoFar:
-    """How far a path was read: its pieces, the last one up to where it was at constant feed; from where on that one counts; what it read.
+class ReadProgress:
+    """Progress of a path: its pieces, the last one up to the end of its constant feed, and the readings of the last piece.
 
-    ``arc_mm`` and ``deviation_mm``, shape (n,): of the last piece, along the whole path. ``boot_id``: of the box that read.
+    ``counted_from_mm``: start of the counted part of the last piece; ``arc_mm`` and ``deviation_mm``, shape (n,): position along the whole
+    path and reading; ``boot_id``: of the box.
     """
 
     pieces: tuple[RunPiece, ...]
@@ -47,20 +48,12 @@ def arc_of(points: Sequence[Sequence[float]]) -> F1:
 
 
 def pieces_of(start: Doc) -> tuple[RunPiece, ...]:
-    """The broken runs whose readings belong to a run, oldest first; none for a run that was measured in one go."""
+    """The interrupted runs whose readings belong to a run, oldest first; empty for a run without interruption."""
     return tuple(RunPiece(int(one["run"]), float(one["to_mm"])) for one in (start.get("path") or {}).get("pieces", []))
 
 
-def read_so_far(record: RunRecord, columns: Doc) -> SoFar | None:
-    """How far a broken run has read its path; None if it gives nothing that could be gone on with.
-
-    Parameters
-    ----------
-    record : RunRecord
-        The run that was broken off.
-    columns : dict
-        Its columns.
-    """
+def progress_of(record: RunRecord, columns: Doc) -> ReadProgress | None:
+    """Progress of an interrupted run with these columns; None if the path cannot be resumed from it."""
     path, end = record.start_doc.get("path"), record.end_doc or {}
     if not path or "good_us" not in end or "box_boot_id" not in end:
         return None
@@ -73,29 +66,29 @@ def read_so_far(record: RunRecord, columns: Doc) -> SoFar | None:
     seq = np.asarray(columns["device_seq"], dtype=np.int64)
     lost = int(seq[-1] - seq[0]) % 2**32 + 1 - seq.size if seq.size else 0
     if lost > max(1.0, MOST_LOST * seq.size):
-        return None  # a line that bad ends a run (abbe.service.capture); it must not get in by pieces
+        return None  # such a loss ends a run (abbe.service.capture), so pieces must not have it either
     known = at_mm <= good_mm
-    good_mm = float(at_mm[known].max(initial=0.0))  # a bar that was out of range before anything else stopped has read no farther
+    good_mm = float(at_mm[known].max(initial=0.0))  # the bar may have left its range before the feed changed
     if good_mm - counted_mm < max(STRETCH_MM, STRETCH_S * feed_mm_s) or int(known.sum()) < LEAST_READINGS:
         return None
     pieces = (*pieces_of(record.start_doc), RunPiece(record.id, offset + good_mm))
     deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)[valid]
-    return SoFar(pieces, offset + counted_mm, offset + at_mm[known], deviation[known], int(end["box_boot_id"]))
+    return ReadProgress(pieces, offset + counted_mm, offset + at_mm[known], deviation[known], int(end["box_boot_id"]))
 
 
 def along_mm(start: Doc, end: Doc, columns: Doc) -> Any:
-    """Where along its own path each reading of a broken run was taken, mm from the path's first point; shape (n,)."""
+    """Position of each reading of an interrupted run along its own path, mm from the first point, shape (n,)."""
     since_s = np.asarray(columns["t_s"], dtype=np.float64) - (end["path_start_us"] - start["ctrl0_us"]) * 1e-6
     return since_s * start["path"]["feed_mm_min"] / 60.0
 
 
-def up_to(record: RunRecord, columns: Doc, to_mm: float) -> Doc:
-    """The columns of a broken run as far as they count."""
+def counted_columns(record: RunRecord, columns: Doc, to_mm: float) -> Doc:
+    """The columns of an interrupted run before ``to_mm`` on the whole path."""
     offset = float(record.start_doc["path"].get("offset_mm", 0.0))
     counts = offset + along_mm(record.start_doc, record.end_doc or {}, columns) < to_mm
     return {name: [v for v, yes in zip(values, counts, strict=True) if yes] for name, values in columns.items()}
 
 
 def joined(parts: list[Doc]) -> Doc:
-    """Columns one after the other."""
+    """Concatenate the columns of several parts."""
     return {name: [v for part in parts for v in part[name]] for name in parts[-1]}

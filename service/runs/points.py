@@ -1,4 +1,4 @@
-"""Points at which somebody asks for the deviation: a CSV file with one commanded position per row."""
+"""Read the points for a prediction: a CSV file with one commanded position per row."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ DIRECTION = ("direction_x", "direction_y", "direction_z")
 TOOL = ("tool_x_mm", "tool_y_mm", "tool_z_mm")
 KNOWN = POSITION + DIRECTION + TOOL
 _MEANT = frozenset(("x", "y", "z", "direction", "dir", "tool"))
-"""A column whose name starts so was meant to say something: it is never passed over in silence."""
+"""A column whose name starts like this was meant for this format and is never ignored."""
 BLOCK = 4096
-"""Rows that are held as text at a time: a point is a hundred times as large as text in Python than as three numbers."""
+"""Rows held as text at a time: as Python text, a point takes a hundred times as much memory as three numbers."""
 
 Lines = NDArray[np.int64]
 
@@ -34,7 +34,6 @@ class PointsFile:
 
     Parameters
     ----------
-    path : Path
     axes_mm : array, shape (n, 3)
         Commanded positions.
     direction : array, shape (n, 3), or None
@@ -42,11 +41,11 @@ class PointsFile:
     directed : tuple of int
         Axes that have a direction column.
     tool_mm : array, shape (n, 3), or None
-        Tool at each point, where the file has one.
+        Tool at each point; None without such columns.
     lines : array of int, shape (n,)
-        Line of the file on which each point stands.
+        Line of each point in the file.
     unused : list of str
-        Columns that mean nothing here.
+        Unknown columns.
     """
 
     path: Path
@@ -66,12 +65,12 @@ def read_points(path: Path) -> PointsFile:
     """Read and check a points file.
 
     Columns ``x_mm,y_mm,z_mm``; optional ``direction_x`` .. ``direction_z`` (-1, 0 or +1) and, all three or none, ``tool_x_mm`` ..
-    ``tool_z_mm``. Others are kept out and named in ``unused``.
+    ``tool_z_mm``. Other columns are ignored and listed in ``unused``.
 
     Raises
     ------
     FileFormatError
-        For the first mistake: file, column and row.
+        The file has a mistake; the message names file, column and row of the first one.
     """
     stream = _rows(path)
     _, first = next(stream, (0, None))
@@ -107,7 +106,7 @@ def read_points(path: Path) -> PointsFile:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of each row that is not blank, the header first."""
+    """Line number and cells of each non-blank row, header first."""
     line = 0
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -152,7 +151,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Some rows as text: the file, how many points stand above them, their lines and cells."""
+    """A block of rows as text: the file, the number of points above it, its line numbers and cells."""
 
     path: Path
     above: int
@@ -182,7 +181,7 @@ class _Block:
 
 
 def _number(cell: str) -> float:
-    """A number as CSV files have them; Python alone would read ``1_00`` and digits of every script."""
+    """A number of a CSV cell, else NaN; ``float`` alone would also accept ``1_00`` and non-ASCII digits."""
     if not cell.isascii() or "_" in cell:
         return math.nan
     try:

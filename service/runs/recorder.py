@@ -1,4 +1,4 @@
-"""What a runner gives its samples to. Who keeps them, and how safely, is another matter (abbe.service.capture)."""
+"""Protocol for the receiver of a run's samples; `abbe.service.capture` implements it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from abbe.drivers.api import BarBatch, BarTap
 
 
 class Recorder(Protocol):
-    """Takes what one run produces."""
+    """Receives and stores the data of one run."""
 
     def tap(self) -> BarTap:
-        """What a new stream gives every sample to, before anybody else sees it."""
+        """The first receiver of every sample of a new stream."""
         ...
 
     async def add_bar(self, batch: BarBatch) -> None:
-        """Hear of a batch that the tap has taken; raises when the samples are not safe, so that the motion stops."""
+        """Account for a batch that the tap received; raises if its samples are not safe, so that the motion stops."""
         ...
 
     async def flush(self) -> None:
-        """Wait until everything given so far is on the disk."""
+        """Wait until all data received so far are on the disk."""
         ...
 
     async def add_record(self, record: dict[str, Any]) -> None:
-        """Take one record of the laser, or of another instrument that is asked for single readings."""
+        """Store one record of the laser, or of another instrument with single readings."""
         ...

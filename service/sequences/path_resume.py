@@ -18,7 +18,7 @@ from abbe.drivers.api import BarSample, ControllerStatus
 from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.models.arrays import F1
 from abbe.service.errors import RunInterrupted, StretchDiffers
-from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, RunPiece, SoFar, arc_of
+from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, ReadProgress, RunPiece, arc_of
 from abbe.service.sequences.steps import Point, RecordPath
 
 LEAD_S, LEAD_MM = 0.5, 5.0
@@ -107,7 +107,7 @@ class PathRemainder:
         return {"offset_mm": self.offset_mm, "pieces": [{"run": p.run, "to_mm": p.to_mm} for p in self.pieces]}
 
 
-def rest_of_path(step: RecordPath, so_far: SoFar) -> tuple[RecordPath, int, PathRemainder] | None:
+def rest_of_path(step: RecordPath, so_far: ReadProgress) -> tuple[RecordPath, int, PathRemainder] | None:
     """Return the rest of a path, the number of its first point, and its `PathRemainder`.
 
     None: resuming saves nothing, or there are too few readings to compare with.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.errors import SetupDisturbed
-from abbe.service.runs.pieces import SoFar
+from abbe.service.runs.pieces import ReadProgress
 from abbe.service.sequences.path_resume import PathRemainder, rest_of_path
 from abbe.service.sequences.recipes.approach import cup_of, over_pole
 from abbe.service.sequences.steps import (
@@ -83,7 +83,7 @@ Rest = tuple[TestPlan, int, ResumeTrail, PathRemainder | None]
 
 
 def rest_of(
-    test: TestPlan, hand: int | None, records: tuple[dict[str, Any], ...], before: Point | None, so_far: SoFar | None = None
+    test: TestPlan, hand: int | None, records: tuple[dict[str, Any], ...], before: Point | None, so_far: ReadProgress | None = None
 ) -> Rest:
     """Return the rest of a test, the number of its first step, the way back to it, and the rest of an interrupted path.
 
@@ -95,7 +95,7 @@ def rest_of(
         Laser records of complete points since this mounting's zero, oldest first; none for a ball-bar.
     before : tuple of float, optional
         End position of the previous test, if both share the set-up.
-    so_far : SoFar, optional
+    so_far : ReadProgress, optional
         How far the path was read in this mounting.
     """
     first = 0 if hand is None else hand + 1
@@ -113,7 +113,7 @@ def rest_of(
     return replace(test, steps=steps), first, _to_beginning(_trail(start, _by_itself(steps)), steps), None
 
 
-def _along_path(test: TestPlan, first: int, start: Point | None, so_far: SoFar) -> Rest | None:
+def _along_path(test: TestPlan, first: int, start: Point | None, so_far: ReadProgress) -> Rest | None:
     """Return the rest that begins on the path, or None."""
     steps = _by_itself(test.steps[first:])
     k = next((k for k, step in enumerate(steps) if isinstance(step, RecordPath)), None)

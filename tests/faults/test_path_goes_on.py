@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from abbe.drivers.errors import Rebooted
-from abbe.service.campaign_data.run_times import times
+from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
@@ -230,9 +230,9 @@ async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_pa
         ours, theirs = load_run(store, runs(store)[-1].id), load_run(other, record.id)
     assert theirs["columns"]["deviation_mm"] == ours["columns"]["deviation_mm"]
     assert theirs["timing"]["pieces"] == ours["timing"]["pieces"]
-    assert not times([theirs])  # a pause of any length is no wrong clock
+    assert not time_issues([theirs])  # a pause of any length is no wrong clock
     later = [t + (3600.0 if k >= ours["timing"]["pieces"][0]["readings"] else 0.0) for k, t in enumerate(ours["columns"]["t_s"])]
-    assert not times([ours | {"columns": ours["columns"] | {"t_s": later}}])
+    assert not time_issues([ours | {"columns": ours["columns"] | {"t_s": later}}])
 
 
 async def test_a_box_that_was_restarted_begins_again(place):

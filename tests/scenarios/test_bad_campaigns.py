@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from abbe.service.campaign_data.copied_runs import copies
+from abbe.service.campaign_data.copied_runs import copy_issues
 from abbe.service.errors import AbbeError, CampaignRefused
 from abbe.service.identification.solve import check_campaign
 from tests.experiments.campaigns import population
@@ -228,8 +228,8 @@ def coarse(name, later_s):
 
 def test_repeats_of_a_coarse_sensor_are_no_copies():
     """Alike to the last digit, at other times: the sensor shows no noise. With the same times it is one measurement."""
-    assert copies([coarse("a", 0.0), coarse("b", 300.0), coarse("c", 600.0)]) == []
-    twice = copies([coarse("a", 0.0), coarse("b", 0.0)])
+    assert copy_issues([coarse("a", 0.0), coarse("b", 300.0), coarse("c", 600.0)]) == []
+    twice = copy_issues([coarse("a", 0.0), coarse("b", 0.0)])
     assert [f.run for f in twice] == ["b"]
     assert "its readings are those of run a" in twice[0].line
 
@@ -239,7 +239,7 @@ def test_visits_at_one_place_are_no_copy_of_the_line_that_passes_it():
     line, visits = coarse("line", 0.0), coarse("visits", 500.0)
     visits["columns"] |= {"x_mm": [20.0] * 12, "direction": [1, -1] * 6}
     visits["columns"]["deviation_mm"] = [line["columns"]["deviation_mm"][k] for k in (2, 9)] * 6
-    assert copies([line, visits]) == []
+    assert copy_issues([line, visits]) == []
 
 
 def test_noise_alone_makes_no_two_runs_alike():
@@ -250,4 +250,4 @@ def test_noise_alone_makes_no_two_runs_alike():
     for run in twice:
         y = np.array(run["columns"]["deviation_mm"]) + rng.normal(0, 2.5e-4, 500)
         run["columns"]["deviation_mm"] = np.round(y, 4).tolist()
-    assert copies(twice) == []
+    assert copy_issues(twice) == []

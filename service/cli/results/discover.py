@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
-    from abbe.service.discovery.discover_live import Added
+    from abbe.service.discovery.discover_live import Addition
     from abbe.service.domain.finding import Finding
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
@@ -82,16 +82,16 @@ def opened(campaign: str, db: str | None, machine: Path | None, without: list[st
 
 def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, DiscoveryJournal]:
     """Return the job and its journal."""
-    from abbe.service.discovery.changed_since import since_of
+    from abbe.service.discovery.changed_since import reference_solution
     from abbe.service.discovery.discover import DiscoveryJournal, prepare
     from abbe.service.discovery.discovery_store import journal_of
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
-    from abbe.service.identification.table_removal import NO_TABLE, table_then
+    from abbe.service.identification.table_removal import NO_TABLE, campaign_table
 
     base = None if store is None else current(store, campaign.site.name)
-    table = NO_TABLE if store is None else table_then(store, campaign)
-    since = None if store is None else since_of(store, campaign)
+    table = NO_TABLE if store is None else campaign_table(store, campaign)
+    since = None if store is None else reference_solution(store, campaign)
     job = prepare(campaign, catalogue(), base, table=table, since=since)
     return job, DiscoveryJournal() if store is None else journal_of(store, job)
 
@@ -116,7 +116,7 @@ def _run_live(
 
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
-    from abbe.service.discovery.discover_live import ROUNDS, added, next_search, rounds
+    from abbe.service.discovery.discover_live import ROUNDS, addition_count, find_addition, next_search
     from abbe.service.discovery.discovery_store import StoredJournal
     from abbe.service.discovery.experiment_recipes import next_plan
     from abbe.service.site import site_of
@@ -127,7 +127,7 @@ def _run_live(
         if finding.next_test is None or not isinstance(journal, StoredJournal):
             break
         _print(job, journal, finding)
-        number = rounds(store, job.campaign.name) + 1
+        number = addition_count(store, job.campaign.name) + 1
         name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
         test = finding.next_test
         about = replace(finding.where, runs=(test.like,)) if finding.verdict == "unknown" and test.like else None
@@ -135,9 +135,9 @@ def _run_live(
         if wanted.plan is None:
             typer.echo(f"by hand: Abbe cannot run {', '.join(wanted.by_hand)} on this machine")
             break
-        addition = added(store, job.campaign, wanted.plan, wanted.after_s)
+        addition = find_addition(store, job.campaign, wanted.plan, wanted.after_s)
         wait_s = _measured(store, site, job.campaign, addition, accept_table=accept_table)
-        accept_table = accept_table and addition.left is None  # the person has accepted the present table, not a later one
+        accept_table = accept_table and addition.remaining is None  # the person has accepted the present table, not a later one
         if wait_s > 0.0:
             start = SystemClock().utc() + timedelta(seconds=wait_s + 1.0)
             what_for = ", ".join(test.adds)
@@ -148,7 +148,7 @@ def _run_live(
     return job, journal, finding
 
 
-def _measured(store: Store, site: Site, campaign: Campaign, addition: Added, *, accept_table: bool) -> float:
+def _measured(store: Store, site: Site, campaign: Campaign, addition: Addition, *, accept_table: bool) -> float:
     """Run the rest of an added measurement on the machine; a stop reports what is kept. Return the seconds to wait, or 0."""
     from abbe.service.cli.measure import ready_session
     from abbe.service.cli.progress import display
@@ -156,9 +156,9 @@ def _measured(store: Store, site: Site, campaign: Campaign, addition: Added, *, 
     from abbe.service.discovery.discover_live import measure_added
 
     if addition.begun is not None:
-        done = len(addition.plan.tests) - (0 if addition.left is None else len(addition.left.tests))
+        done = len(addition.plan.tests) - (0 if addition.remaining is None else len(addition.remaining.tests))
         typer.echo(f"resuming campaign {addition.plan.name!r}: {done} of {len(addition.plan.tests)} runs are measured")
-    if addition.left is None:
+    if addition.remaining is None:
         return 0.0
 
     async def work() -> float:
@@ -210,7 +210,7 @@ def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, jso
 
 
 def _print(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> None:
-    from abbe.service.discovery.discovery_words import lines_of
+    from abbe.service.discovery.discovery_text import lines_of
 
     typer.echo(f"campaign {job.campaign.name}: {len(finding.runs)} runs, {len(job.effects)} effects in the catalogue")
     for line in job.flags:

@@ -48,7 +48,7 @@ def show_model(
     as_json: JsonOption = False,
 ) -> None:
     """Show one version: its effects with their size, their remedy, and the runs they came from."""
-    from abbe.service.discovery.discovery_words import size_text
+    from abbe.service.discovery.discovery_text import size_text
     from abbe.service.effects.model_book import REMEDIES
 
     with open_store(database_url(db, machine_file)) as store:
@@ -76,7 +76,7 @@ def diff_models(
     as_json: JsonOption = False,
 ) -> None:
     """Show the effects that were added, removed or resized between two versions."""
-    from abbe.service.discovery.discovery_words import unit
+    from abbe.service.discovery.discovery_text import unit
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import differences, version
     from abbe.service.rendering.numbers import with_uncertainty

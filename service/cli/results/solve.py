@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.identification.solve import Solved
-    from abbe.service.identification.solve_report import Account
+    from abbe.service.identification.solve_report import Assessment
     from abbe.service.storage.store import Store
 
 
@@ -71,10 +71,10 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 
     A folder's result is stored only if --db or --machine names a database. A run that contradicts its description is refused (exit code 2).
     """
-    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, keep
+    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, store_solution
     from abbe.service.domain.solution_file import SolutionFile
-    from abbe.service.identification.effect_removal import taken_out
-    from abbe.service.identification.table_removal import table_then
+    from abbe.service.identification.effect_removal import remove_effects
+    from abbe.service.identification.table_removal import campaign_table
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:
@@ -86,16 +86,16 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         summary, doc = _solved(chosen, wanted)
         if db is not None or machine is not None:
             with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: a refusal creates no database
-                doc |= keep(store, found, doc)
+                doc |= store_solution(store, found, doc)
         if report is not None:
             _write_report(None, chosen, summary, doc, machine, report)
     else:
         with stored_campaign(campaign, database_url(db, machine)) as (store, found):
             chosen = found.without(without or [])
-            known = taken_out(store, chosen, table_then(store, chosen))
+            known = remove_effects(store, chosen, campaign_table(store, chosen))
             summary, doc = _solved(known.campaign, wanted)
             doc |= known.doc
-            doc |= keep(store, found, doc)
+            doc |= store_solution(store, found, doc)
             if report is not None:
                 _write_report(store, chosen, summary, doc, machine, report)
     if as_json:
@@ -136,12 +136,12 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
         yield store, found
 
 
-def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[str, Any]]:
+def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
     """Return the account of the solution and its document, with progress on stderr."""
     from abbe.service.cli.progress import display
     from abbe.service.domain.progress import Progress
     from abbe.service.identification.solve import solve_runs
-    from abbe.service.identification.solve_report import account, as_doc, solution_of
+    from abbe.service.identification.solve_report import as_doc, assess, solution_of
 
     with display() as sink:
         stages = iter(range(1, STAGES))
@@ -149,16 +149,16 @@ def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Account, dict[st
         def report_stage(text: str) -> None:
             sink(Progress("solve", float(next(stages, STAGES - 1)), float(STAGES), None, text))
 
-        solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, say=report_stage)
+        solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, progress=report_stage)
         report_stage("what these runs cannot tell, and how well the volume is known")
-        summary = account(solved)
+        summary = assess(solved)
         solution = solution_of(summary).model_copy(update=_more(summary, wanted, report_stage))
         doc = {"campaign": campaign.name, "machine": campaign.site.doc} | as_doc(solution)
         sink(Progress("solve", float(STAGES), float(STAGES), 0.0, "done"))
     return summary, doc
 
 
-def _more(summary: Account, wanted: _SolveRequest, report_stage: Callable[[str], None]) -> dict[str, Any]:
+def _more(summary: Assessment, wanted: _SolveRequest, report_stage: Callable[[str], None]) -> dict[str, Any]:
     """Return the results that take longer, as requested. The grid is written here: if it is refused, nothing is stored."""
     out: dict[str, Any] = {}
     if not (wanted.tables or wanted.grid or wanted.trials):
@@ -178,7 +178,7 @@ def _more(summary: Account, wanted: _SolveRequest, report_stage: Callable[[str],
 
 
 def _write_report(
-    store: Store | None, campaign: Campaign, summary: Account, doc: dict[str, Any], machine: Path | None, target: Path
+    store: Store | None, campaign: Campaign, summary: Assessment, doc: dict[str, Any], machine: Path | None, target: Path
 ) -> None:
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
@@ -191,7 +191,7 @@ def _write_report(
     write_document(solution_report(store, campaign, SolutionResult(doc, doc.get("solution_id"), summary), made, rules), target)
 
 
-def _print(summary: Account, solution: SolutionFile) -> None:
+def _print(summary: Assessment, solution: SolutionFile) -> None:
     from abbe.service.identification.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
     from abbe.service.identification.table_removal import table_line
 
@@ -228,7 +228,7 @@ def _lines(heading: str, lines: list[str]) -> None:
         typer.echo(f"- {text}")
 
 
-def _parameters(summary: Account) -> None:
+def _parameters(summary: Assessment) -> None:
     from abbe.models.compensation.summary import SCALE_NOTE
     from abbe.service.identification.solve_report import HIDDEN_NOTE
 
@@ -246,7 +246,7 @@ def _parameters(summary: Account) -> None:
     typer.echo("error motions, each for itself: " + "; ".join(f"{s}: {names}" for s, names in words.items()))
 
 
-def _comparison(summary: Account) -> None:
+def _comparison(summary: Assessment) -> None:
     from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE
 
     solved = summary.solved

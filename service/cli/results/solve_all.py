@@ -46,10 +46,10 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
 
 def _executor(workers: int, dask: str | None) -> Executor:
     from abbe.service.errors import ConfigError
-    from abbe.service.identification.executors import Dask, Here, Processes
+    from abbe.service.identification.executors import DaskExecutor, ProcessExecutor, SerialExecutor
 
     if dask is None:
-        return Here() if workers == 1 else Processes(workers)
+        return SerialExecutor() if workers == 1 else ProcessExecutor(workers)
     if workers != 1:
         raise ConfigError("--workers and --dask both say where to compute", "give one of them")
-    return Dask(dask)
+    return DaskExecutor(dask)

@@ -14,7 +14,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.rendering.document import Document
 from abbe.service.report.report_measured import Measured, run_report
 from abbe.service.report.report_parts import Rules
-from abbe.service.runs.cases import set_once
+from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
 from abbe.service.site import Site, machine_from_doc
 from abbe.service.storage.store import Store
@@ -73,7 +73,7 @@ def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[dict[st
     """A run as an ``abbe-run/1`` object, and its report."""
     owner = store.campaigns.find(record.campaign_id)
     machine: dict[str, Any] = store.machines.get(owner.machine_id).doc
-    run = set_once([load_run(store, record.id)])[0]
+    run = with_earliest_mounting([load_run(store, record.id)])[0]
     site = Site(str(machine.get("name") or record.campaign), machine_from_doc(machine), machine, DeviceUrls())
     known = owner.doc.get("imported") or owner.doc
     return run, run_report(Measured(Campaign(record.campaign, site, [run], None, known)), record.label, rules)

@@ -113,7 +113,7 @@ def _screen(stored: StoredField, campaign: str, query: VolumeQuery, found: NodeM
     return VolumeScreen(
         stored.number, campaign, VolumeQuery(query.motions, query.plane, at, n), motions, list(stored.hidden.items()), node_lines(found),
         [placed(float(v), place) for v in levels], f"/api/v1/solutions/{stored.number}/field?{urlencode(parameters)}", picture, figures,
-        int((~found.told).sum()), steps(top), top, magnified,
+        int((~found.significant).sum()), steps(top), top, magnified,
     )  # fmt: skip
 
 
@@ -137,7 +137,7 @@ def _slice(found: NodeMap, plane: str, at: int) -> SlicePlane:
         grid = values.reshape(n, n, n, *values.shape[1:]).take(at, axis=third)
         return grid if across < up else np.swapaxes(grid, 0, 1)
 
-    return SlicePlane(plane, cut(found.points_mm), cut(found.deviation_um), cut(2.0 * found.u_um[:, 3]), cut(found.told))
+    return SlicePlane(plane, cut(found.points_mm), cut(found.deviation_um), cut(2.0 * found.u_um[:, 3]), cut(found.significant))
 
 
 def node_lines(found: NodeMap) -> list[NodeLine]:
@@ -145,7 +145,7 @@ def node_lines(found: NodeMap) -> list[NodeLine]:
     frame = current()
     values = np.column_stack([found.deviation_um, found.length_um])
     out = []
-    for place, row, u, significant in zip(found.points_mm, values, found.u_um, found.told, strict=True):
+    for place, row, u, significant in zip(found.points_mm, values, found.u_um, found.significant, strict=True):
         x, y, z = (placed(float(v), frame.drawn("mm")) for v in place)
         parts = tuple(frame.with_u(float(v), float(s)) if s > STILL_UM else (STILL, STILL) for v, s in zip(row, u, strict=True))
         out.append(NodeLine((x, y, z), parts, bool(significant)))

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from abbe.service.identification.executors import Dask, Executor, Here, Processes
+from abbe.service.identification.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from abbe.service.identification.reanalysis import ReanalysisTask, solve_all, tasks_of
 from abbe.service.storage.store import Store
 from tests.many_campaigns import dask_cluster, fill
@@ -29,16 +29,16 @@ def compared(progress: Callable[[str], None]) -> dict:
             fill(store, Path(folder), range(1, CAMPAIGNS + 1))
             tasks = tasks_of(store, url, "june-*", MODEL)
         progress("reanalysis: one process")
-        wanted, first_s = _timed(Here(), tasks)
+        wanted, first_s = _timed(SerialExecutor(), tasks)
         found = {"one process": {"wall_s": first_s, "right": all(json.loads(wanted)), "cores": len(os.sched_getaffinity(0))}}
         for workers in WORKERS:
             progress(f"reanalysis: {workers} processes")
-            told, wall_s = _timed(Processes(workers), tasks)
+            told, wall_s = _timed(ProcessExecutor(workers), tasks)
             found[f"{workers} processes"] = {"wall_s": wall_s, "right": told == wanted}
         if importlib.util.find_spec("distributed") is not None:
             progress(f"reanalysis: Dask, {WORKERS[-1]} workers")
             with dask_cluster(WORKERS[-1]) as address:
-                told, wall_s = _timed(Dask(address), tasks)
+                told, wall_s = _timed(DaskExecutor(address), tasks)
             found[f"Dask, {WORKERS[-1]} workers"] = {"wall_s": wall_s, "right": told == wanted}
     progress("")
     return found

@@ -12,7 +12,7 @@ from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import InstrumentsDisagree
 from abbe.service.identification.solve import Solved, solve_runs
-from abbe.service.identification.solve_report import account, solution_doc
+from abbe.service.identification.solve_report import assess, solution_doc
 from abbe.service.report.solution_sections import parameter_rows
 from abbe.service.site import Site, machine_doc
 from tests.models.solvers.truth import MACHINE, Truth
@@ -65,7 +65,7 @@ def test_every_step_diagonal_figure_has_its_uncertainty_and_says_what_is_not_in_
 
 
 def test_words_on_the_screen_say_the_same(solved, capsys):
-    told = account(solved)
+    told = assess(solved)
     _print(told, SolutionFile.read({"campaign": "c1"} | solution_doc(told)))
     text = " ".join(capsys.readouterr().out.split())
     for words in ("about that sphere only", "Tilt of the mirrors", "temperature", "step diagonals XYZ", "one tool length"):

@@ -11,10 +11,10 @@ from abbe.models.paths.lines import step_diagonal
 from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.campaign_data.campaign_issue import CampaignIssue
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, revision, run_digest, versions
-from abbe.service.campaign_data.run_geometry import geometry
-from abbe.service.campaign_data.run_times import times
+from abbe.service.campaign_data.run_geometry import geometry_mistake
+from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.errors import CampaignRefused
-from abbe.service.identification.solve import _whole
+from abbe.service.identification.solve import _longest_contained
 
 MACHINE = {"chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 
@@ -56,7 +56,7 @@ def put(found, **keys):
 
 
 def text(found):
-    what = geometry(MACHINE, found)
+    what = geometry_mistake(MACHINE, found)
     assert what is not None
     assert what.refuse
     assert what.remedy
@@ -65,7 +65,7 @@ def text(found):
 
 @pytest.mark.parametrize("good", [helix(), circle(), diagonal(), diagonal("ZYX")], ids=["helix", "circle", "diagonal", "reversed order"])
 def test_runs_as_they_should_be_are_left_alone(good):
-    assert geometry(MACHINE, good) is None
+    assert geometry_mistake(MACHINE, good) is None
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_exchanged_axes_of_a_cube_show_in_the_order_of_the_steps():
 
 def test_a_run_beyond_the_stroke_names_axis_and_stroke():
     small = {"stroke_mm": MACHINE["stroke_mm"] | {"Z": [0, 200]}}
-    what = geometry(small, helix())
+    what = geometry_mistake(small, helix())
     assert what is not None
     assert what.text == "Z goes 50 mm beyond the stroke 0 to 200 mm"
 
@@ -175,16 +175,16 @@ def fed(run, label, start, factor=1.0):
 
 def test_times_in_ms_and_runs_at_the_same_time_are_flagged_by_name():
     good = [fed(helix(), "a", 0), fed(helix(), "b", 2000), fed(circle(), "c", 4000)]
-    assert times(good) == []
-    (flag,) = times([*good, fed(helix(), "d", 6000, factor=1e3)])
+    assert time_issues(good) == []
+    (flag,) = time_issues([*good, fed(helix(), "d", 6000, factor=1e3)])
     assert (flag.run, flag.refuse) == ("d", False)
     assert "t_s holds ms" in flag.what
-    (flag,) = times([*good, fed(helix(), "e", 2010)])
+    (flag,) = time_issues([*good, fed(helix(), "e", 2010)])
     assert {flag.run} <= {"b", "e"}
     assert "lies within that of run" in flag.what
 
 
 def test_a_set_up_is_found_by_its_whole_name():
-    assert _whole(["B1", "B12", "B"], "cup_B12_x") == "B12"
-    assert _whole(["B1"], "cup_B12_x") is None
-    assert _whole(["r1", "far_r1"], "zero_far_r1") == "far_r1"
+    assert _longest_contained(["B1", "B12", "B"], "cup_B12_x") == "B12"
+    assert _longest_contained(["B1"], "cup_B12_x") is None
+    assert _longest_contained(["r1", "far_r1"], "zero_far_r1") == "far_r1"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.service.discovery.discovery_answer import answer_doc
-from abbe.service.discovery.discovery_words import verdict_of
+from abbe.service.discovery.discovery_text import verdict_of
 from tests.service.discovery.axis_bench import cycles, searched
 
 

@@ -18,16 +18,16 @@ import pytest
 from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.models.discovery.changed import comparison as changed
-from abbe.service.campaign_data.campaign_folder import from_store, keep
-from abbe.service.discovery.changed_since import since_of
-from abbe.service.discovery.changed_words import changed_lines, changed_words, proved
+from abbe.service.campaign_data.campaign_folder import from_store, store_solution
+from abbe.service.discovery.changed_since import reference_solution
+from abbe.service.discovery.changed_text import changed_lines, changed_text, proved
 from abbe.service.discovery.discover import DiscoveryJournal, discover, prepare
 from abbe.service.domain.discovery import FindingSource
 from abbe.service.domain.document import document, record
 from abbe.service.domain.finding import ChangedSince, EffectFound, Finding
 from abbe.service.domain.results import NewVersion
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.effects.model_book import grown
+from abbe.service.effects.model_book import extended_book
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.runs.exchange import import_folder
@@ -79,7 +79,7 @@ def book(tmp_path_factory: pytest.TempPathFactory) -> Path:
     _, text, doc = june()
     with Store.open(f"sqlite:///{folder / 'book.sqlite3'}") as opened:
         put(opened, folder, "june", json.loads(text))
-        keep(opened, from_store(opened, "june"), doc)
+        store_solution(opened, from_store(opened, "june"), doc)
     return folder / "book.sqlite3"
 
 
@@ -116,7 +116,7 @@ def put(store: Store, place: Path, name: str, runs: list[Doc]) -> None:
 
 def compared(store: Store, name: str, found: Sequence[EffectFound] = ()) -> ChangedSince | None:
     campaign = from_store(store, name)
-    since = since_of(store, campaign)
+    since = reference_solution(store, campaign)
     return None if since is None else since.compare(campaign, found)
 
 
@@ -127,8 +127,8 @@ def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(s
     (change,) = found.changes
     assert (change.motion, change.part, change.unit, change.halves) == ("EXX", "linear", "um/m", 2)
     assert abs(change.value - GROWN * 1e6) <= 2.0 * change.u < 6.0
-    assert changed_words(found).startswith("changed since solution 1: scale of X +")
-    assert "proved" not in changed_words(found)
+    assert changed_text(found).startswith("changed since solution 1: scale of X +")
+    assert "proved" not in changed_text(found)
     gap = found.gap
     assert gap is not None
     assert gap.after_um < gap.floor_um + 0.1 * (gap.before_um - gap.floor_um)
@@ -140,7 +140,7 @@ def test_without_a_change_what_could_hide_is_told(store: Store, tmp_path: Path) 
     found = compared(store, "july")
     assert found is not None
     assert found.changes == ()
-    assert changed_words(found) == "nothing has changed since solution 1 that these runs can tell"
+    assert changed_text(found) == "nothing has changed since solution 1 that these runs can tell"
     assert "scale of Z" in changed_lines(found)[1]
 
 
@@ -173,7 +173,7 @@ def test_a_table_that_nobody_knows_is_compared_only_where_it_did_nothing(
 ) -> None:
     runs = moved(json.loads(june()[1]), np.zeros(3), 4)
     put(store, tmp_path, "july", [run | {"table": tables[k % len(tables)]} for k, run in enumerate(runs)])
-    assert (since_of(store, from_store(store, "july")) is not None) is is_compared
+    assert (reference_solution(store, from_store(store, "july")) is not None) is is_compared
 
 
 def test_a_table_that_was_switched_on_in_between_is_another_table(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_a_table_that_was_switched_on_in_between_is_another_table(tmp_path: Path
     crc = crc32(image)
     with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as store:
         put(store, tmp_path, "june", [run | {"table": {"crc": crc, "acting": False}} for run in json.loads(text)])
-        keep(store, from_store(store, "june"), doc)
+        store_solution(store, from_store(store, "june"), doc)
         store.tables.add(store.campaigns.find("june").machine_id, None, image, crc, {})
         runs = moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 6)
         put(store, tmp_path, "july", [run | {"table": {"crc": crc, "acting": True}} for run in runs])
@@ -196,7 +196,7 @@ def test_with_the_same_table_both_times_it_need_not_be_known(tmp_path: Path) -> 
     told = {"crc": 12345, "acting": True}
     with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as store:
         put(store, tmp_path, "june", [run | {"table": told} for run in json.loads(text)])
-        keep(store, from_store(store, "june"), doc | {"inputs": doc["inputs"] | {"tables": [told]}})
+        store_solution(store, from_store(store, "june"), doc | {"inputs": doc["inputs"] | {"tables": [told]}})
         put(store, tmp_path, "july", [run | {"table": told} for run in moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 1)])
         found = compared(store, "july")
     assert found is not None
@@ -214,9 +214,11 @@ def test_what_was_taken_out_of_the_readings_then_is_taken_out_now(store: Store, 
     """Lost motion of X by the model book of June: in July it is taken out by that same version, whatever the book says today."""
     machine, text, doc = june()
     source = FindingSource(campaign="june", machine_digest=doc["inputs"]["machine"])
-    book = grown(None, Finding(verdict="named", effects=(entry("backlash", "X", "drive", 4.0),)), source, 1)
+    book = extended_book(None, Finding(verdict="named", effects=(entry("backlash", "X", "drive", 4.0),)), source, 1)
     store.models.add(NewVersion(machine["name"], None, document(book)))
-    keep(store, from_store(store, "june"), doc | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}})
+    store_solution(
+        store, from_store(store, "june"), doc | {"machine_model": {"version": 1, "taken_out": ["backlash:X"], "not_for_tables": []}}
+    )
     put(store, tmp_path, "july", moved(json.loads(text), np.array([GROWN, 0.0, 0.0]), 1))
     found = compared(store, "july")
     assert found is not None
@@ -232,10 +234,10 @@ def test_a_lasting_effect_that_was_found_beside_leaves_a_change_unproved(store: 
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
     own = compared(store, "july", [entry("backlash", "X", "drive", 0.0)])
     assert own is not None
-    assert (own.beside, "not proved" in changed_words(own)) == ((), False)
+    assert (own.beside, "not proved" in changed_text(own)) == ((), False)
     other = compared(store, "july", [entry("lateral_play", "EYX", "structure", 0.0)])
     assert other is not None
-    assert changed_words(other).endswith("(not proved)")
+    assert changed_text(other).endswith("(not proved)")
     assert "lateral_play EYX was found in the same runs" in changed_lines(other)[1]
 
 
@@ -243,7 +245,7 @@ def test_what_heat_did_in_these_runs_is_taken_out_first(store: Store, tmp_path: 
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.zeros(3), 2))
     taken: list[str] = []
     monkeypatch.setattr(
-        "abbe.service.discovery.changed_since.less_effects", lambda c, entries, whose: taken.extend(e.label for e in entries) or c
+        "abbe.service.discovery.changed_since.subtract_effects", lambda c, entries, origin: taken.extend(e.label for e in entries) or c
     )
     compared(store, "july", [entry("spindle_growth", "Z", "thermal", 1.0), entry("backlash", "X", "drive", 1.0)])
     assert taken == ["spindle_growth:Z"]
@@ -252,13 +254,13 @@ def test_what_heat_did_in_these_runs_is_taken_out_first(store: Store, tmp_path: 
 def test_the_first_campaign_is_compared_with_nothing_and_none_with_a_later_one(store: Store, tmp_path: Path) -> None:
     assert compared(store, "june") is None
     assert changed_lines(None) == []
-    assert changed_words(None) == ""
+    assert changed_text(None) == ""
 
 
 def test_a_discovery_keeps_what_has_changed_and_asks_once(store: Store, tmp_path: Path) -> None:
     put(store, tmp_path, "july", moved(json.loads(june()[1]), np.array([GROWN, 0.0, 0.0]), 1))
     campaign = from_store(store, "july")
-    job = prepare(campaign, catalogue(), None, since=since_of(store, campaign))
+    job = prepare(campaign, catalogue(), None, since=reference_solution(store, campaign))
     assert job.digest == prepare(campaign, catalogue(), None).digest, "a solution that comes later makes no other search of it"
     journal = DiscoveryJournal()
     search = Search("none")
@@ -274,8 +276,8 @@ def test_what_cannot_be_compared_is_a_line_and_costs_no_finding(store: Store, tm
     monkeypatch.setattr("abbe.service.discovery.changed_since.changed_since", lambda *_: np.linalg.cholesky(-np.eye(2)))
     found = compared(store, "july")
     assert found is not None
-    assert changed_lines(found) == [changed_words(found)]
-    assert changed_words(found).startswith("what has changed since solution 1 could not be told: ")
+    assert changed_lines(found) == [changed_text(found)]
+    assert changed_text(found).startswith("what has changed since solution 1 could not be determined: ")
 
 
 GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
@@ -301,5 +303,5 @@ def test_a_change_that_is_not_proved_says_so(told: Doc, change: Doc, proof: bool
     one = {"motion": "EXX", "part": "linear", "value": 12.0, "u": 1.0, "unit": "um/m", "rivals": [], "halves": 2} | change
     found = record(ChangedSince, {"since": 4, "changes": [one], "gap": GAP, "judged": 50.0, "hidden_um_m": {}} | told, "a change")
     found = replace(found, proved=proved(found))
-    assert changed_words(found).endswith("(not proved)") is not proof
+    assert changed_text(found).endswith("(not proved)") is not proof
     assert any(says in line for line in changed_lines(found)), changed_lines(found)

@@ -26,7 +26,7 @@ from abbe.models.discovery.answer import Discovery, NextTest
 from abbe.service import cli
 from abbe.service.campaign_data import campaign_checks
 from abbe.service.discovery import experiment_recipes
-from abbe.service.discovery.discover_live import rounds
+from abbe.service.discovery.discover_live import addition_count
 from abbe.service.domain.owner import Owner
 from abbe.service.domain.results import NewVersion
 from abbe.service.errors import MeasurementFault
@@ -348,7 +348,7 @@ def test_an_addition_that_is_gone_on_with_alone_has_labels_of_its_own(bench: Ben
     assert bench.live() == 0
     with Store.open(bench.url) as store:
         names = [c.name for c in store.campaigns.all()]
-        assert [rounds(store, n) for n in names] == [0, 1]
+        assert [addition_count(store, n) for n in names] == [0, 1]
     bench.search.adds = {1: ("second_feed",)}
     assert bench.live(campaign=names[1]) == 0
     assert bench.measured == ["n1-feed", "n2-feed"]

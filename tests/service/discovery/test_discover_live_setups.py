@@ -10,7 +10,7 @@ import pytest
 
 from abbe.models.discovery.answer import Localization
 from abbe.service.campaign_data.campaign_folder import Campaign, ensure_stored, from_folder
-from abbe.service.discovery.discover_live import Added, added
+from abbe.service.discovery.discover_live import Addition, find_addition
 from abbe.service.discovery.experiment_recipes import next_plan
 from abbe.service.domain.owner import Owner
 from abbe.service.runs.cases import case_of
@@ -52,7 +52,9 @@ class Played:
 
     def __init__(self, store: Store, june: Campaign) -> None:
         self.store, self.june = store, june
-        self.number = store.campaigns.add(store.machines.add("VMC-1", MACHINE), "next1", {"continues": added(store, june, repeats()).link})
+        self.number = store.campaigns.add(
+            store.machines.add("VMC-1", MACHINE), "next1", {"continues": find_addition(store, june, repeats()).link}
+        )
 
     def run(self, label: str, *, complete: bool = True) -> None:
         number = self.store.runs.start(self.number, label, "ballbar_helix", "identify", {})
@@ -60,8 +62,8 @@ class Played:
             self.store.runs.finish(number, "complete", "", {})
 
     def left(self) -> tuple[TestPlan, ...]:
-        found: Added = added(self.store, self.june, repeats())
-        return () if found.left is None else found.left.tests
+        found: Addition = find_addition(self.store, self.june, repeats())
+        return () if found.remaining is None else found.remaining.tests
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from abbe.service.discovery.discover import prepare
 from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current, no_table_lines
-from abbe.service.identification.effect_removal import taken_out
+from abbe.service.identification.effect_removal import remove_effects
 from abbe.service.identification.table_removal import NO_TABLE
 from abbe.service.storage.store import Store
 from tests.service.discovery.discovery_bench import WIDTH_MM, Search, write_case
@@ -141,9 +141,7 @@ def test_the_book_is_used_compared_and_taken_back(abbe: Call, finds: Callable[[S
     plain = prepare(from_folder(july), catalogue())
     taken = [a.deviation_mm - b.deviation_mm for a, b in zip(plain.case.runs[:3], job.case.runs[:3], strict=True)]  # type: ignore[operator]
     assert np.allclose(np.abs(np.concatenate(taken)).max(), 0.5 * WIDTH_MM, atol=1e-5)  # the centre has no sign
-    assert no_table_lines(book)[0].startswith(
-        "backlash (lost motion) X (model version 1) is no matter for tables but for a parameter of the"
-    )
+    assert no_table_lines(book)[0].startswith("backlash (lost motion) X (model version 1) needs a parameter of the control, not tables: ")
     finds(Search(width_um=2.0))
     assert "model version 2" in abbe("discover", july, "--db", DB)[1]
     out = abbe("model", "diff", "VMC-1", 1, "--db", DB)[1]
@@ -168,7 +166,7 @@ def test_tables_are_made_without_what_they_cannot_take_out(abbe: Call, finds: Ca
     abbe("discover", write_case(tmp_path / "june"), "--db", DB)
     abbe("import", write_case(tmp_path / "july", campaign="july"), "--db", DB)
     with Store.open(DB) as store:
-        told = taken_out(store, from_store(store, "july"), NO_TABLE)
+        told = remove_effects(store, from_store(store, "july"), NO_TABLE)
         raw = from_store(store, "july")
     assert (told.labels, told.version) == (("backlash:X",), 1)
     assert told.doc["machine_model"]["not_for_tables"] == list(told.lines)
@@ -194,7 +192,7 @@ def test_a_model_of_another_geometry_is_not_used(abbe: Call, finds: Callable[[Se
     abbe("import", other, "--db", DB)
     with Store.open(DB) as store:
         raw = from_store(store, "july")
-        told = taken_out(store, raw, NO_TABLE)
+        told = remove_effects(store, raw, NO_TABLE)
     line = "model version 1 of VMC-1 is of another geometry and was not used"
     assert (told.lines, told.labels, told.campaign.runs) == ((line,), (), raw.runs)
     assert told.doc["machine_model"]["not_for_tables"] == [line]

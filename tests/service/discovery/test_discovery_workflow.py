@@ -21,7 +21,7 @@ from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, disc
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.discovery_states import entering, judge, not_entered
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of, stored_steps
-from abbe.service.discovery.discovery_words import lines_of, next_of, rival_lines, verdict_of
+from abbe.service.discovery.discovery_text import lines_of, next_of, rival_lines, verdict_of
 from abbe.service.discovery.simulate import simulate, simulated_finding
 from abbe.service.domain.discovery import DiscoveryStep
 from abbe.service.domain.discovery_file import DiscoveryFile

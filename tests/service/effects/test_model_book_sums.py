@@ -12,7 +12,7 @@ from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.domain.discovery import FindingSource
 from abbe.service.domain.finding import EffectFound, Finding
 from abbe.service.domain.packed_arrays import PackedCovariance
-from abbe.service.effects.model_book import grown, total
+from abbe.service.effects.model_book import extended_book, total
 
 SOURCE = FindingSource(campaign="c1", machine_digest="m")
 
@@ -36,7 +36,7 @@ def test_only_strengths_of_opposite_sign_cancel(strengths: tuple[float, float], 
     """A straightness is known to 60 %; more of it found later is no repair."""
     u = (0.1, 0.1) if min(strengths) < 0 else (6.2, 1.6)
     effects = [found("a", s, v) for s, v in zip(strengths, u, strict=True)]
-    book = grown(None, finding(*effects), SOURCE, 1)
+    book = extended_book(None, finding(*effects), SOURCE, 1)
     assert book.gone == (("a",) if gone else ())
     assert len(book.effects) == (0 if gone else 2)
 
@@ -63,7 +63,7 @@ def straight(coefficients: tuple[float, ...], noise: float = 0.05) -> EffectFoun
 )
 def test_sizes_without_a_sign_add_up_as_their_coefficients_do(change: tuple[float, ...], gone: bool, share: float) -> None:
     first, second = straight((3.0, 4.0)), straight(change)
-    book = grown(None, finding(first, second), SOURCE, 1, CATALOGUE)
+    book = extended_book(None, finding(first, second), SOURCE, 1, CATALOGUE)
     assert book.gone == (("straightness:EYX",) if gone else ())
     effect = next(e for e in CATALOGUE if e.name == "straightness")
     assert total([first, second], effect).strength == pytest.approx(share * first.strength, abs=0.05 * first.strength)

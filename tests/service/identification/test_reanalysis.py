@@ -9,8 +9,8 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.errors import ConfigError
-from abbe.service.identification.executors import Dask, Executor, Here, Processes
-from abbe.service.identification.reanalysis import Reanalysed, solve_all, tasks_of
+from abbe.service.identification.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
+from abbe.service.identification.reanalysis import ReanalysisResult, solve_all, tasks_of
 from abbe.service.storage.store import Store
 from tests.conftest import Require
 from tests.many_campaigns import dask_cluster, fill
@@ -29,22 +29,22 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     return found
 
 
-def answers(url: str, executor: Executor) -> list[Reanalysed]:
+def answers(url: str, executor: Executor) -> list[ReanalysisResult]:
     with Store.open(url) as store:
         return list(solve_all(tasks_of(store, url, "june-*", "rigid6"), executor))
 
 
 @pytest.fixture(scope="module")
-def here(url: str) -> list[Reanalysed]:
-    return answers(url, Here())
+def here(url: str) -> list[ReanalysisResult]:
+    return answers(url, SerialExecutor())
 
 
-def text(found: list[Reanalysed]) -> str:
+def text(found: list[ReanalysisResult]) -> str:
     return json.dumps([one.doc for one in found])
 
 
 def test_each_is_solved_as_abbe_solve_does_and_one_that_cannot_be_stops_no_other(
-    url: str, here: list[Reanalysed], capsys: pytest.CaptureFixture[str]
+    url: str, here: list[ReanalysisResult], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert [one.campaign for one in here] == ["june-7", "june-8", "june-empty"]
     assert here[2].doc is None
@@ -56,21 +56,21 @@ def test_each_is_solved_as_abbe_solve_does_and_one_that_cannot_be_stops_no_other
 
 
 @pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="beside Dask, which starts processes too: ABBE_TEST_LONG=1 runs it")
-def test_processes_give_the_same_numbers(url: str, here: list[Reanalysed]) -> None:
-    assert text(answers(url, Processes(2))) == text(here)
+def test_processes_give_the_same_numbers(url: str, here: list[ReanalysisResult]) -> None:
+    assert text(answers(url, ProcessExecutor(2))) == text(here)
 
 
-def test_dask_gives_the_same_numbers(url: str, here: list[Reanalysed], require: Require) -> None:
+def test_dask_gives_the_same_numbers(url: str, here: list[ReanalysisResult], require: Require) -> None:
     try:
         import distributed
     except ModuleNotFoundError:
         require("dask", False, "distributed is not installed (pip install 'abbe[fleet]')")
         return
     with dask_cluster(2) as address:
-        assert text(answers(url, Dask(address))) == text(here), distributed.__version__
+        assert text(answers(url, DaskExecutor(address))) == text(here), distributed.__version__
 
 
-def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[Reanalysed]) -> None:
+def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[ReanalysisResult]) -> None:
     assert run(["solve-all", "june-*", "--model", "rigid6", "--store", url]) == 1  # one was refused
     out = capsys.readouterr().out
     assert [word in out for word in ("june-7", "june-8", "june-empty", "refused")] == [True] * 4
@@ -94,4 +94,4 @@ def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> 
         assert err.startswith(told)
         assert err.count("\n") == 1
     with pytest.raises(ConfigError, match=r"Dask is not installed|no Dask scheduler answers"):
-        Dask("nonsense://")
+        DaskExecutor("nonsense://")

@@ -22,7 +22,15 @@ from abbe.service.discovery.simulate import simulate
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
-from abbe.service.identification.table_removal import NO_TABLE, STAYS, RemovedTable, as_left, less, table_line, table_then
+from abbe.service.identification.table_removal import (
+    NO_TABLE,
+    NOT_REMOVED,
+    RemovedTable,
+    campaign_table,
+    remove_table,
+    subtract_table,
+    table_line,
+)
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base
 from abbe.service.tables.nine_tables import table_image
@@ -70,7 +78,7 @@ def test_the_play_leaves_and_the_correction_stays() -> None:
     moved = (corrected - commanded) @ BEAM
     read = own + moved - moved[0]
     there = run(axes, read, "laser_step_diagonal", start_mm=axes[0].tolist(), end_mm=axes[-1].tolist(), order="XYZ")
-    told = np.array(less([there], OUT)[0]["columns"]["deviation_mm"])
+    told = np.array(subtract_table([there], OUT)[0]["columns"]["deviation_mm"])
     assert np.abs(read - own - table).max() > 2e-3
     assert np.abs(told - own - table).max() < 1e-4  # the beam of the set-up and BEAM are one line
 
@@ -78,7 +86,7 @@ def test_the_play_leaves_and_the_correction_stays() -> None:
 def test_a_run_without_readings_stays() -> None:
     there = run(steps(), np.zeros(61), "laser_step_diagonal")
     there["columns"]["deviation_mm"] = None
-    assert less([there], OUT) == [there]
+    assert subtract_table([there], OUT) == [there]
 
 
 @pytest.mark.parametrize("acting", [False, None, True])
@@ -113,12 +121,12 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
     assert cli.run(["import", str(folder), "--db", DB]) == 0
     with Store.open(DB) as store:
         before = from_store(store, "july")
-        then = table_then(store, before)
-        assert (then.table, then.why) == (None, f"measured with table {crc32(image):08X}, which this database does not know: {STAYS}")
+        then = campaign_table(store, before)
+        assert (then.table, then.why) == (None, f"measured with table {crc32(image):08X}, which this database does not know: {NOT_REMOVED}")
         assert prepare(before, catalogue(), None, table=then).flags[-1] == then.why
         store.tables.add(store.campaigns.find("july").machine_id, None, image, crc32(image), {})
-        then = table_then(store, before)
-        left = as_left(before, then.table)
+        then = campaign_table(store, before)
+        left = remove_table(before, then.table)
         job = prepare(before, catalogue(), None, table=then)
         assert left.removed is not None
         assert job.flags[-1] == table_line(left.removed)
@@ -158,20 +166,20 @@ def test_a_table_of_a_kind_that_nobody_reads_is_not_known(tmp_path: Path) -> Non
         for run in before.runs:
             run["table"] = {"crc": 5}
         store.tables.add(store.machines.add("VMC-1", {}), None, b"someone else's", 5, {})
-        then = table_then(store, before)
-        assert (then.table, then.why) == (None, f"measured with table 00000005, of a kind that cannot be read: {STAYS}")
+        then = campaign_table(store, before)
+        assert (then.table, then.why) == (None, f"measured with table 00000005, of a kind that cannot be read: {NOT_REMOVED}")
 
 
 def test_runs_of_another_table_or_of_none_keep_their_readings(tmp_path: Path) -> None:
     before = from_folder(write_case(tmp_path / "files", campaign="july"))
     for run, told in zip(before.runs, ({"crc": 5, "acting": True}, {"crc": 5}, {"crc": 5, "acting": False}, {"crc": 6}), strict=True):
         run["table"] = told
-    left = as_left(before, kinked())
+    left = remove_table(before, kinked())
     same = [a["columns"]["deviation_mm"] == b["columns"]["deviation_mm"] for a, b in zip(before.runs, left.runs, strict=True)]
     assert same == [False, False, True, True]  # the third is held out, and was measured with the compensation switched off
     with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
         before.runs[1]["table"] = {"crc": 6}
-        assert table_then(store, before).why.startswith("these runs were not all measured with one table")
+        assert campaign_table(store, before).why.startswith("these runs were not all measured with one table")
         for run in before.runs:
             run["table"] = {"crc": 6, "acting": False}
-        assert table_then(store, before) == NO_TABLE
+        assert campaign_table(store, before) == NO_TABLE

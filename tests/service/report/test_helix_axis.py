@@ -81,7 +81,7 @@ def test_what_neither_set_up_nor_path_tells_is_not_drawn(monkeypatch: pytest.Mon
     run["columns"] = {name: values[:25] for name, values in run["columns"].items()}
     document, traces = drawn(run, monkeypatch)
     assert traces == []
-    assert document.verdict[2] == "incomplete: its share of the path cannot be told; not judged."
+    assert document.verdict[2] == "incomplete: its share of the path is unknown; not judged."
     with pytest.raises(MeasurementFault, match="states no axis of the helix"):
         curve(compared(run))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.service.runs.approached import came_from
+from abbe.service.runs.approached import with_reversals
 from abbe.service.runs.cases import path_of
 from abbe.service.runs.observations import run_data
 from abbe.service.site import machine_from_doc
@@ -31,6 +31,6 @@ def test_a_turning_point_read_twice_went_beyond_only_where_its_readings_say_so()
 def test_other_tests_and_moving_rows_are_as_they_were() -> None:
     run = cycles(1)[0] | {"test": "laser_diagonal"}
     q = np.column_stack([run["columns"][c] for c in ("x_mm", "y_mm", "z_mm")])
-    path, rows = came_from(run, q)
+    path, rows = with_reversals(run, q)
     assert path is q
     assert rows.tolist() == list(range(22))

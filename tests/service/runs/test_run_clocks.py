@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.drivers.api import BarSample
-from abbe.service.campaign_data.run_times import times
+from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.devices.session import KEPT, noted, notes_since
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.domain.owner import Owner
@@ -94,7 +94,7 @@ def test_a_sync_line_that_is_late_is_held_against_the_arrivals_and_said(late_s, 
     run = measured(drift_ppm=100.0, sync_late_s=late_s)
     assert says in run["timing"]["trouble"]
     assert run["timing"]["sync_start_ms"] == pytest.approx(1e3 * late_s, abs=8.0)
-    (flag,) = [f for f in times([run]) if "sync line" in f.what]
+    (flag,) = [f for f in time_issues([run]) if "sync line" in f.what]
     assert not flag.refuse
 
 

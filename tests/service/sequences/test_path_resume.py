@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from abbe.drivers.api import BarSample, Condition, ControllerStatus
 from abbe.service.errors import RunInterrupted, StretchDiffers
-from abbe.service.runs.pieces import RunPiece, SoFar, arc_of
+from abbe.service.runs.pieces import ReadProgress, RunPiece, arc_of
 from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, PathProgress, PathRemainder, StretchComparison, rest_of_path
 from abbe.service.sequences.recipes.recipe import Circle
 from abbe.service.sequences.resume_plan import rest_of, way_back
@@ -63,9 +63,9 @@ def test_of_a_path_that_hardly_began_nothing_is_known():
     assert seen(0.4).doc() == {}
 
 
-def so_far(good_mm: float, counted_from_mm: float = 0.0) -> SoFar:
+def so_far(good_mm: float, counted_from_mm: float = 0.0) -> ReadProgress:
     at = np.arange(counted_from_mm, good_mm, FEED_MM_S / 200.0)
-    return SoFar((RunPiece(4, good_mm),), counted_from_mm, at, np.sin(at / 20.0) * 0.01, 5)
+    return ReadProgress((RunPiece(4, good_mm),), counted_from_mm, at, np.sin(at / 20.0) * 0.01, 5)
 
 
 @settings(deadline=None)
@@ -79,7 +79,7 @@ def test_the_pieces_and_the_rest_are_the_whole_path_once(shares, leads):
     for share in shares:
         good = counted_mm + share * (float(ARC[-1]) - counted_mm)
         before = so_far(good, counted_mm)
-        found = rest_of_path(step, SoFar((*pieces, RunPiece(len(pieces), good)), counted_mm, before.arc_mm, before.deviation_mm, 5))
+        found = rest_of_path(step, ReadProgress((*pieces, RunPiece(len(pieces), good)), counted_mm, before.arc_mm, before.deviation_mm, 5))
         if found is None:
             # only where there is no room for lead and stretch, before what counts already or before the end
             assert min(good, ends_mm) < max(counted_mm, 0.5 * FEED_MM_S) + 0.5 * FEED_MM_S + 3.0
@@ -170,7 +170,7 @@ def test_on_a_circle_whose_places_are_passed_twice_it_goes_back_a_lead_and_a_str
     good = share * float(arc[-1])
     at = np.arange(0.0, good, FEED_MM_S / 200.0)
     mounted = next(k for k, s in enumerate(circle.steps) if isinstance(s, MountBar))
-    known = SoFar((RunPiece(1, good),), 0.0, at, 0.0 * at, 5)
+    known = ReadProgress((RunPiece(1, good),), 0.0, at, 0.0 * at, 5)
     _, _, resume_trail, remainder = rest_of(circle, mounted, (), None, known)
     assert remainder is not None
     stands = [float(np.interp(good + 7.0, arc, np.array(step.points_mm)[:, a])) for a in range(3)]

@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
-from abbe.service.campaign_data.run_geometry import geometry
+from abbe.service.campaign_data.run_geometry import geometry_mistake
 from abbe.service.identification.solve import step_diagonals
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import MoveTo, ReadLaser
@@ -45,4 +45,4 @@ def test_a_row_less_shifts_no_figures_but_takes_them_away(how):
 def test_an_increment_is_that_of_the_targets_where_the_machine_overruns_them():
     plain, over = (run(Diagonal("d", "S", "identify", "npp", 8, "", overrun_mm=mm)) for mm in (0.0, 8.0))
     assert over["setup"]["increment_mm"] == pytest.approx(plain["setup"]["increment_mm"])
-    assert geometry({}, over) is None
+    assert geometry_mistake({}, over) is None

@@ -1,11 +1,11 @@
-"""A finding in words: what is missing, how large it is, what to do at the machine, what else it could be, what to measure next."""
+"""Text of a finding: what is missing, its size, the remedy, the alternatives, and what to measure next."""
 
 from __future__ import annotations
 
 import math
 
 from abbe.models.discovery.answer import Localization, NextTest
-from abbe.service.discovery.changed_words import changed_lines
+from abbe.service.discovery.changed_text import changed_lines
 from abbe.service.discovery.discovery_states import LEFT, entering, judge, not_entered
 from abbe.service.discovery.never_fitted import disagreeing, nothing_missing
 from abbe.service.domain.discovery import Judgement
@@ -30,7 +30,7 @@ ADDS = {
 AXES = "XYZ"
 MANY = 6
 CLEAR = 7.0
-"""Evidence (natural logarithm) from which on a rival's chances are stated as a power of ten: one in a thousand."""
+"""Difference in evidence (natural logarithm) above which a rival's odds are stated as a power of ten: one in a thousand."""
 ROLES = {
     "identify": "fitted",
     "holdout": "never fitted, only judge",
@@ -39,7 +39,7 @@ ROLES = {
 
 
 def unit(text: str) -> str:
-    """A unit of run-format.md 5 as people write it."""
+    """A unit of run-format.md 5 in its usual spelling."""
     return UNITS.get(text, text)
 
 
@@ -50,7 +50,7 @@ def size(effect: EffectSize) -> tuple[str, str, str]:
 
 
 def size_text(effect: EffectSize) -> str:
-    """The same in one piece, ``6.1 ± 0.2 µm``."""
+    """Strength, U and unit in one string: ``6.1 ± 0.2 µm``."""
     return _plus_minus(effect.strength, effect.u_strength, unit(effect.unit))
 
 
@@ -62,26 +62,26 @@ def verdict_of(finding: Finding) -> tuple[str, str, str]:
 
 
 def _verdict_of(finding: Finding) -> tuple[str, str, str]:
-    gap = _gap_words(finding)
+    gap = _gap_text(finding)
     if finding.verdict == "none":
-        return _none_words(finding, gap)
+        return _nothing_missing_verdict(finding, gap)
     names = " and ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
     if finding.verdict == "unknown":
-        beside = f" Beside it: {names}." if names else _suspect_words(finding)
+        beside = f" Beside it: {names}." if names else _suspect_text(finding)
         there = "; ".join(where_lines(finding.where)) or "it could not be located"
         return "bad", "Something is missing that the catalogue does not explain", f"{_capital(gap)}. {there}.{beside}"
     judged = judge(finding)
-    proof = _proof_words(judged) if judged.proved else judged.rule
+    proof = _proof_text(judged) if judged.proved else judged.rule
     word = "Found" if not finding.confounded_with else "Found, but these runs cannot tell it from something else"
-    left = _left_words(finding)
+    left = _remainder_text(finding)
     sign = "ok" if word == "Found" and not left else "open"
     return sign, word, f"{names}. {_capital(gap)}; {proof}.{left}"
 
 
-def _none_words(finding: Finding, gap: str) -> tuple[str, str, str]:
+def _nothing_missing_verdict(finding: Finding, gap: str) -> tuple[str, str, str]:
     where = finding.where
     if where.tests and where.table and where == Localization(tests=where.tests, table=where.table):
-        return "ok", "No common drift", _repeat_words(finding)
+        return "ok", "No common drift", _repeatability_text(finding)
     if disagreeing(finding):
         sign, word = "open", "Nothing is missing in the fitted runs, but the others do not agree"
     else:
@@ -93,43 +93,43 @@ def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
-def _left_words(finding: Finding) -> str:
-    """That more than noise is left beside what was found; empty where it is not, or where readings scatter and no model takes it out."""
+def _remainder_text(finding: Finding) -> str:
+    """A note that more than noise remains; empty if not, or if the finding is scatter, which no model removes."""
     gap = finding.gaps.get("identify")
     more = gap is not None and entering(finding) and gap.after_um > LEFT * gap.floor_um
     return " More than noise is left: something else is missing, too." if more else ""
 
 
-def _proof_words(judged: Judgement) -> str:
-    """What closed on the runs that only judge: their own figures, not those of the fitted runs."""
-    assert judged.gap is not None  # without a gap nothing is proved
-    before, after, _ = _figures(judged.gap)
+def _proof_text(judged: Judgement) -> str:
+    """How far the gap closed on the judging runs."""
+    assert judged.gap is not None  # a proof needs a gap
+    before, after, _ = _gap_values(judged.gap)
     return f"also on runs that were never fitted, from {before} to {after} µm rms ({judged.closed:.0%} closed)"
 
 
-def _suspect_words(finding: Finding) -> str:
-    """Names that the judging runs do not confirm; empty where there are none."""
+def _suspect_text(finding: Finding) -> str:
+    """Effects that the judging runs do not confirm; empty without any."""
     names = " and ".join(f"{e.words} {size_text(e)}" for e in finding.suspects)
     return f" Suspected: {names}; but {finding.proof}." if names else ""
 
 
-def _repeat_words(finding: Finding) -> str:
-    """A positioning test whose repeats share no drift: their scatter is the axis's or the sensor's repeatability, whatever causes it."""
+def _repeatability_text(finding: Finding) -> str:
+    """A positioning test whose repeats share no drift: their scatter is the repeatability of axis and sensor."""
     test, gap = finding.where.table[0], finding.gaps["identify"]
     p = f"noise with the same memory gives as much in {test.p:.1%} of tests"
     scatter = f"They scatter by {plain(gap.before_um)} µm: that is repeatability, which no model takes out"
     return f"In these repeats a {test.value}; {p}. {scatter}."
 
 
-def _figures(gap: GapUm) -> tuple[str, str, str]:
+def _gap_values(gap: GapUm) -> tuple[str, str, str]:
     return plain(gap.before_um), plain(gap.after_um), plain(gap.floor_um)
 
 
-def _gap_words(finding: Finding) -> str:
+def _gap_text(finding: Finding) -> str:
     gap = finding.gaps.get("identify") or next(iter(finding.gaps.values()), None)
     if gap is None:
         return "no run could be judged"
-    before, after, floor = _figures(gap)
+    before, after, floor = _gap_values(gap)
     if finding.effects and not entering(finding):
         return f"readings scatter more than the noise of {floor} µm; {before} µm rms in all, and no model takes scatter out"
     if not finding.effects:
@@ -139,7 +139,7 @@ def _gap_words(finding: Finding) -> str:
 
 
 def lines_of(finding: Finding) -> list[str]:
-    """The verdict for the terminal: one line a thing to know."""
+    """The verdict for the terminal, one fact per line."""
     _, word, text = verdict_of(finding)
     out = [f"{word}. {text}"]
     for e in finding.effects:
@@ -150,7 +150,7 @@ def lines_of(finding: Finding) -> list[str]:
 
 
 def book_lines(finding: Finding) -> list[str]:
-    """Why what was named does not enter the model book, where it does not."""
+    """Why the named effects stay out of the model book; empty if they enter it."""
     why = not_entered(finding, judge(finding)) if finding.effects else None
     return [] if why is None else [f"not added to the model book: {why}"]
 
@@ -168,18 +168,18 @@ def effect_lines(effect: EffectFound) -> list[str]:
 
 
 def parameter_text(parameter: ParameterFound) -> str:
-    """A further parameter with its U."""
+    """A non-linear parameter with its U (k = 2) and unit."""
     return _plus_minus(parameter.value, parameter.u, unit(parameter.unit)).rstrip()
 
 
 def _plus_minus(value: float, u: float | None, what: str) -> str:
-    """Value and U (k = 2) where one is known; a threshold that follows from its place in a list alone has none."""
+    """Value and U (k = 2), if known; a threshold that was picked from a grid has no U."""
     text, expanded = with_uncertainty(value, u)
     return f"{text} {what}" if expanded == NOT_AVAILABLE else f"{text} ± {expanded} {what}"
 
 
 def rival_lines(effect: EffectFound) -> list[str]:
-    """What else it could be, each with how much less evidence it has; where nothing, why."""
+    """Each alternative with its odds; without any, the reason."""
     if not effect.alternatives:
         moves = effect.kind == "mean"
         return ["nothing else in the catalogue fits these runs as well" if moves else "no rival was tried: scatter has no shape to compare"]
@@ -187,7 +187,7 @@ def rival_lines(effect: EffectFound) -> list[str]:
 
 
 def _times(less: float) -> str:
-    """A rival's chances. Where evidence is large, one that explains nearly all of it is formally hopeless, and yet a bent form would do."""
+    """Odds of a rival. Above `CLEAR` it is formally ruled out, although a slightly bent form of it could still explain the readings."""
     if less < 0.7:
         return "just as likely"
     if less < CLEAR:
@@ -196,7 +196,7 @@ def _times(less: float) -> str:
 
 
 def next_of(finding: Finding) -> list[str]:
-    """What to measure next after a finding; without a test that tells suspects apart, what helps anyway. Empty: nothing is missing."""
+    """What to measure next: a test that separates the suspects, else general advice; empty if nothing is missing."""
     if finding.next_test is not None:
         return _next_lines(finding.next_test)
     if finding.verdict == "unknown":
@@ -210,7 +210,7 @@ def next_of(finding: Finding) -> list[str]:
 
 
 def _next_lines(test: NextTest) -> list[str]:
-    """What to measure next, why, how long it takes and how well it separates."""
+    """The next test with its purpose, duration and expected separation."""
     what = " and ".join(ADDS.get(a, a) for a in test.adds) or "nothing on offer"
     sigma = test.expected_separation_sigma
     well = "" if sigma is None else f", should tell them apart by {plain(sigma, 2)} sigma"
@@ -219,16 +219,16 @@ def _next_lines(test: NextTest) -> list[str]:
 
 
 def unseen_lines(finding: Finding) -> list[str]:
-    """What these runs could not have shown, whether it is there or not, and what would; empty: nothing of the kind is known."""
+    """Effects that these runs could not show, and the measurement that would."""
     return [f"could not be seen: {u.what}, because {u.because}; what would show it: {ADDS.get(u.adds, u.adds)}" for u in finding.unseen]
 
 
 def where_lines(where: Localization) -> list[str]:
-    """Where something lives, in words."""
-    axes = () if len(where.axes) == len(AXES) else where.axes  # all three: it tells nothing
+    """The location of an effect, one line per known property."""
+    axes = () if len(where.axes) == len(AXES) else where.axes  # all three axes are no information
     out = [
-        f"{word} {', '.join(found[:MANY])}" + (f" and {len(found) - MANY} more" if len(found) > MANY else "")
-        for word, some in (("seen in", where.tests), ("axis", axes), ("run", where.runs), ("depends on", where.depends_on))
+        f"{label} {', '.join(found[:MANY])}" + (f" and {len(found) - MANY} more" if len(found) > MANY else "")
+        for label, some in (("seen in", where.tests), ("axis", axes), ("run", where.runs), ("depends on", where.depends_on))
         if (found := [str(v).replace("_", " ") for v in some])
     ]
     if len(where.directions) == 1:

@@ -1,4 +1,4 @@
-"""What has changed since a solution (`abbe.service.discovery.changed_since`), in words."""
+"""Text about the changes since a solution (`abbe.service.discovery.changed_since`)."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from abbe.service.domain.finding import ChangedSince, GapUm, MotionChange
 from abbe.service.rendering.numbers import COVERAGE, plain, with_uncertainty
 
 LEFT = 1.5
-"""What is left after the changes counts as more than noise from this factor on: the solution is known to a part of the noise only."""
+"""Ratio of the remaining gap to the noise from which the remainder counts as more than noise: the solution itself is uncertain."""
 HALVES = 2
 UNITS = {"um/m": "µm/m", "urad": "µrad", "um": "µm"}
 
 
-def changed_words(changed: ChangedSince | None) -> str:
-    """In one sentence, empty where nothing could be compared: what has changed, with U (k = 2), and whether that is proved."""
+def changed_text(changed: ChangedSince | None) -> str:
+    """One sentence with the changes, their U (k = 2) and whether they are proved; empty without a comparison."""
     if changed is None:
         return ""
     since = f"since solution {changed.since}"
     if changed.trouble:
-        return f"what has changed {since} could not be told: {changed.trouble}"
+        return f"what has changed {since} could not be determined: {changed.trouble}"
     if not changed.changes:
         return f"nothing has changed {since} that these runs can tell"
     names = ", ".join(_size(c) for c in changed.changes)
@@ -27,10 +27,10 @@ def changed_words(changed: ChangedSince | None) -> str:
 
 
 def changed_lines(changed: ChangedSince | None) -> list[str]:
-    """The same with what proves it, what else it could be, and what would not have been seen; empty where nothing could be compared."""
+    """`changed_text`, then the proof, the alternatives and what these runs could not show; empty without a comparison."""
     if changed is None:
         return []
-    out = [changed_words(changed)]
+    out = [changed_text(changed)]
     if changed.trouble:
         return out
     for c in changed.changes:
@@ -45,10 +45,10 @@ def changed_lines(changed: ChangedSince | None) -> list[str]:
 
 
 def proved(changed: ChangedSince) -> bool:
-    """Whether runs that did not choose the changes bear them out.
+    """Whether runs that did not choose the changes confirm them.
 
-    Each half of the set-ups is more likely with what the other has chosen; the gap, where it shows, closes; every change was chosen by both
-    halves, has no near rival, and is larger than its own U; and nothing was found in the same runs that could be the same thing.
+    Each half of the set-ups must be more likely with the changes that the other half chose. A visible gap must close. Both halves must have
+    chosen every change, which must have no close rival and exceed its own U. No other finding in these runs may have the same cause.
     """
     sure = all(c.halves == HALVES and not c.rivals and _sure(c) for c in changed.changes)
     if not changed.changes or not sure or changed.beside or changed.judged is None or changed.judged < NEAR:
@@ -86,7 +86,7 @@ def _proof(changed: ChangedSince) -> list[str]:
 
 
 def _hidden(changed: ChangedSince) -> list[str]:
-    """What may have changed beside what was named, where nothing was: all of it."""
+    """Changes that these runs could have missed."""
     hidden = changed.hidden_um_m
     named = {c.motion for c in changed.changes if c.part == "linear"}
     each = [f"{NAMES[n]} {plain(v, 2)} {'µm/m' if n[0] == 'E' else 'µrad'}" for n, v in hidden.items()]
