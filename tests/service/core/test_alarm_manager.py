@@ -439,7 +439,9 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
         control, nothing = Control(), cast("Any", SimpleNamespace(controller=None))
         control.stop()  # before the way back begins
         order = PushOrder(4, cast("Any", None), lambda now: None, control)
-        task = asyncio.create_task(push_approved._finish_when_safe(PushContext(nothing, bench.store, nothing, clock=bench.clock), order, told))
+        task = asyncio.create_task(
+            push_approved._finish_when_safe(PushContext(nothing, bench.store, nothing, clock=bench.clock), order, told)
+        )
         async with asyncio.timeout(within(20)):
             await begun.wait()
             ask(control)
