@@ -247,7 +247,7 @@ async def test_a_controller_that_acts_at_its_next_start_keeps_its_promises_too_a
     lies(b, AtNextStart)
     found = await commission_levels(b.session.controller, store, b.site)
     assert found.capabilities.level == 3, found.rows()
-    assert "to act after the next start" in {name: text for name, _, text in found.rows()}["swap_compares"]
+    assert "effective after the next start" in {name: text for name, _, text in found.rows()}["swap_compares"]
     assert comp.states == [BankState.SEALED, BankState.WRITING]
     assert in_force(b) == before
 
@@ -281,7 +281,7 @@ async def test_another_firmware_is_another_controller(place, monkeypatch):
     monkeypatch.setattr(b.session.controller, "identify", newer, raising=False)
     now = await level_status(b.session.controller, store, b.site)
     assert now.level == 2
-    assert "another firmware" in now.hint
+    assert "controller or its firmware was replaced" in now.hint
     with pytest.raises(TableRefused, match="a person who approves"):
         await push(b, store, attended=False)
     other = replace(b.site, name="another machine")

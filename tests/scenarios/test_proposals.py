@@ -125,7 +125,7 @@ def test_proposing_writes_nothing_to_the_controller(shop):
 
 CHANGED: dict[str, tuple[Callable[[Site], Site], float, str]] = {
     "another machine": (lambda s: replace(s, name="other", doc=s.doc | {"name": "other"}), 0.0, "MACHINE: the table is for 'sim'"),
-    "another tool": (lambda s: replace(s, doc=s.doc | {"tool_mm": [0.0, 0.0, -90.0]}), 0.0, "MACHINE: the machine file describes another"),
+    "another tool": (lambda s: replace(s, doc=s.doc | {"tool_mm": [0.0, 0.0, -90.0]}), 0.0, "MACHINE: the machine file differs"),
     "another temperature window": (lambda s: replace(s, limits=replace(s.limits, temperature_c=(30.0, 32.0))), 0.0, "TEMPERATURE"),
     "a wider temperature window": (
         lambda s: replace(s, limits=replace(s.limits, temperature_c=(10.0, 40.0))),
@@ -194,7 +194,7 @@ def test_an_approval_ends_and_binds_who_and_what(shop):
 
         own, good = shop.copy(store), store.proposals.approvals(number)[0]
         store.proposals.approve(replace(good, proposal_id=own, name=f" {login().upper()} "))  # past the check of the command
-        with pytest.raises(TableRefused, match=r"APPROVAL: .* proposed it and cannot be the one"):
+        with pytest.raises(TableRefused, match=r"APPROVAL: .* proposed it and cannot approve it"):
             try_push(shop, store, own)
 
         other = shop.copy(store)

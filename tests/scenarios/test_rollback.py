@@ -39,7 +39,7 @@ async def test_back_byte_for_byte_and_forward_again_and_to_the_beginning(start_s
     async with bench(sims, tmp_path) as (site, store, session):
         c = session.controller
         first = await read_base(c)
-        with pytest.raises(TableRefused, match="nothing to take back"):
+        with pytest.raises(TableRefused, match="nothing to roll back"):
             await rollback(c, store, site)
         assert (await push(c, store, site, steep(site))).kept
         kept = await read_base(c)
