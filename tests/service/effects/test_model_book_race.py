@@ -223,7 +223,7 @@ def test_a_book_of_another_geometry_is_not_used_and_yet_it_is_what_a_version_com
     store.models.add(version(None))
     folder, search = write_case(tmp_path / "june", "june"), Search()
     job = job_of(folder, store)
-    assert (job.base, job.seen) == (None, 1)
+    assert (job.base, job.expected_version) == (None, 1)
     journal = journal_of(store, job)
     assert journal_of(store, job_of(folder, store)).id == journal.id  # begun, and gone on with
     discover(job, journal, search, ignore_progress)
