@@ -170,7 +170,7 @@ def test_tables_are_made_without_what_they_cannot_take_out(abbe: Call, finds: Ca
         raw = from_store(store, "july")
     assert (told.labels, told.version) == (("backlash:X",), 1)
     assert told.doc["machine_model"]["not_for_tables"] == list(told.lines)
-    assert "a parameter of the control: enter the width as backlash compensation" in told.lines[0]
+    assert "needs a parameter of the control, not tables: enter the width as backlash compensation" in told.lines[0]
     known = prepare(raw, catalogue(), None).case.runs[0].path
     expected = catalogue()[0].signal((known,), "X", {})[0][:, 0] * 8.0
     before, after = (np.array(c.runs[0]["columns"]["deviation_mm"]) for c in (raw, told.campaign))
