@@ -52,7 +52,7 @@ docs: $(DEV_READY) ## write the pages of docs/ that come from the code: commands
 	@$(BIN)/abbe schema
 
 bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
-	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/kernel/test_kernel_threads.py tests/experiments/test_bench_case.py tests/experiments/test_bench_trials.py tests/experiments/test_bench_discovery.py
+	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/test_bench_case.py tests/experiments/test_bench_trials.py tests/experiments/test_bench_discovery.py
 	@$(BENCH_VENV)/bin/python -m tests.experiments.bench $(ARGS)
 
 lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer versions)

@@ -72,7 +72,7 @@ async def test_a_listened_run_whose_samples_the_database_lacks_stays_open(store:
 
     for name, value in {"start_campaign": begin, "start_document": document, "listen_to": listening}.items():
         monkeypatch.setattr(listen_campaign, name, value)
-    for name in ("dry_run_campaign", "wanted"):
+    for name in ("dry_run_campaign", "planned_readings"):
         monkeypatch.setattr(listen_campaign, name, lambda *words: None)
     test = SimpleNamespace(label="r01", test="laser", role="identify", setup={"setup_id": "L1"}, steps=())
     with pytest.raises(StoreError, match="did not take all samples"):
