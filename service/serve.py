@@ -51,8 +51,7 @@ from abbe.service.scheduler.job import CheckJobs
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.storage.engine import parse_url
-from abbe.service.storage.private import database_readable_by_others
+from abbe.service.storage.engine import database_readable_by_others, parse_url
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.users.roles import Permission

@@ -17,8 +17,7 @@ from abbe.service.audit.chain import Anchor, anchor_of, faults, follow, key_name
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken
 from abbe.service.secrets import mask_secrets, visible
-from abbe.service.storage.engine import parse_url
-from abbe.service.storage.private import private_file
+from abbe.service.storage.engine import parse_url, private_file
 from abbe.service.storage.store import Store
 
 # The two files of the audit: created for their owner only, append-only; a refusal names their owner.

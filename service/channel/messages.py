@@ -1,4 +1,7 @@
-"""All messages between core and web process: frozen, validated at both ends, bounded in length.
+"""The channel between core and web process: all messages, and its two ends (`Wire`).
+
+Messages are frozen, validated at both ends, and bounded in length. They travel as four bytes of length, then JSON, over a socket pair that
+the parent created: without a file, a port or a name no other process can connect to it.
 
 The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`); the web process forwards what a person
 requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
@@ -7,9 +10,12 @@ table: a request names the table in force by its push and CRC, and the push jour
 
 from __future__ import annotations
 
+import asyncio
+import socket
+import struct
 from dataclasses import dataclass
 from datetime import date
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -272,3 +278,58 @@ def _checked(adapter: TypeAdapter[T], body: bytes) -> T:
         first = wrong.errors(include_input=False, include_url=False)[0]
         location = ".".join(str(part) for part in first["loc"])
         raise ChannelBroken(f"invalid message on the channel of the service: {location}: {first['msg']}") from None
+
+
+_LENGTH = struct.Struct(">I")
+FULL_B = 2 * LARGEST_B
+"""Bytes that may wait for the reader. Beyond them the sender skips updates, since newer ones follow."""
+
+
+class Wire:
+    """Sends and receives whole messages; created by `Wire.over`."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader, self._writer = reader, writer
+
+    @classmethod
+    async def over(cls, end: socket.socket) -> Self:
+        """Take over one end of a socket pair."""
+        end.setblocking(False)
+        return cls(*await asyncio.open_connection(sock=end, limit=LARGEST_B + _LENGTH.size))
+
+    @property
+    def is_full(self) -> bool:
+        """Whether so much waits for the reader that updates should be skipped."""
+        return self._writer.transport.get_write_buffer_size() > FULL_B
+
+    def send(self, message: FromCore | FromWeb) -> None:
+        """Send without waiting; a message to a closed channel is lost, and the reading side notices the end.
+
+        Raises
+        ------
+        ChannelBroken
+            The message does not match its type.
+        """
+        body = encode(message)
+        if not self._writer.is_closing():
+            self._writer.write(_LENGTH.pack(len(body)) + body)
+
+    async def receive(self) -> bytes | None:
+        """Return the next message; None when the other side has ended.
+
+        Raises
+        ------
+        ChannelBroken
+            The announced length is too large.
+        """
+        try:
+            (size,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
+            if size > LARGEST_B:
+                raise ChannelBroken(f"a message of {size} bytes was announced on the channel of the service; allowed are {LARGEST_B}")
+            return await self._reader.readexactly(size)
+        except (asyncio.IncompleteReadError, ConnectionError):
+            return None
+
+    def close(self) -> None:
+        """Close this end; the other side reads the end of the stream."""
+        self._writer.close()

@@ -33,9 +33,9 @@ from abbe.service.channel.messages import (
     Snapshot,
     StartJob,
     SteerJob,
+    Wire,
     from_web,
 )
-from abbe.service.channel.wire import Wire
 from abbe.service.children import python_command
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry

@@ -13,7 +13,7 @@ from abbe.service.clock import Clock
 from abbe.service.errors import StoreError
 from abbe.service.scheduler import record
 from abbe.service.scheduler.ports import Doc, OpenSlot
-from abbe.service.storage.repositories.slots import RUNNING
+from abbe.service.storage.repositories.service_records import RUNNING
 from abbe.service.storage.store import Store
 
 log = structlog.get_logger("abbe.store")

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Engine, inspect
 
 from abbe.service.errors import StoreError
 from abbe.service.secrets import mask_secrets
-from abbe.service.storage.private import private_file
+from abbe.service.storage.engine import private_file
 
 if TYPE_CHECKING:
     from alembic.config import Config

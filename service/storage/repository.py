@@ -1,20 +1,130 @@
-"""Base of the repositories: read records through their mapping, insert rows."""
+"""Base of the repositories, and the mapping of rows to records.
+
+A field of a record is the column of the same name, unless its mapping names another column or a nested record.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, Generic, TypeVar
 
-from sqlalchemy import Column, ColumnElement, Connection, Table, insert
+from sqlalchemy import Column, ColumnElement, Connection, FromClause, Row, Select, Table, func, insert, null, select
 from sqlalchemy.dialects.postgresql import Insert as PostgresInsert
 from sqlalchemy.dialects.postgresql import insert as postgres_insert
 from sqlalchemy.dialects.sqlite import Insert as SqliteInsert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
+from abbe.service.domain import decisions, measured, people, results, service_records
+from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.owner import Owner
 from abbe.service.errors import NotStored
+from abbe.service.storage import tables as t
 from abbe.service.storage.database import Database
-from abbe.service.storage.mapping import RecordMapping
 
 R = TypeVar("R")
+
+
+class RecordMapping(Generic[R]):
+    """A frozen record and the columns that it is read from and written to.
+
+    SQLAlchemy's own mapper writes its state into the object and refuses frozen ones (decision 0037).
+
+    ``source``: the FROM clause to read, if it is more than the table. ``**other``: fields that are not the column of their name, given as
+    another expression or as the mapping of a nested record.
+    """
+
+    def __init__(
+        self, record: type[R], table: Table, source: FromClause | None = None, **other: ColumnElement[Any] | RecordMapping[Any]
+    ) -> None:
+        assert is_dataclass(record)
+        self.table, self._source = table, table if source is None else source
+        self._make: Callable[..., R] = record
+        self._prefix = f"{table.name}_{record.__name__}_"
+        names = [one.name for one in fields(record)]
+        if missing := [name for name in names if name not in other and name not in table.c]:
+            raise TypeError(f"{record.__name__}: table {table.name} has no column {', '.join(missing)}")
+        self._fields = {name: other[name] if name in other else table.c[name] for name in names}
+
+    @property
+    def columns(self) -> list[ColumnElement[Any]]:
+        """The columns to select for `read`."""
+        found: list[ColumnElement[Any]] = []
+        for name, column in self._fields.items():
+            found += column.columns if isinstance(column, RecordMapping) else [column.label(self._prefix + name)]
+        return found
+
+    def select(self) -> Select[Any]:
+        """All rows, in no order."""
+        return select(*self.columns).select_from(self._source)
+
+    def read(self, row: Row[*tuple[Any, ...]]) -> R:
+        """The record of a row that holds `columns` and possibly others."""
+        return self.from_values(row._mapping)  # noqa: SLF001 - SQLAlchemy's public name
+
+    def from_values(self, values: Mapping[Any, Any]) -> R:
+        """The record of values by names of `columns`."""
+        return self._make(
+            **{
+                name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
+                for name, column in self._fields.items()
+            }
+        )
+
+    def values(self, record: R, *without: str) -> dict[str, Any]:
+        """The columns of a record that its table stores, by name, except the fields ``without``."""
+        found: dict[str, Any] = {}
+        for name, column in self._fields.items():
+            if isinstance(column, RecordMapping):
+                found |= column.values(getattr(record, name))
+            elif isinstance(column, Column) and column.table is self.table and name not in without:
+                found[column.name] = getattr(record, name)
+        return found
+
+
+def owner_of(table: Table) -> RecordMapping[Owner]:
+    """Mapping of the process that owns a row."""
+    return RecordMapping(Owner, table, host=table.c.owner_host, pid=table.c.owner_pid, start=table.c.owner_start)
+
+
+MACHINE = RecordMapping(measured.MachineRecord, t.machines)
+CAMPAIGN = RecordMapping(measured.CampaignRecord, t.campaigns)
+RUN = RecordMapping(
+    measured.RunRecord,
+    t.runs,
+    t.runs.join(t.campaigns, t.campaigns.c.id == t.runs.c.campaign_id),
+    campaign=t.campaigns.c.name,
+    owner=owner_of(t.runs),
+)
+CHUNK = RecordMapping(measured.ChunkRecord, t.chunks)
+CHECKPOINT = RecordMapping(measured.CheckpointRecord, t.checkpoints)
+
+SOLUTION = RecordMapping(results.SolutionRecord, t.solutions)
+TABLE = RecordMapping(results.TableRecord, t.comp_tables)
+VERIFICATION = RecordMapping(results.VerificationRecord, t.verifications)
+DISCOVERY = RecordMapping(results.DiscoveryRecord, t.discoveries)
+STEP = RecordMapping(results.StepRecord, t.discovery_steps)
+MODEL = RecordMapping(results.ModelRecord, t.machine_models)
+
+PROPOSAL = RecordMapping(decisions.ProposalRecord, t.proposals)
+APPROVAL = RecordMapping(decisions.ProposalApproval, t.approvals)
+REJECTION = RecordMapping(decisions.ProposalRejection, t.rejections)
+PUSH_ENTRY = RecordMapping(decisions.PushEntryRecord, t.push_entries)
+PUSH_MARK = RecordMapping(decisions.PushEntryRecord, t.push_entries, doc=null())
+"""Without the document, which holds the images of tables."""
+
+ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries)
+SLOT = RecordMapping(service_records.SlotRecord, t.slots, reason=func.coalesce(t.slots.c.reason, ""))
+HEARTBEAT = RecordMapping(service_records.HeartbeatRecord, t.heartbeats, owner=owner_of(t.heartbeats))
+OUTBOX = RecordMapping(service_records.OutboxRecord, t.outbox)
+REPLY = RecordMapping(service_records.ReplyRecord, t.replies)
+
+USER = RecordMapping(people.UserRecord, t.users)
+SESSION = RecordMapping(people.SessionRecord, t.sessions)
+TOKEN = RecordMapping(people.TokenRecord, t.api_tokens)
+AUDIT = RecordMapping(AuditEvent, t.audit)
+
+
 Order = ColumnElement[Any]
 
 

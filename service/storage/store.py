@@ -12,22 +12,12 @@ from sqlalchemy import Connection, Engine, func, select, text
 from abbe.service.domain.service_records import StoreHealth
 from abbe.service.storage.database import Database
 from abbe.service.storage.migrate import head_revision, revision_of
-from abbe.service.storage.repositories.alarms import Alarms
-from abbe.service.storage.repositories.audit import Audit
-from abbe.service.storage.repositories.checkpoints import Checkpoints
-from abbe.service.storage.repositories.chunks import Chunks
-from abbe.service.storage.repositories.discoveries import Discoveries, Models
-from abbe.service.storage.repositories.heartbeats import Heartbeats
-from abbe.service.storage.repositories.machines import Campaigns, Machines
-from abbe.service.storage.repositories.outbox import Outbox
+from abbe.service.storage.repositories.decisions import Proposals, Pushes
+from abbe.service.storage.repositories.measured import Campaigns, Checkpoints, Chunks, Machines, Runs
 from abbe.service.storage.repositories.pages import Pages
 from abbe.service.storage.repositories.people import People
-from abbe.service.storage.repositories.proposals import Proposals
-from abbe.service.storage.repositories.pushes import Pushes
-from abbe.service.storage.repositories.replies import Replies
-from abbe.service.storage.repositories.results import Solutions, Tables, Verifications
-from abbe.service.storage.repositories.runs import Runs
-from abbe.service.storage.repositories.slots import Slots
+from abbe.service.storage.repositories.results import Discoveries, Models, Solutions, Tables, Verifications
+from abbe.service.storage.repositories.service_records import Alarms, Audit, Heartbeats, Outbox, Replies, Slots
 from abbe.service.storage.tables import identity, machines, outbox
 
 

@@ -1,1 +1,1 @@
-"""Repositories, one file per aggregate: campaigns, runs, pushes, people and so on."""
+"""Repositories, in files of the same names as their records in `abbe.service.domain`."""

@@ -9,8 +9,7 @@ from sqlalchemy import ColumnElement, Connection, Update, delete, func, select, 
 from abbe.service.domain.people import SessionRecord, TokenRecord, UserRecord
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
-from abbe.service.storage.mapping import SESSION, TOKEN, USER
-from abbe.service.storage.repository import Repository, insert_row
+from abbe.service.storage.repository import SESSION, TOKEN, USER, Repository, insert_row
 from abbe.service.storage.tables import api_tokens, sessions, users
 
 FORGOTTEN = timedelta(days=30)

@@ -21,9 +21,9 @@ from abbe.service.channel.messages import (
     StartJob,
     Steering,
     SteerJob,
+    Wire,
     from_core,
 )
-from abbe.service.channel.wire import Wire
 from abbe.service.clock import Clock
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState

@@ -13,8 +13,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import PROTOCOL, Begin, Heartbeat, Serving, from_core
-from abbe.service.channel.wire import Wire
+from abbe.service.channel.messages import PROTOCOL, Begin, Heartbeat, Serving, Wire, from_core
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, ChannelBroken
 from abbe.service.plant.gather import Gatherer

@@ -27,7 +27,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.runs.codec import decode_bar
-from abbe.service.storage.repositories import chunks as store_chunks
+from abbe.service.storage.repositories import measured as store_measured
 from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.service.capture.capture_bench import abandon, batch, new_run
@@ -268,13 +268,13 @@ def test_equal_inserts_of_two_are_looked_at_again(store: Store, monkeypatch) -> 
     run_id = new_run(store)
     one = ChunkRecord(run_id, "bar", 0, 3, "bar/1", 1, b"abc", 1.0, 2.0, 3, 4)
     assert store.chunks.ingest([one]) == 1
-    look, looks = store_chunks._stored, []
+    look, looks = store_measured._stored, []
 
     def too_early(connection, given):  # as PostgreSQL: the other's row is not visible at the first look
         looks.append(1)
         return {} if len(looks) == 1 else look(connection, given)
 
-    monkeypatch.setattr(store_chunks, "_stored", too_early)
+    monkeypatch.setattr(store_measured, "_stored", too_early)
     assert store.chunks.ingest([one]) == 0
     assert len(looks) == 2
 

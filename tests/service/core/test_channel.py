@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abbe.service.channel import messages as m
-from abbe.service.channel.wire import FULL_B, Wire
+from abbe.service.channel.messages import FULL_B, Wire
 from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess

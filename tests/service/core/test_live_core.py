@@ -9,8 +9,7 @@ from base64 import b64decode
 import numpy as np
 
 from abbe.service.capture.live import LiveFeed
-from abbe.service.channel.messages import LivePath, LiveSamples, from_core
-from abbe.service.channel.wire import Wire
+from abbe.service.channel.messages import LivePath, LiveSamples, Wire, from_core
 from abbe.service.clock import SystemClock
 from abbe.service.core.web_process import show_live
 from tests.patience import within

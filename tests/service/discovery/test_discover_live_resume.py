@@ -32,10 +32,8 @@ from abbe.service.domain.results import NewVersion
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns
-from abbe.service.storage.repositories.chunks import Chunks
-from abbe.service.storage.repositories.discoveries import Discoveries
-from abbe.service.storage.repositories.machines import Campaigns
-from abbe.service.storage.repositories.runs import Runs
+from abbe.service.storage.repositories.measured import Campaigns, Chunks, Runs
+from abbe.service.storage.repositories.results import Discoveries
 from abbe.service.storage.store import Store
 from tests.pretended_status import READY, controller_status
 from tests.service.discovery.discovery_bench import MACHINE, Search, circle, write_case

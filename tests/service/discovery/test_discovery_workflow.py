@@ -376,7 +376,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from abbe.service.domain.progress import ignore_progress
-from abbe.service.storage.repositories.discoveries import Discoveries
+from abbe.service.storage.repositories.results import Discoveries
 from abbe.service.storage.store import Store
 from abbe.service.discovery.discover import discover
 from abbe.service.discovery.discovery_store import journal_of

@@ -23,7 +23,7 @@ from abbe.service.cli.administration.audited import record_all
 from abbe.service.cli.common import print_table
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
-from abbe.service.storage.private import private_file, readable_by_others
+from abbe.service.storage.engine import private_file, readable_by_others
 from abbe.service.storage.store import Store
 from tests.migration import next_revision
 from tests.service.users.conftest import World

@@ -13,8 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from abbe.service.channel.messages import Answer, ConfirmPrompt, Jobs, Outcome, Snapshot, StartJob, from_web
-from abbe.service.channel.wire import Wire
+from abbe.service.channel.messages import Answer, ConfirmPrompt, Jobs, Outcome, Snapshot, StartJob, Wire, from_web
 from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobState
 from abbe.service.queries.reader import Reader

@@ -13,8 +13,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from abbe.service.channel.messages import Answer, Jobs, Outcome, PushNow, RollBack, from_web
-from abbe.service.channel.wire import Wire
+from abbe.service.channel.messages import Answer, Jobs, Outcome, PushNow, RollBack, Wire, from_web
 from abbe.service.clock import SystemClock
 from abbe.service.core.board import Board
 from abbe.service.domain.job_state import JobState
