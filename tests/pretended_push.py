@@ -6,8 +6,8 @@ from typing import Any
 
 from abbe.drivers.tables import crc32
 from abbe.service.clock import Clock
-from abbe.service.push.book import StoreBook
-from abbe.service.push.states import PushState, S
+from abbe.service.domain.push_entry import PushState, S
+from abbe.service.push.journal import StoreBook
 from abbe.service.storage.store import Store
 
 UP_TO_ACTIVE = (S.SNAPSHOT, S.VALIDATED, S.APPROVED, S.LEASED, S.STAGING, S.STAGED, S.ACTIVATING, S.PROBATION)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.push.entries import GENESIS, canonical
+from abbe.service.domain.document import GENESIS, canonical
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,7 @@ from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock
-from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence
-from abbe.service.push.validate import content_digest
+from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base

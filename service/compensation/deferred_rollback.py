@@ -7,11 +7,11 @@ from collections.abc import Callable
 from abbe.drivers.api import TableController
 from abbe.service.clock import Clock
 from abbe.service.compensation.recover import READY, finish_push
+from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import StillActive
-from abbe.service.push.adapter import ControllerPort, no_actors
-from abbe.service.push.book import StoreBook
+from abbe.service.push.execute import ControllerPort, no_actors
+from abbe.service.push.journal import StoreBook
 from abbe.service.push.operations import Done, Doubt, Operation, OperationKind, Outcome, Truth
-from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

@@ -20,8 +20,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
 from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.errors import TableRefused
-from abbe.service.push.levels import Capabilities
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.limits import Capabilities, PushLimits
 from abbe.service.push.validate import promise_reason
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.needed import check_devices
@@ -53,7 +52,7 @@ class PushContext:
 class Admission:
     """The token of a push: a proposal with no reason against it, and the readings and decisions that this rests on.
 
-    ``level``: capability level of the controller (`abbe.service.push.levels`). ``hint``: a warning about the control for people, or empty.
+    ``level``: capability level of the controller (`abbe.service.push.limits`). ``hint``: a warning about the control for people, or empty.
     """
 
     precheck: PushPrecheck

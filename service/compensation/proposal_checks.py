@@ -15,9 +15,8 @@ from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.compensation.proposals import by_whom, login
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
-from abbe.service.push.candidate import Candidate, CandidateContext, EvidenceSeal
 from abbe.service.push.operations import Approval
-from abbe.service.push.validate import content_digest, reasons_against
+from abbe.service.push.validate import Candidate, CandidateContext, EvidenceSeal, content_digest, reasons_against
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import Base, read_base

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from abbe.service.compensation.proposal_checks import valid_approval
 from abbe.service.compensation.proposal_doc import Proposed
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
-from abbe.service.push.entries import Journal, facts
-from abbe.service.push.states import TERMINAL, PushState
+from abbe.service.domain.push_entry import TERMINAL, PushState
+from abbe.service.push.journal import Journal, facts
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
 

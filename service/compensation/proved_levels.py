@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from abbe.drivers.api import BankState, DeviceInfo, Identity
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableRefused
-from abbe.service.push.levels import Capabilities, objection
+from abbe.service.push.limits import Capabilities, objection
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
@@ -29,7 +29,7 @@ class LevelStatus:
 
     @property
     def level(self) -> int:
-        """Capability level (`abbe.service.push.levels`)."""
+        """Capability level (`abbe.service.push.limits`)."""
         return self.capabilities.level
 
 

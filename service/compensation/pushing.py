@@ -20,16 +20,12 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import level_status
 from abbe.service.domain.owner import this_process
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
-from abbe.service.push.adapter import ControllerPort, PushActors
-from abbe.service.push.book import StoreBook
-from abbe.service.push.entries import Doc, Journal, facts
-from abbe.service.push.execute import Ended
+from abbe.service.push.execute import ControllerPort, Ended, PushActors, semantic_digest_of_tables
+from abbe.service.push.journal import Doc, Journal, OperationOrder, StoreBook, facts
 from abbe.service.push.operations import Approval, Verdict
-from abbe.service.push.order import OperationOrder
-from abbe.service.push.semantic_digest import semantic_digest_of_tables
-from abbe.service.push.states import PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

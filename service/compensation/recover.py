@@ -11,12 +11,11 @@ from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.pushing import pushes_here
 from abbe.service.domain.owner import Owner, this_process
+from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from abbe.service.push import execute
-from abbe.service.push.adapter import ControllerPort, no_actors
-from abbe.service.push.book import StoreBook
-from abbe.service.push.entries import NO_PUSH, Journal, facts
-from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
+from abbe.service.push.execute import ControllerPort, no_actors
+from abbe.service.push.journal import NO_PUSH, Journal, StoreBook, facts
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import operator_needed

@@ -15,10 +15,10 @@ from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposals import by_whom
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, RestoredTable
 from abbe.service.compensation.recover import recover
+from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.push.entries import Journal, facts
+from abbe.service.push.journal import Journal, facts
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

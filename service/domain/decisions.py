@@ -1,4 +1,4 @@
-"""Stored decisions on tables: proposals, approvals, rejections, and the push journal. One record is one row."""
+"""Stored decisions on tables: proposals, approvals, rejections. One record is one row."""
 
 from __future__ import annotations
 
@@ -46,28 +46,3 @@ class ProposalRejection(ProposalDecision):
     """A rejection with its reason."""
 
     reason: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PushTransition:
-    """One transition of a push, chained by ``prev`` to the entry before it in the same journal.
-
-    ``machine``: name of the journal (`chain_of`); ``push``: number of the push in it; ``seq``: number of the entry in its push, from 0;
-    ``prev``, ``digest``: SHA-256 of the entry before and of this one.
-    """
-
-    machine: str
-    push: int
-    seq: int
-    state: str
-    utc: str
-    prev: str
-    digest: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PushEntryRecord(PushTransition):
-    """A transition as it is stored. Never changed after writing; the database gives ``id``."""
-
-    id: int = 0
-    doc: Doc

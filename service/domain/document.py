@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -10,6 +11,8 @@ from abbe.service.errors import Unusable
 
 Doc = dict[str, Any]
 """A JSON object."""
+GENESIS = "0" * 64
+"""What the first entry of a hash chain follows, in place of a digest."""
 T = TypeVar("T")
 _adapters: dict[type[Any], TypeAdapter[Any]] = {}
 
@@ -41,3 +44,8 @@ def record(kind: type[T], doc: object, what: str) -> T:
         path = ".".join(str(part) for part in first["loc"])
         raise Unusable(f"{what} has another form than expected: {path}: {first['msg']}", "make it again with this version") from None
     return found
+
+
+def canonical(value: object) -> bytes:
+    """Canonical JSON for hashing: sorted keys, no blanks. Raises ValueError for NaN and Inf."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False).encode()

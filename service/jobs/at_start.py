@@ -8,7 +8,7 @@ from abbe.service.capture.recovery import recover_segments
 from abbe.service.compensation.recovered_session import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
-from abbe.service.push.states import TERMINAL, PushState
+from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from datetime import datetime
-from typing import Any
 
-from abbe.service.domain.decisions import PushEntryRecord
+from abbe.service.domain.push_entry import BEFORE_ACTIVATION, PushEntry, PushState
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import CheckFailure, Verification
 from abbe.service.plant.facts import ActiveTable, PlantAlarm, PlantFacts
+from abbe.service.push.journal import NOT_YET, PushFacts, facts
 from abbe.service.queries.status import Status
 from abbe.service.storage.store import Store
 
@@ -80,7 +80,7 @@ def _slot_alarm(slot: SlotRecord) -> PlantAlarm:
     )
 
 
-def table_in_force(journal: Sequence[PushEntryRecord]) -> ActiveTable | None:
+def table_in_force(journal: Sequence[PushEntry]) -> ActiveTable | None:
     """Return the active table, as far as the journal of the last push knows it.
 
     Before activation and after a push that failed it is the old one, after KEEP the new one, after a person's acceptance the accepted one.
@@ -88,23 +88,20 @@ def table_in_force(journal: Sequence[PushEntryRecord]) -> ActiveTable | None:
     """
     if not journal:
         return None
-    known: dict[str, Any] = {}
-    for entry in journal:
-        known.update(entry.doc)
-    last = journal[-1]
-    found = _bank_and_crc(last.state, known)
-    if found is None or not all(isinstance(part, int) for part in found):
-        return None
-    return ActiveTable(found[0], found[1], last.push, datetime.fromisoformat(last.utc))
+    last, known = journal[-1], facts(tuple(journal))
+    bank, crc = _bank_and_crc(last.state, known)
+    return None if NOT_YET in (bank, crc) else ActiveTable(bank, crc, last.push, datetime.fromisoformat(last.utc))
 
 
-def _bank_and_crc(state: str, known: Mapping[str, Any]) -> tuple[Any, Any] | None:
-    if state == "ACCEPTED":
-        return known.get("accepted_bank"), known.get("accepted_crc")
-    if state == "KEEP":
-        return known.get("target"), known.get("crc")
-    if state == "ROLLED_BACK":
-        return known.get("bank"), known.get("base_crc")
-    if state in {"SNAPSHOT", "REJECTED", "VALIDATED", "APPROVED", "LEASED", "STAGING", "STAGED", "ABORTED"}:
-        return known.get("base_bank"), known.get("base_crc")
-    return None
+def _bank_and_crc(state: PushState, known: PushFacts) -> tuple[int, int]:
+    """Bank and CRC of the table in force; `NOT_YET` if it is not known."""
+    match state:
+        case PushState.ACCEPTED:
+            return known.accepted_bank, known.accepted_crc
+        case PushState.KEEP:
+            return known.target, known.crc
+        case PushState.ROLLED_BACK:
+            return known.bank, known.base_crc
+        case _ if state in BEFORE_ACTIVATION or state in (PushState.REJECTED, PushState.ABORTED):
+            return known.base_bank, known.base_crc
+    return NOT_YET, NOT_YET

@@ -6,11 +6,11 @@ The process that began the push runs it, or any later one; it may be interrupted
 from __future__ import annotations
 
 from abbe.drivers.api import BankState
-from abbe.service.push.entries import Doc, PushFacts
-from abbe.service.push.learn import BACK
-from abbe.service.push.operations import Knowledge, Operation, OperationKind, Refused, Truth
+from abbe.service.domain.document import Doc
+from abbe.service.domain.push_entry import PushState
+from abbe.service.push.journal import PushFacts
+from abbe.service.push.operations import BACK, Knowledge, Operation, OperationKind, Refused, Truth
 from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
-from abbe.service.push.states import PushState
 
 MAX_UNANSWERED = 3
 BACKS = 3

@@ -1,17 +1,36 @@
-"""Run the push machine: get the next operation, do it through a port, learn from its outcome. One loop for models and machines."""
+"""Run the push machine: get the next operation, do it through a port, learn from its outcome. One loop for models and machines.
+
+`ControllerPort` is the port to a real controller: one operation becomes one call of the driver, and its errors become outcomes. It decides
+nothing: Refused means that nothing changed, Doubt that the result is unknown. The machine decides.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import hashlib
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from abbe.service.push.entries import Doc, Journal, JournalEntry
-from abbe.service.push.learn import after_record, learn
+from abbe.drivers.api import Condition, TableController
+from abbe.drivers.errors import DriverError, Rebooted, Refused
+from abbe.drivers.second_decoder import UnreadableImage, read_axis_tables
+from abbe.models.compensation.tables import NineTables
+from abbe.service.clock import Clock
+from abbe.service.domain.document import Doc, canonical
+from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
+from abbe.service.push import operations as o
+from abbe.service.push.journal import Journal, OperationOrder, facts
 from abbe.service.push.machine import next_operation
-from abbe.service.push.operations import Knowledge, Operation, OperationKind, Outcome
-from abbe.service.push.order import OperationOrder
-from abbe.service.push.states import TERMINAL, PushState
+from abbe.service.push.operations import Knowledge, Operation, OperationKind, Outcome, Truth, after_record, learn
+from abbe.service.sequences.interlocks import tripped
+
+LEASE_MS, BEAT_S = 60_000, 20.0
+"""Length of a lease, and interval of its renewal while the machine is measured."""
+_POSITIONS_PER_MM = 1e5
+_VALUES_PER_MM = 1e6
+
+Rows = list[tuple[str, str, list[tuple[int, int]]]]
 
 
 class Port(Protocol):
@@ -29,7 +48,7 @@ class Book(Protocol):
         """All entries so far."""
         ...
 
-    async def append(self, journal: Journal, state: PushState, doc: Doc) -> JournalEntry:
+    async def append(self, journal: Journal, state: PushState, doc: Doc) -> PushEntry:
         """Write the next entry; on return it is on disk. Raises otherwise, or if somebody else wrote an entry meanwhile."""
         ...
 
@@ -81,3 +100,182 @@ async def _drive(
             journal, known = (*journal, entry), after_record(known, entry.state)
         else:
             known = learn(known, op, await port.execute(op, journal))
+
+
+@dataclass(frozen=True, slots=True)
+class PushActors:
+    """Answers to the machine's questions: check of the table, approval, probe, verification."""
+
+    validate: Callable[[Journal], Awaitable[list[str]]]
+    approve: Callable[[Journal], Awaitable[o.Approval | None]]
+    probe: Callable[[Journal], Awaitable[o.Verdict]]
+    verify: Callable[[Journal], Awaitable[o.Verdict]]
+
+
+def no_actors() -> PushActors:
+    """Actors for a recovery, which asks no question: every answer is no."""
+
+    async def no_reason(journal: Journal) -> list[str]:
+        return ["nobody is there to check it"]
+
+    async def no_approval(journal: Journal) -> o.Approval | None:
+        return None
+
+    async def no_verdict(journal: Journal) -> o.Verdict:
+        return o.Verdict(False, "nobody is there to measure it")
+
+    return PushActors(no_reason, no_approval, no_verdict, no_verdict)
+
+
+class ControllerPort:
+    """Does operations on a real controller.
+
+    Parameters
+    ----------
+    controller : TableController
+        Identified.
+    clock : Clock
+        Monotonic time, in which approvals expire.
+    """
+
+    def __init__(self, controller: TableController, actors: PushActors, clock: Clock) -> None:
+        self._c, self._actors, self._clock = controller, actors, clock
+        self._map = ""
+
+    async def execute(self, op: Operation, journal: Journal) -> Outcome:
+        """Do one operation; raises nothing for what the controller or the link does."""
+        try:
+            return await self._execute(op, journal)
+        except Refused as error:
+            return o.Refused(str(error))
+        except (DriverError, TimeoutError) as error:
+            return o.Doubt(str(error) or type(error).__name__)
+
+    async def _execute(self, op: Operation, journal: Journal) -> Outcome:
+        match op.kind:
+            case OperationKind.LOOK:
+                return o.Done(await self._look())
+            case OperationKind.READ:
+                return o.Done(await self._c.read_bank(op.bank, 2 * op.count or None))
+            case OperationKind.READ_AGAIN:
+                return o.Done(semantic_digest_of_image(await self._c.read_bank(op.bank, 2 * op.count or None)))
+            case OperationKind.READ_CHUNK:
+                return o.Done(await self._c.read_bank(op.bank, 2 * op.count, first=op.first))
+            case OperationKind.VALIDATE | OperationKind.APPROVE | OperationKind.PROBE | OperationKind.VERIFY:
+                return await self._ask(op.kind, journal)
+            case _:
+                await self._change(op)
+                return o.Done()
+
+    async def _change(self, op: Operation) -> None:
+        match op.kind:
+            case OperationKind.LEASE:
+                await self._c.lease(op.owner, LEASE_MS)
+            case OperationKind.RELEASE:
+                await self._c.release(op.owner)
+            case OperationKind.WRITE:
+                await self._c.write_bank(op.bank, op.data, first=op.first)
+            case OperationKind.SEAL:
+                await self._c.seal(op.bank, op.owner)
+            case OperationKind.ACTIVATE:
+                await self._c.activate(op.bank, expect_crc=op.crc, expect_gen=op.gen, owner=op.owner)
+            case _:
+                raise AssertionError(f"{op.kind} is no operation on a controller")
+
+    async def _ask(self, kind: OperationKind, journal: Journal) -> Outcome:
+        if kind is OperationKind.VALIDATE:
+            return o.Done(await self._actors.validate(journal))
+        if kind is OperationKind.APPROVE:
+            approval = await self._actors.approve(journal)
+            return o.Refused("nobody approved it") if approval is None else o.Done(approval)
+        return o.Done(await self._while_leased(self._actors.probe if kind is OperationKind.PROBE else self._actors.verify, journal))
+
+    async def _while_leased(self, question: Callable[[Journal], Awaitable[o.Verdict]], journal: Journal) -> o.Verdict:
+        """Measure while renewing the lease. If another owner takes it, the measurement does not count."""
+        over, lost = asyncio.Event(), asyncio.Event()
+        asked = asyncio.ensure_future(question(journal))
+        beat = asyncio.ensure_future(self._beat(facts(journal).owner, over, lost))
+        try:
+            await asyncio.wait([asked, beat], return_when=asyncio.FIRST_COMPLETED)
+            if lost.is_set() and not asked.done():
+                asked.cancel()
+            await asyncio.wait([asked])
+        finally:
+            over.set()  # not cancelled: a command under way would leave the link in doubt
+            await asyncio.wait([beat])
+        if lost.is_set() and asked.cancelled():
+            return o.Verdict(False, "another owner took the lease meanwhile")
+        if not beat.cancelled():
+            beat.exception()  # a failed renewal shows at the next look at the lease; the measurement counts
+        return asked.result()
+
+    async def _beat(self, owner: int, over: asyncio.Event, lost: asyncio.Event) -> None:
+        """Renew the lease until ``over`` is set; set ``lost`` when another owner has it."""
+        ended = asyncio.ensure_future(over.wait())
+        try:
+            while True:
+                pause = asyncio.ensure_future(self._clock.sleep(BEAT_S))
+                await asyncio.wait([ended, pause], return_when=asyncio.FIRST_COMPLETED)
+                pause.cancel()
+                if ended.done():
+                    return
+                try:
+                    await self._c.lease(owner, LEASE_MS)
+                except Refused:
+                    lost.set()
+                    return
+                except (DriverError, TimeoutError):
+                    continue  # the measurement meets the same fault, and decides
+        finally:
+            ended.cancel()
+
+    async def _look(self) -> Truth:
+        """One look. Only a look accepts a restart: the new boot id reports it to the machine."""
+        if not self._map:
+            self._map = (await self._c.identify()).firmware
+        try:
+            return await self._truth()
+        except Rebooted:
+            self._map = (await self._c.identify()).firmware
+            return await self._truth()
+
+    async def _truth(self) -> Truth:
+        status = await self._c.status()
+        comp = await self._c.comp_status()
+        trouble = tripped(status)
+        unsafe = trouble.detail if trouble else ("the axes move" if status.moving else "")
+        still_s = (status.ctrl_us - status.in_position_us) * 1e-6 if Condition.IN_POSITION in status.conditions else 0.0
+        return Truth(
+            comp.boot_id, comp.gen, comp.active_bank, comp.bank_crc, comp.bank_state, comp.lease_owner, comp.lease_left_ms,
+            unsafe, still_s, self._clock.monotonic_s(), self._map,
+        )  # fmt: skip
+
+
+def semantic_digest_of_tables(tables: NineTables) -> str:
+    """Digest of corrections (added to the command): position in 10 nm and correction in nm, for each moved and each corrected axis.
+
+    It shares no code with `semantic_digest_of_image`: if the encoder gets a sign, an axis or a unit wrong, the two differ. Only the
+    physical probe shows what both get wrong.
+    """
+    rows: Rows = []
+    for a, moved in enumerate("XYZ"):
+        for i, corrected in enumerate("XYZ"):
+            pairs = zip(tables.position_mm[a].tolist(), tables.correction_mm[a][:, i].tolist(), strict=True)
+            rows.append((moved, corrected, [(round(p * _POSITIONS_PER_MM), round(c * _VALUES_PER_MM)) for p, c in pairs]))
+    return _digest(rows)
+
+
+def semantic_digest_of_image(image: bytes) -> str:
+    """Digest of a bank as the independent decoder reads it; ``"unreadable"`` if it cannot."""
+    try:
+        curves = read_axis_tables(image)
+    except UnreadableImage:
+        return "unreadable"
+    rows: Rows = []
+    for (moved, corrected), pairs in curves.items():
+        rows.append((moved, corrected, [(round(p * _POSITIONS_PER_MM), round(c * _VALUES_PER_MM)) for p, c in pairs]))
+    return _digest(rows)
+
+
+def _digest(rows: Rows) -> str:
+    return hashlib.sha256(canonical(sorted(rows))).hexdigest()

@@ -10,14 +10,12 @@ import zlib
 from collections.abc import Callable
 
 from abbe.drivers.api import BankState
+from abbe.service.domain.push_entry import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, PushState
 from abbe.service.push.back import MAX_UNANSWERED, OWNERS, go_back, in_force, mismatch_doc, record
-from abbe.service.push.entries import Journal, PushFacts, facts_to_act_on
-from abbe.service.push.learn import FORGET
-from abbe.service.push.levels import objection
-from abbe.service.push.operations import Approval, Done, Knowledge, Operation, OperationKind, Refused, Truth, Verdict
-from abbe.service.push.order import OperationOrder
+from abbe.service.push.journal import Journal, OperationOrder, PushFacts, facts_to_act_on
+from abbe.service.push.limits import objection
+from abbe.service.push.operations import FORGET, Approval, Done, Knowledge, Operation, OperationKind, Refused, Truth, Verdict
 from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
-from abbe.service.push.states import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, PushState
 
 STILL_S = 1.0
 """The axes must have stood for this long before anything is staged."""
@@ -29,8 +27,8 @@ def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | N
     """Decide what to do next.
 
     ``journal``: all entries of one push, empty before its first; ``known``: what this process learned since its start, or since the last
-    entry; ``order``: needed only while the journal is empty. After the operation: `abbe.service.push.learn`, or for RECORD the entry and
-    `after_record`.
+    entry; ``order``: needed only while the journal is empty. After the operation: `learn`, or for RECORD the entry and `after_record`
+    (`abbe.service.push.operations`).
     """
     if not journal:
         return _begin(known, order) if order is not None else Operation(OperationKind.END, text="nothing was begun")

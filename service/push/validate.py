@@ -1,4 +1,4 @@
-"""Reasons against a table, found without touching the controller: form, numbers, promise, evidence, policy, signature.
+"""A proposed table, and the reasons against it that need no controller: form, numbers, promise, evidence, policy, signature. Pure.
 
 All reasons are collected, so that a person sees everything at once. Only an empty list admits a table.
 """
@@ -6,18 +6,123 @@ All reasons are collected, so that a person sees everything at once. Only an emp
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import asdict, replace
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 
-from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal
-from abbe.service.push.entries import canonical
+from abbe.service.domain.document import canonical
 from abbe.service.push.limits import PushLimits
-from abbe.service.push.validate_numbers import number_reasons
 
 AXES = ("X", "Y", "Z")
 HEADER_REGISTERS = 24
 SIGNERS = frozenset({"metrologist"})
+LARGEST = 32767
+WHOLE = 0.01
+"""Allowed distance of a value from a whole unit of the table, in units: float noise only."""
+ZERO_MM = 0.5e-6
+"""A table that is not zero at its reference moves the axis at once when it comes into force."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Correction of one axis over the travel of one axis.
+
+    ``left_mm``: the machine's measured error in this column with the table in force; a correction of opposite sign reduces it.
+    ``reverse_mm``: corrections for the reverse approach, or empty; ``reversal_mm``: measured mean difference, reverse minus forward.
+    """
+
+    moved: str
+    corrected: str
+    position_mm: tuple[float, ...]
+    correction_mm: tuple[float, ...]
+    left_mm: tuple[float, ...] = ()
+    reverse_mm: tuple[float, ...] = ()
+    reversal_mm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class TableEvidence:
+    """What the table was computed from. Lengths mm; ``machine_mark``: see `CandidateContext`.
+
+    ``ended_s``, ``last_s``: end of the oldest and of the newest run, seconds UTC by the service's clock; ``last_s`` None: the same.
+    """
+
+    run_count: int
+    ended_s: float
+    temperature_c: tuple[float, float]
+    drift_mm: float
+    u_mm: float
+    before_mm: float
+    after_mm: float
+    machine_mark: str
+    calibrated_until_s: tuple[float, ...]
+    last_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceSeal:
+    """Who vouches for the table: role, and SHA-256 of the signed content; empty without a signature."""
+
+    role: str = ""
+    digest: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A proposed table. ``base_crc``: CRC of the table in force during the measurement, the only one that it may replace."""
+
+    machine: str
+    map_version: int
+    lsb_nm: int
+    length_unit: str
+    columns: tuple[Column, ...]
+    base_crc: int
+    evidence: TableEvidence
+    digest: str
+    seal: EvidenceSeal = field(default_factory=EvidenceSeal)
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateContext:
+    """What a candidate is checked against: this machine, its controller, the table in force, the time.
+
+    Parameters
+    ----------
+    machine, machine_mark : str
+        Name; mark that changes with every reboot, crash alarm and maintenance, which invalidate older measurements.
+    map_version, lsb_nm, bank_registers : int
+        Of the controller.
+    travel_mm : dict
+        Axis -> (lowest, highest) position.
+    grid_mm : dict
+        Axis -> the controller's grid, where it prescribes one.
+    active_crc, active : int, dict
+        Table in force: its CRC; (moved, corrected) -> corrections on the candidate's grid, empty for no correction.
+    month_ago : dict
+        The same for the table of 30 days ago.
+    now_s : float
+        Seconds UTC.
+    attended : bool
+        A person who may approve is at the machine.
+    last_push_s : float
+        Time of the last unattended push; minus infinity for never.
+    """
+
+    machine: str
+    machine_mark: str
+    map_version: int
+    lsb_nm: int
+    bank_registers: int
+    travel_mm: dict[str, tuple[float, float]]
+    grid_mm: dict[str, tuple[float, ...]]
+    active_crc: int
+    active: dict[tuple[str, str], tuple[float, ...]]
+    month_ago: dict[tuple[str, str], tuple[float, ...]]
+    now_s: float
+    attended: bool = True
+    last_push_s: float = float("-inf")
 
 
 def content_digest(candidate: Candidate) -> str:
@@ -146,3 +251,116 @@ def _seal(c: Candidate) -> Iterator[str]:
         yield f"ROLE: signed by a {c.seal.role}, only a metrologist may"
     elif c.seal.digest != digest:
         yield "SIGNATURE: it was given for another table"
+
+
+def number_reasons(candidate: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
+    """All reasons against the numbers of a candidate of correct form."""
+    odd = [reason for column in candidate.columns if (reason := _odd(column))]
+    if odd:
+        yield from odd
+        return
+    lsb_mm = context.lsb_nm * 1e-6
+    for column in candidate.columns:
+        name = f"table of {column.corrected} over {column.moved}"
+        active = context.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
+        for reason in _size(column, active, limits, lsb_mm):
+            yield f"{reason} ({name})"
+    for axis in sorted({column.corrected for column in candidate.columns}):
+        total_mm = sum(max(abs(v) for v in column.correction_mm) for column in candidate.columns if column.corrected == axis)
+        yield from together_reasons(axis, total_mm, limits)
+    yield from _whole(candidate, context, limits)
+
+
+def _odd(column: Column) -> str:
+    for value in (*column.correction_mm, *column.reverse_mm, *column.left_mm, *column.position_mm):
+        if not math.isfinite(value):
+            return f"NUMBER: {value} is not finite (table of {column.corrected} over {column.moved})"
+        if value == 0.0 and math.copysign(1.0, value) < 0.0:
+            return f"NUMBER: minus zero (table of {column.corrected} over {column.moved})"
+        if value != 0.0 and abs(value) < sys.float_info.min:
+            return f"NUMBER: {value} is denormal (table of {column.corrected} over {column.moved})"
+    return ""
+
+
+def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float], limits: PushLimits) -> Iterator[str]:
+    """Values, changes, steps and bends of one table beyond the limits: each with its place, its size and the key of its limit.
+
+    ``p``, ``v``, ``active``: positions, new corrections and those in force, mm.
+    """
+    steps = [b - a for a, b in pairwise(v)]
+    changes = [a - b for a, b in zip(v, active, strict=True)]
+    bends = [b - a for a, b in pairwise(steps)]
+    for word, sizes, limit, key in (
+        ("VALUE", v, limits.value_mm, "table_value_um"),
+        ("CHANGE", changes, limits.change_mm, "table_change_um"),
+        ("STEP", steps, limits.step_mm, "table_step_um"),
+        ("BEND", bends, limits.second_mm, ""),
+    ):
+        k = max(range(len(sizes)), key=lambda n: abs(sizes[n]), default=0)
+        if sizes and abs(sizes[k]) > limit:
+            allowed = f"allowed are {limit * 1e3:.1f} µm" + (f" ([limits] {key})" if key else "")
+            yield f"{word}: {abs(sizes[k]) * 1e3:.1f} µm at {p[k]:.1f} mm, {allowed}"
+
+
+def together_reasons(axis: str, total_mm: float, limits: PushLimits) -> Iterator[str]:
+    """The reason if the largest values of an axis' three tables add up to too much; ``total_mm``: their sum."""
+    if total_mm > limits.value_mm:
+        allowed = f"allowed are {limits.value_mm * 1e3:.1f} µm ([limits] table_value_um)"
+        yield f"VALUE: the tables of {axis} together reach {total_mm * 1e3:.1f} µm, {allowed}"
+
+
+def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm: float) -> Iterator[str]:
+    v, p = column.correction_mm, column.position_mm
+    counts = max(abs(x) / lsb_mm for x in v)
+    if round(counts) > LARGEST:
+        yield f"OVERFLOW: {counts:.0f} units do not fit 16 bits"
+    if len(active) != len(v):
+        yield "CHANGE: the table in force has another grid and was not given on this one"
+        return
+    yield from size_reasons(p, v, active, limits)
+    slopes = [abs(d - c) / (b - a) for c, d, a, b in zip(v, v[1:], p, p[1:], strict=False)]
+    if max(slopes) > limits.slope:
+        yield f"SLOPE: {max(slopes) * 1e3:.2f} µm/mm, allowed are {limits.slope * 1e3:.2f} µm/mm"
+    if abs(v[0]) > ZERO_MM:
+        yield f"REFERENCE: {v[0] * 1e3:.2f} µm at the reference instead of 0"
+    if max(abs(x / lsb_mm - round(x / lsb_mm)) for x in v) > WHOLE:
+        yield "ROUNDING: values are no whole units of the table; quantise it first"
+    if column.reverse_mm:
+        yield from _reverse(column)
+
+
+def _reverse(column: Column) -> Iterator[str]:
+    """The difference of the two directions has to reduce the measured reversal, not to double it."""
+    table = sum(b - a for a, b in zip(column.correction_mm, column.reverse_mm, strict=True)) / len(column.reverse_mm)
+    if abs(column.reversal_mm + table) > abs(column.reversal_mm):
+        measured_um, table_um = column.reversal_mm * 1e3, table * 1e3
+        yield f"DIRECTIONS: the two columns are exchanged (measured {measured_um:.1f} µm, the table adds {table_um:.1f} µm)"
+
+
+def _whole(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
+    """Shadow simulation: predict the residual with the new table from measurements with the one in force."""
+    values = [x for column in c.columns for x in column.correction_mm]
+    active = [x for column in c.columns for x in _active(column, context)]
+    if values == active:
+        yield "SAME: this table is in force already"
+        return
+    if not any(values) and any(active):
+        yield "ZERO: it would only take the table in force away; that is a rollback"
+    left = [x for column in c.columns for x in column.left_mm]
+    if len(left) != len(values) or len(active) != len(values):
+        yield "RESIDUAL: the machine's residuals are missing, so nothing can be predicted"
+        return
+    after = [e + (new - old) for e, new, old in zip(left, values, active, strict=True)]
+    before_mm, after_mm = _rms(left), _rms(after)
+    if not after_mm <= (1.0 - limits.gain) * before_mm:
+        opposed = sum(e * (new - old) for e, new, old in zip(left, values, active, strict=True)) > 0.0
+        word = "SIGN: it adds to the error" if opposed else "GAIN: it takes too little of the error"
+        yield f"{word}: {before_mm * 1e3:.2f} to {after_mm * 1e3:.2f} µm rms in the shadow"
+
+
+def _active(column: Column, context: CandidateContext) -> tuple[float, ...]:
+    return context.active.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
+
+
+def _rms(values: list[float]) -> float:
+    return math.sqrt(sum(v * v for v in values) / len(values))

@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
-from abbe.service.domain.decisions import PushTransition
+from abbe.service.domain.push_entry import PushEntry, PushState, PushTransition
 from abbe.service.queries.reader import Reader, of_row
 from abbe.service.tables.push_journal import JournalView, TableHistory
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PushEntry(PushTransition):
-    """One transition of a push in the journal of a machine, chained to the entry before it."""
-
-    number: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PushEntryDetail(PushEntry):
-    """An entry with the facts that it recorded; tables are hexadecimal images."""
-
-    known: dict[str, Any]
-
-
 def push_entries(
     reader: Reader, machine: str | None, push: int | None, state: str | None, cursor: int | None, limit: int
-) -> tuple[list[PushEntry], int | None]:
+) -> tuple[list[PushTransition], int | None]:
     """The push journal, newest entry first; a renamed machine keeps its journal under the first name."""
     journal = machine and reader.store.pushes.chain(machine, reader.control_of(machine))
     rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
-    return [of_row(PushEntry, row) for row in rows], after
+    return [of_row(PushTransition, row, state=PushState(row["state"])) for row in rows], after
 
 
-def push_entry(reader: Reader, number: int) -> PushEntryDetail:
+def push_entry(reader: Reader, number: int) -> PushEntry:
     """One entry of the journal with the facts that it recorded. Raises NotStored."""
     row = reader.row("pushes", number, "entry of a push")
-    return of_row(PushEntryDetail, row, known=row["doc"])
+    return of_row(PushEntry, row, state=PushState(row["state"]))
 
 
 def tables(reader: Reader) -> TableHistory:

@@ -10,10 +10,10 @@ import numpy as np
 
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
+from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
-from abbe.service.push.entries import NO_PUSH, NOT_YET, JournalBroken, JournalEntry, PushFacts, check_chain, facts
-from abbe.service.push.states import TERMINAL, PushState
+from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts
 from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
@@ -159,7 +159,7 @@ def _machine_doc(store: Store, machine: str) -> Doc:
     return next(m.doc for m in reversed(store.machines.all()) if m.name == machine)
 
 
-def _about(store: Store, journal: Sequence[JournalEntry], known: PushFacts) -> dict[str, str]:
+def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict[str, str]:
     out = {"Begun": journal[0].utc, "Last entry": journal[-1].utc, "State": str(journal[-1].state)}
     if known.crc != NOT_YET:
         out["New table"] = f"CRC {known.crc:08X}, bank {known.target}"
@@ -174,14 +174,14 @@ def _about(store: Store, journal: Sequence[JournalEntry], known: PushFacts) -> d
     return out | {name: text for name, text in found.items() if text}
 
 
-def _verdict(journal: Sequence[JournalEntry], known: PushFacts) -> tuple[Sign, str, str]:
+def _verdict(journal: Sequence[PushEntry], known: PushFacts) -> tuple[Sign, str, str]:
     state = journal[-1].state
     sign, word = ENDS.get(state, ("open", "Not ended"))
     why = known.why or known.verify or "; ".join(known.reasons)
     return sign, word, (why or f"it stands at {state}") + ("" if state in TERMINAL else f" (state {state})")
 
 
-def _chain(entries: Sequence[JournalEntry]) -> list[str]:
+def _chain(entries: Sequence[PushEntry]) -> list[str]:
     try:
         check_chain(entries)
     except JournalBroken as error:

@@ -1,13 +1,15 @@
 """Base of the repositories, and the mapping of rows to records.
 
-A field of a record is the column of the same name, unless its mapping names another column or a nested record.
+A field of a record is the column of the same name, unless its mapping names another column or a nested record. A field of a text enum is
+read as its member.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, Generic, TypeVar
+from enum import StrEnum
+from typing import Any, Generic, TypeVar, get_type_hints
 
 from sqlalchemy import Column, ColumnElement, Connection, FromClause, Row, Select, Table, func, insert, null, select
 from sqlalchemy.dialects.postgresql import Insert as PostgresInsert
@@ -15,7 +17,7 @@ from sqlalchemy.dialects.postgresql import insert as postgres_insert
 from sqlalchemy.dialects.sqlite import Insert as SqliteInsert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
-from abbe.service.domain import decisions, measured, people, results, service_records
+from abbe.service.domain import decisions, measured, people, push_entry, results, service_records
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.owner import Owner
 from abbe.service.errors import NotStored
@@ -45,6 +47,8 @@ class RecordMapping(Generic[R]):
         if missing := [name for name in names if name not in other and name not in table.c]:
             raise TypeError(f"{record.__name__}: table {table.name} has no column {', '.join(missing)}")
         self._fields = {name: other[name] if name in other else table.c[name] for name in names}
+        kinds = get_type_hints(record)
+        self._enums = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, StrEnum)}
 
     @property
     def columns(self) -> list[ColumnElement[Any]]:
@@ -64,12 +68,13 @@ class RecordMapping(Generic[R]):
 
     def from_values(self, values: Mapping[Any, Any]) -> R:
         """The record of values by names of `columns`."""
-        return self._make(
-            **{
-                name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
-                for name, column in self._fields.items()
-            }
-        )
+        found = {
+            name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
+            for name, column in self._fields.items()
+        }
+        for name, kind in self._enums.items():
+            found[name] = kind(found[name])
+        return self._make(**found)
 
     def values(self, record: R, *without: str) -> dict[str, Any]:
         """The columns of a record that its table stores, by name, except the fields ``without``."""
@@ -78,7 +83,8 @@ class RecordMapping(Generic[R]):
             if isinstance(column, RecordMapping):
                 found |= column.values(getattr(record, name))
             elif isinstance(column, Column) and column.table is self.table and name not in without:
-                found[column.name] = getattr(record, name)
+                value = getattr(record, name)
+                found[column.name] = value.value if name in self._enums else value
         return found
 
 
@@ -109,8 +115,8 @@ MODEL = RecordMapping(results.ModelRecord, t.machine_models)
 PROPOSAL = RecordMapping(decisions.ProposalRecord, t.proposals)
 APPROVAL = RecordMapping(decisions.ProposalApproval, t.approvals)
 REJECTION = RecordMapping(decisions.ProposalRejection, t.rejections)
-PUSH_ENTRY = RecordMapping(decisions.PushEntryRecord, t.push_entries)
-PUSH_MARK = RecordMapping(decisions.PushEntryRecord, t.push_entries, doc=null())
+PUSH_ENTRY = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id)
+PUSH_MARK = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id, doc=null())
 """Without the document, which holds the images of tables."""
 
 ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries)

@@ -12,10 +12,9 @@ from functools import cached_property
 from typing import Any, Literal
 
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushEntry, PushState
 from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import NO_PUSH, NOT_YET, Journal, JournalBroken, JournalEntry, PushFacts, check_chain, facts
-from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
+from abbe.service.push.journal import NO_PUSH, NOT_YET, Journal, JournalBroken, PushFacts, check_chain, facts
 from abbe.service.storage.store import Store
 from abbe.service.tables.unverified import PushedTable, known_tables
 
@@ -114,7 +113,7 @@ class JournalView:
     `pushes`, and everything that uses it, raises `JournalChanged` if an entry was changed, removed or swapped.
     """
 
-    entries: tuple[JournalEntry, ...] = ()
+    entries: tuple[PushEntry, ...] = ()
     origins: Mapping[int, TableOrigin] = field(default_factory=dict)
 
     @classmethod
@@ -133,7 +132,7 @@ class JournalView:
         StoreError
             The database cannot be read.
         """
-        return cls(tuple(read_entries(store, machine, control)), origins_of(store) if origins else {})
+        return cls(tuple(store.pushes.entries(machine, control)), origins_of(store) if origins else {})
 
     @property
     def sound(self) -> bool:
@@ -190,7 +189,7 @@ class JournalView:
         return next((crc for crc in bases if crc != NOT_YET), None), True
 
     @property
-    def changes(self) -> list[JournalEntry]:
+    def changes(self) -> list[PushEntry]:
         """Entries that put a table into force permanently: kept, or accepted by a person. Pushes that were rolled back do not count."""
         return [e for e in self.entries if e.state in (PushState.KEEP, PushState.ACCEPTED)]
 

@@ -11,10 +11,8 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.document import Doc
-from abbe.service.push.entries import JournalEntry
-from abbe.service.push.states import BEFORE_ACTIVATION, TERMINAL, PushState
+from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushEntry, PushState
 from abbe.service.storage.store import Store
 
 How = Literal["verified", "accepted", "found in force"]
@@ -108,7 +106,7 @@ def known_tables(store: Store) -> KnownTables:
     return KnownTables({number: last[key] for number, key in unverified.items()}, frozenset(crcs), pushed, endorsed)
 
 
-def _add(endorsed: dict[int, dict[str, Endorsement]], crc: int, how: How, push: PushedTable, mark: PushEntryRecord) -> None:
+def _add(endorsed: dict[int, dict[str, Endorsement]], crc: int, how: How, push: PushedTable, mark: PushEntry) -> None:
     """Add an endorsement to a journal; "found in force" never replaces an earlier one."""
     one = Endorsement(how, push.machine, push.push, mark.utc, str(mark.doc.get("by", "")) if how == "accepted" else "")
     journals, chain = endorsed.setdefault(crc, {}), push.chain
@@ -116,7 +114,7 @@ def _add(endorsed: dict[int, dict[str, Endorsement]], crc: int, how: How, push: 
         journals[chain] = one
 
 
-def unverified_crcs(entries: Sequence[JournalEntry]) -> dict[int, int]:
+def unverified_crcs(entries: Sequence[PushEntry]) -> dict[int, int]:
     """Tables of one journal that were neither kept nor accepted: CRC -> number of the push."""
     found = _unverified([(e.push, e.state, e.doc) for e in entries])
     return {crc: push for crc, push in found.items() if isinstance(push, int)}

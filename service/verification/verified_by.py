@@ -14,10 +14,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, computed_field
 
 from abbe.service.domain.document import Doc
+from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import StoreError
-from abbe.service.push.entries import JournalEntry
-from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
 
@@ -174,7 +173,7 @@ def _of_journal(store: Store, journal: JournalView, checks: Sequence[Verificatio
     return VerifiedBy("unknown", "never", **known)
 
 
-def _since(store: Store, journal: JournalView, change: JournalEntry, known: dict[str, Any]) -> VerifiedBy:
+def _since(store: Store, journal: JournalView, change: PushEntry, known: dict[str, Any]) -> VerifiedBy:
     """State after a change of table without a later check: decided by the kind of change."""
     if change.state is PushState.ACCEPTED:
         return VerifiedBy("unverified", "accepted", change.push, datetime.fromisoformat(change.utc), **known)

@@ -11,11 +11,11 @@ from abbe.service.campaigns.builtin_recipes import USUAL_HZ
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState
+from abbe.service.domain.push_entry import PushTransition
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.measured import CampaignSummary, MachineDescription, RunSummary
 from abbe.service.queries.people import UserSummary
 from abbe.service.queries.proposals import ProposalSummary
-from abbe.service.queries.pushes import PushEntry
 from abbe.service.queries.results import DiscoverySummary, SolutionSummary
 from abbe.service.queries.timetable import ScheduleState
 from abbe.service.web.catalogue import ErrorEntry
@@ -75,7 +75,7 @@ class ProposalList(ListPage):
 class PushJournal(ListPage):
     """The journal of pushes."""
 
-    entries: Sequence[PushEntry]
+    entries: Sequence[PushTransition]
 
 
 class CheckList(ListPage):

@@ -12,9 +12,8 @@ import pytest
 from abbe.service.compensation.commission import check_commissioned, commission, commissioned
 from abbe.service.compensation.recover import recover
 from abbe.service.domain.progress import Progress, ignore_progress
+from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import Interlock, StillActive, TableRefused
-from abbe.service.push.book import read_entries
-from abbe.service.push.states import TERMINAL, PushState
 from abbe.service.sequences.interlocks import Suspending, Watching
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc import bank
@@ -56,7 +55,7 @@ async def test_an_honest_control_is_proved(place):
     await check_commissioned(controller, store, b.site)
     comp = b.sim.world.controller.comp
     assert comp.crcs[comp.active] == crc  # the table that was in force is in force again
-    entries = read_entries(store, b.site.name)
+    entries = store.pushes.entries(b.site.name)
     assert [e.state for e in entries if e.state in TERMINAL] == [PushState.ROLLED_BACK] * 4
 
 
@@ -78,7 +77,7 @@ async def test_another_unit_stops_at_the_first_step(place, monkeypatch):
     with pytest.raises(TableRefused, match="takes the numbers for another unit"):
         await commission(b.session, store, b.site, progress=ignore_progress)
     comp = b.sim.world.controller.comp
-    assert read_entries(store, b.site.name)[-1].state is PushState.ROLLED_BACK
+    assert store.pushes.entries(b.site.name)[-1].state is PushState.ROLLED_BACK
     assert np.abs(comp.correction(np.array([[300.0, 250.0, 200.0]]))).max() == 0.0
     assert await commissioned(b.session.controller, store, b.site) is False
     assert b.sim.world.ballbar._cup_mm is None  # and cup and bar are away
@@ -104,7 +103,7 @@ async def test_a_door_in_the_middle_ends_it_with_the_old_table_and_says_what_is_
     await recover(b.session.controller, store, site)
     comp = b.sim.world.controller.comp
     assert np.abs(comp.correction(np.array([[300.0, 250.0, 200.0]]))).max() == 0.0
-    assert read_entries(store, b.site.name)[-1].state is PushState.ROLLED_BACK
+    assert store.pushes.entries(b.site.name)[-1].state is PushState.ROLLED_BACK
 
 
 async def test_a_unit_too_coarse_for_a_harmless_step_is_refused_before_anything_is_mounted(place, monkeypatch):
@@ -117,5 +116,5 @@ async def test_a_unit_too_coarse_for_a_harmless_step_is_refused_before_anything_
     monkeypatch.setattr(b.session.controller, "table_format", coarse, raising=False)
     with pytest.raises(TableRefused, match="too coarse"):
         await commission(b.session, store, b.site, progress=ignore_progress)
-    assert not read_entries(store, b.site.name)
+    assert not store.pushes.entries(b.site.name)
     assert not store.runs.all()

@@ -17,8 +17,7 @@ from abbe.service.compensation.commission_levels import RESTART, commission_leve
 from abbe.service.compensation.proved_levels import check_level, level_status
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import facts
+from abbe.service.push.journal import facts
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -181,7 +180,7 @@ def in_force(b) -> list[int]:
 async def test_an_honest_controller_is_proved_and_may_be_pushed_into_by_night(place):
     b, store = place
     assert (await push(b, store, attended=True)).kept  # a real table is in force
-    assert facts(tuple(read_entries(store, "sim"))).level == 2  # not proved yet: what the status block shows
+    assert facts(tuple(store.pushes.entries("sim"))).level == 2  # not proved yet: what the status block shows
     comp, before = b.sim.world.controller.comp, in_force(b)
     where = b.sim.world.controller.position_mm.copy()
     active = comp.active
@@ -194,7 +193,7 @@ async def test_an_honest_controller_is_proved_and_may_be_pushed_into_by_night(pl
     assert bank.parse(comp.words[1 - active])[0] == 1  # the copy stays
     assert (await level_status(b.session.controller, store, b.site)).hint == ""
     assert (await push(b, store, attended=False, slope=2e-5)).kept
-    assert facts(tuple(e for e in read_entries(store, "sim") if e.push == 2)).level == 3
+    assert facts(tuple(e for e in store.pushes.entries("sim") if e.push == 2)).level == 3
 
 
 async def test_never_proved_is_for_attended_pushes_only_and_says_so(place):

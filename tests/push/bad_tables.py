@@ -7,8 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 
-from abbe.service.push.candidate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence
-from abbe.service.push.validate import content_digest
+from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest
 
 LSB_MM = 1e-4
 NOW_S = 1.8e9

@@ -29,7 +29,7 @@ MUTANTS: dict[str, Edits] = {
         ),
     ),
     "activation sent again blindly": (("machine", "not known.asked and not known.stop:", "(not known.asked or known.unanswered):"),),
-    "only the first chunk compared": (("learn", "outcome.value == op.data:", "(op.first > 0 or outcome.value == op.data):"),),
+    "only the first chunk compared": (("operations", "outcome.value == op.data:", "(op.first > 0 or outcome.value == op.data):"),),
     "boot id ignored": (
         ("machine", '(truth.boot, truth.gen) != (f.boot, f.probation_gen)', 'truth.gen != f.probation_gen'),
         ("machine", ' or known.start.boot != f.boot)', ")"),
@@ -41,9 +41,9 @@ MUTANTS: dict[str, Edits] = {
     ),
     "reasons noted, table written": (("machine", "reasons=reasons) if reasons else", "reasons=reasons) if False else"),),
     "approval of the machine's name": (
-        ("entries", '[image.hex(), base_image.hex(), machine, limits, expiry]', '[machine, expiry]'),
+        ("journal", '[image.hex(), base_image.hex(), machine, limits, expiry]', '[machine, expiry]'),
     ),
-    "approval without the base": (("entries", '[image.hex(), base_image.hex(), ', '[image.hex(), '),),
+    "approval without the base": (("journal", '[image.hex(), base_image.hex(), ', '[image.hex(), '),),
     "approval never ends": (("machine", "truth.now_s >= known.approved_until_s", "False"),),
     "way back without the old table": (
         ("back", 'if truth.states[other] is BankState.SEALED and truth.crc[other] == f.base_crc:', "if True:"),
@@ -66,7 +66,7 @@ MUTANTS: dict[str, Edits] = {
     "new table written in place": (("machine", '"target": 1 - active}', '"target": active}'),),
     "a person's words overwritten": (("staging", "if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):", "if False:"),),
     "a person's table switched away": (("back", 'if which == "neither":', "if False:"),),
-    "journal not chained": (("entries", "str(state), doc, utc, prev]", 'str(state), doc, utc, ""]'),),
+    "journal not chained": (("journal", "str(state), doc, utc, prev]", 'str(state), doc, utc, ""]'),),
     "level not asked": (("machine", "    if no:\n", "    if False:\n"),),
     "way back without an entry": (
         (

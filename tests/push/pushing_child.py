@@ -24,12 +24,8 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError
 from abbe.service.push import operations as o
-from abbe.service.push.adapter import ControllerPort, PushActors
-from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.entries import check_chain, facts
-from abbe.service.push.execute import push, recover
-from abbe.service.push.order import OperationOrder
-from abbe.service.push.semantic_digest import semantic_digest_of_tables
+from abbe.service.push.execute import ControllerPort, PushActors, push, recover, semantic_digest_of_tables
+from abbe.service.push.journal import OperationOrder, StoreBook, check_chain, facts
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
 
@@ -128,7 +124,7 @@ async def _work(words: dict[str, Any]) -> dict[str, Any]:
             else:
                 book = await StoreBook.last(store, MACHINE, clock)
                 ended = await recover(port, KillingBook(book, killer)) if book is not None else None
-            check_chain(read_entries(store, MACHINE))
+            check_chain(store.pushes.entries(MACHINE))
             comp = await controller.comp_status()
             active = await controller.read_bank(comp.active_bank)
         finally:

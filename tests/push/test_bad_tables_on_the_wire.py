@@ -11,11 +11,10 @@ import pytest
 
 from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableRefused
-from abbe.service.push.book import read_entries
 from abbe.service.push.limits import PushLimits
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import PushState
 from abbe.service.push.validate import reasons_against
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -65,7 +64,7 @@ async def test_every_class_of_bad_tables_is_rejected_and_writes_no_register(tmp_
                 questions = Questions(lambda reasons=reasons: reasons, "a test", never, never)
                 with pytest.raises(TableRefused, match=word):
                     await Pushing(controller, store, b.site).bring(wanted, questions)
-                last = read_entries(store, b.site.name)[-1]
+                last = store.pushes.entries(b.site.name)[-1]
                 assert (last.state, last.doc["reasons"]) == (PushState.REJECTED, reasons)
             assert log == []
             assert b.sim.world.controller.comp.generation == gen

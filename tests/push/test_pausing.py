@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
+from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.errors import Stopped
-from abbe.service.push.book import read_entries
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import PushState as Push
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
@@ -71,7 +70,7 @@ async def test_a_pause_holds_it_before_anything_is_written_or_not_at_all(tmp_pat
         control.pause()
         task = asyncio.create_task(brought(b, store, control))
         await held(control)
-        assert (written, read_entries(store, b.site.name)) == ([], [])
+        assert (written, store.pushes.entries(b.site.name)) == ([], [])
         control.resume()
         pushed, paused = await task
         assert (pushed.kept, paused) == (True, [False, False, False])
@@ -91,6 +90,6 @@ async def test_a_push_that_is_stopped_in_its_pause_has_written_nothing(tmp_path:
         control.stop()
         with pytest.raises(Stopped):
             await task
-        assert (written, read_entries(store, b.site.name), control.no_pause_reason) == ([], [], "")
+        assert (written, store.pushes.entries(b.site.name), control.no_pause_reason) == ([], [], "")
         assert (await brought(b, store, Control()))[0].kept, "nothing of it is left over"
-        assert read_entries(store, b.site.name)[-1].state is Push.KEEP
+        assert store.pushes.entries(b.site.name)[-1].state is Push.KEEP

@@ -15,11 +15,10 @@ import pytest
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.pushing import RECHECK_S, Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
-from abbe.service.push.adapter import BEAT_S, ControllerPort, no_actors
-from abbe.service.push.book import read_entries
+from abbe.service.push.execute import BEAT_S, ControllerPort, no_actors
 from abbe.service.push.operations import Done, Operation, OperationKind, Verdict
-from abbe.service.push.states import PushState
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
 from abbe.simulators.cnc.compensation import CompResult
@@ -72,7 +71,7 @@ async def test_who_orders_a_push_approves_it_for_an_hour_and_not_for_longer(mach
         return
     with pytest.raises(PushNotBegun, match="the approval has expired"):
         await brought(b, store, clock, Questions(list, "a test", never, never))
-    assert PushState.ACTIVATING not in {entry.state for entry in read_entries(store, b.site.name)}
+    assert PushState.ACTIVATING not in {entry.state for entry in store.pushes.entries(b.site.name)}
 
 
 async def test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_not_kept(machine) -> None:
@@ -90,7 +89,7 @@ async def test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_
 
     with pytest.raises(StillActive, match="another owner has the lease"):
         await brought(b, store, Jumping(), Questions(list, "a test", kept, taken))
-    entries = read_entries(store, b.site.name)
+    entries = store.pushes.entries(b.site.name)
     assert ended == ["in time"]
     assert entries[-1].state is PushState.ROLLBACK_PENDING
     assert next(e for e in entries if e.state is PushState.ROLLBACK).doc["why"] == "verify: another owner took the lease meanwhile"

@@ -17,11 +17,10 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.urls import DeviceUrls, address_of, control_of
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableMismatch, UnsafeToMove
-from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.entries import NO_PUSH, check_chain
+from abbe.service.push.journal import NO_PUSH, StoreBook, check_chain
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import PushState
 from abbe.service.report.report_table import table_remarks
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -81,10 +80,10 @@ async def pushed(store: Store, machine: str, images: tuple[bytes, bytes], states
 async def test_a_new_name_continues_the_history_of_its_control(store: Store) -> None:
     await pushed(store, "mill-a", (OLD, NEW), KEPT, HERE)
     await pushed(store, "mill-A", (NEW, THIRD), KEPT, HERE)
-    entries = read_entries(store, "mill-A", HERE)
+    entries = store.pushes.entries("mill-A", HERE)
     check_chain(entries)
     assert {e.push for e in entries} == {1, 2}
-    assert entries == read_entries(store, "mill-A") == read_entries(store, "mill-a")  # also for whoever knows a name only
+    assert entries == store.pushes.entries("mill-A") == store.pushes.entries("mill-a")  # also for whoever knows a name only
 
 
 async def test_an_open_push_of_the_control_is_finished_before_one_under_a_new_name(store: Store) -> None:
@@ -101,8 +100,8 @@ async def test_a_control_at_a_new_address_keeps_the_journal_of_its_name_unless_t
     assert store.pushes.chain("mill-old", HERE) == "mill"
     assert store.pushes.chain("mill", THERE) == f"mill ({THERE})"
     await pushed(store, "mill", (b"other base", b"other table"), KEPT, THERE)
-    assert [e.push for e in read_entries(store, "mill", THERE)[:1]] == [1]
-    assert read_entries(store, "mill") == read_entries(store, "mill", THERE)
+    assert [e.push for e in store.pushes.entries("mill", THERE)[:1]] == [1]
+    assert store.pushes.entries("mill") == store.pushes.entries("mill", THERE)
 
 
 async def test_an_address_that_a_control_has_left_is_not_its_any_more(store: Store) -> None:
@@ -126,8 +125,8 @@ async def test_a_journal_that_was_begun_under_a_name_is_not_that_of_another_cont
 
 async def test_what_an_older_version_wrote_belongs_to_the_name(store: Store) -> None:
     await pushed(store, "mill", (OLD, NEW), UP_TO_ACTIVE)
-    assert read_entries(store, "mill", HERE)[-1].state == PushState.PROBATION
-    assert read_entries(store, "other", HERE) == []
+    assert store.pushes.entries("mill", HERE)[-1].state == PushState.PROBATION
+    assert store.pushes.entries("other", HERE) == []
 
 
 async def test_unverified_is_looked_up_over_all_journals_and_no_later_base_makes_it_good(store: Store) -> None:
@@ -239,10 +238,10 @@ async def test_at_another_address_it_is_refused_and_a_person_s_word_closes_it_un
         words = rf"is that of push 1 of machine 'sim' at {re.escape(here)}, which was never verified.*machine file of 'sim'"
         with pytest.raises(TableMismatch, match=words):
             await recover(controller, left.store, elsewhere)
-        assert read_entries(left.store, "sim")[-1].state == PushState.PROBATION  # only looked at
+        assert left.store.pushes.entries("sim")[-1].state == PushState.PROBATION  # only looked at
         table = await left.active()
         assert "push 1 of machine 'sim', which no measurement has verified" in await accept(controller, left.store, elsewhere, "ann")
-        assert read_entries(left.store, "sim")[-1].doc["by"] == "ann"
+        assert left.store.pushes.entries("sim")[-1].doc["by"] == "ann"
         for site in (elsewhere, left.b.site, left.site("third")):
             assert await recover(controller, left.store, site) is None
         assert await left.active() == table != left.base
@@ -277,12 +276,12 @@ NOT_HERE = r"push 1 of 'sim' was begun at {} and has not ended, and its table is
 
 async def test_a_control_of_the_same_name_at_another_address_does_not_end_the_open_push(tmp_path: Path) -> None:
     async with left_in_probation(tmp_path) as left, another_control(tmp_path) as other:
-        now, before = await other.session.controller.comp_status(), read_entries(left.store, "sim")
+        now, before = await other.session.controller.comp_status(), left.store.pushes.entries("sim")
         assert (now.bank_crc[now.active_bank], other.site.name) == (left.base, left.b.site.name)
         for _ in range(2):
             with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(left.b.site.control))):
                 await recover(other.session.controller, left.store, other.site)
-        assert read_entries(left.store, "sim") == before  # nothing was written
+        assert left.store.pushes.entries("sim") == before  # nothing was written
         assert await other.session.controller.comp_status() == now
         assert "push 1 was not verified" in str(await recover(left.b.session.controller, left.store, left.b.site))
         assert await left.active() == left.base
@@ -293,8 +292,8 @@ async def test_a_control_that_moved_and_fell_back_to_its_old_table_needs_a_perso
     async with left_in_probation(tmp_path) as left, another_control(tmp_path) as moved:
         controller = moved.session.controller
         assert "is accepted by ann" in await accept(controller, left.store, moved.site, "ann")
-        check_chain(read_entries(left.store, "sim"))
-        assert [e.state for e in read_entries(left.store, "sim")][-2:] == [PushState.OPERATOR, PushState.ACCEPTED]
+        check_chain(left.store.pushes.entries("sim"))
+        assert [e.state for e in left.store.pushes.entries("sim")][-2:] == [PushState.OPERATOR, PushState.ACCEPTED]
         assert await recover(controller, left.store, moved.site) is None
         with pytest.raises(TableMismatch, match="never verified"):  # if it was another machine after all: its table is not accepted
             await recover(left.b.session.controller, left.store, left.b.site)
@@ -307,7 +306,7 @@ async def test_a_push_that_had_activated_nothing_is_closed_by_a_person_s_word_at
             with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(HERE))):
                 await recover(b.session.controller, store, b.site)
             await accept(b.session.controller, store, b.site, "ann")
-            assert [e.state for e in read_entries(store, "sim")][-2:] == [PushState.ABORTED, PushState.ACCEPTED]
+            assert [e.state for e in store.pushes.entries("sim")][-2:] == [PushState.ABORTED, PushState.ACCEPTED]
             assert await recover(b.session.controller, store, b.site) is None
 
 
@@ -322,8 +321,8 @@ async def test_two_machines_of_two_names_do_not_meet_each_other_s_open_push(tmp_
     async with left_in_probation(tmp_path) as left, another_control(tmp_path) as other:
         site = replace(other.site, name="lathe")
         assert await recover(other.session.controller, left.store, site) is None
-        assert read_entries(left.store, "sim")[-1].state == PushState.PROBATION
-        assert read_entries(left.store, "lathe", site.control) == []
+        assert left.store.pushes.entries("sim")[-1].state == PushState.PROBATION
+        assert left.store.pushes.entries("lathe", site.control) == []
 
 
 async def test_an_open_push_at_an_address_where_another_control_is_now_waits_for_a_person(tmp_path: Path) -> None:
@@ -341,7 +340,7 @@ async def test_an_open_push_at_an_address_where_another_control_is_now_waits_for
                 with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(site.control))):
                     await recover(controller, store, site)
                 assert await controller.comp_status() == now
-                assert read_entries(store, "sim")[-1].state == PushState.PROBATION
+                assert store.pushes.entries("sim")[-1].state == PushState.PROBATION
             await accept(controller, store, site)
             assert await recover(controller, store, site) is None
 
@@ -366,8 +365,8 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             assert "is accepted by ann" in str(await recover(controller, store, site, accept_by="ann"))
             for again in (site, left.site("mill-A")):
                 assert await recover(controller, store, again, accept_by="bob") is None  # there is nothing left to accept
-            check_chain(read_entries(store, site.name))
-            assert [(e.push, e.state, e.doc["by"]) for e in read_entries(store, site.name)] == [(NO_PUSH, PushState.ACCEPTED, "ann")]
+            check_chain(store.pushes.entries(site.name))
+            assert [(e.push, e.state, e.doc["by"]) for e in store.pushes.entries(site.name)] == [(NO_PUSH, PushState.ACCEPTED, "ann")]
             told = JournalView.read(store, site.name).history()
             assert (told.now.how, told.pushes, f"{told.now.crc:08X}") == ("accepted", (), crc)
             await accept(controller, store, site, "eve")  # the same word by `abbe accept-table`
@@ -387,7 +386,7 @@ async def test_a_table_verified_on_one_control_is_not_good_on_another_until_a_pe
             for _ in range(2):
                 with pytest.raises(TableMismatch, match=r"was verified on machine 'A' \(push 1\), not on this one"):
                     await recover(controller, store, site)
-            assert read_entries(store, site.name, site.control) == []
+            assert store.pushes.entries(site.name, site.control) == []
             told = await recover(controller, store, site, accept_by="ann")
             assert "verified on machine 'A' (push 1), not on this one (CRC" in str(told)
             assert await recover(controller, store, site) is None
@@ -468,4 +467,4 @@ async def test_a_control_as_it_comes_and_a_table_of_zeros_need_nobody_s_word(tmp
         assert await left.active() != left.base
         with Store.open(f"sqlite:///{tmp_path / 'another.sqlite3'}") as store:
             assert await recover(left.b.session.controller, store, left.b.site) is None
-            assert read_entries(store, "sim") == []
+            assert store.pushes.entries("sim") == []

@@ -23,7 +23,7 @@ VARIANTS = (
     Variant(
         "no read-back",
         (
-            ("learn", "isinstance(outcome, Done) and outcome.value == op.data", "isinstance(outcome, Done)"),
+            ("operations", "isinstance(outcome, Done) and outcome.value == op.data", "isinstance(outcome, Done)"),
             ("staging", "if known.image != image.data or known.decoded_digest != image.semantic_digest:", "if False:"),
             ("staging", "or truth.crc[image.bank] != image.crc:", "or False:"),
             ("machine", "if not why and truth.crc[f.target] != f.crc:", "if False:"),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
+from abbe.service.domain.document import GENESIS
 from tests.push import controller as c
 from tests.push.content import images, meanings, tables
 from tests.push.invariants import violations
@@ -220,7 +221,7 @@ class World:
 
     def _read_again(self, op: Any) -> Any:
         data = self._take(op.bank, 0, op.count, "read_again")
-        return self.p.operations.Done(meanings(self.p.semantic_digest)(data))
+        return self.p.operations.Done(meanings(self.p.execute)(data))
 
     def _read_chunk(self, op: Any) -> Any:
         return self.p.operations.Done(self._take(op.bank, op.first, op.count, ""))
@@ -281,7 +282,7 @@ class World:
     def _approve(self, op: Any) -> Any:
         if self.case.approved == "no":
             return self.p.operations.Refused("no")
-        f = self.p.entries.facts(self.journal)
+        f = self.p.journal.facts(self.journal)
         if self.case.approved == "another table":
             f = replace(f, image=self.base)
         if self.case.approved == "another base":
@@ -316,8 +317,8 @@ class World:
         fault = self.step("journal")
         if fault == "journal_fails":
             raise JournalFails
-        head = self.journal[-1].digest if self.journal else self.p.entries.GENESIS
-        entry = self.p.entries.follow(journal, 1, state, doc, "2026-01-01T00:00:00Z", head)
+        head = self.journal[-1].digest if self.journal else GENESIS
+        entry = self.p.journal.follow(journal, 1, state, doc, utc="2026-01-01T00:00:00Z", head=head, machine="M")
         if len(journal) != len(self.journal):
             raise JournalFails("somebody else wrote an entry")
         self.journal = (*self.journal, entry)
@@ -332,8 +333,8 @@ class World:
 
     def order(self) -> Any:
         case = self.case
-        meaning = self.p.semantic_digest.semantic_digest_of_tables(tables(55))
-        return self.p.order.OperationOrder(
+        meaning = self.p.execute.semantic_digest_of_tables(tables(55))
+        return self.p.journal.OperationOrder(
             "M", self.candidate, c.zlib.crc32(self.candidate), meaning, "limits", OWNER, case.level, case.attended, CHUNK_WORDS
         )
 

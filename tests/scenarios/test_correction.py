@@ -21,9 +21,8 @@ from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
-from abbe.service.push.book import read_entries
+from abbe.service.push.execute import semantic_digest_of_tables
 from abbe.service.push.limits import PushLimits
-from abbe.service.push.semantic_digest import semantic_digest_of_tables
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
@@ -59,7 +58,7 @@ class Shop:
 
     @property
     def state(self) -> str:
-        return str(read_entries(self.store, "sim")[-1].state)
+        return str(self.store.pushes.entries("sim")[-1].state)
 
 
 @pytest.fixture
@@ -120,13 +119,13 @@ async def stops_take_it_back(shop: Shop) -> None:
     assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)
 
     # runs that are no verification are refused before anything is written
-    pushes = len(read_entries(shop.store, "sim"))
+    pushes = len(shop.store.pushes.entries("sim"))
     with pytest.raises(MeasurementFault, match="no verification"):
         await shop.correct("june", shop.before[:3])
     warm = replace(shop.site, temperature_c=(30.0, 32.0))
     with pytest.raises(TableRefused, match="°C"):
         await correct(PushContext(shop.session, shop.store, warm, rate_hz=RATE_HZ), "june", shop.before)
-    assert len(read_entries(shop.store, "sim")) == pushes
+    assert len(shop.store.pushes.entries("sim")) == pushes
 
 
 @pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="two whole identifications: ABBE_TEST_LONG=1 runs it")

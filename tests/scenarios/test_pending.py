@@ -13,7 +13,6 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.deferred_rollback import finish_when_safe
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import StatusUnknown, StillActive
-from abbe.service.push.book import read_entries
 from abbe.service.storage.store import Store
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario
@@ -82,13 +81,13 @@ async def test_waiting_ends_when_its_time_is_over_and_can_be_broken_off(shop: Sh
             with pytest.raises(StillActive, match="STILL ACTIVE after 0 s"):
                 await finish_when_safe(session.controller, store, shop.site, limit_s=0.2, clock=clock, notify=heard.append)
             assert len(heard) == 1
-            entries = len(read_entries(store, "sim"))
+            entries = len(store.pushes.entries("sim"))
             waiting = asyncio.ensure_future(
                 finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=clock, notify=lambda text: waiting.cancel())
             )
             with pytest.raises(asyncio.CancelledError):
                 await waiting
-            assert (state(store), len(read_entries(store, "sim"))) == ("ROLLBACK_PENDING", entries)  # looking writes nothing
+            assert (state(store), len(store.pushes.entries("sim"))) == ("ROLLBACK_PENDING", entries)  # looking writes nothing
             released(shop)
             done = await finish_when_safe(session.controller, store, shop.site, limit_s=60.0, clock=clock, notify=heard.append)
             assert "made active again" in str(done)

@@ -21,11 +21,10 @@ from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.progress import ignore_progress
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
-from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.entries import check_chain
+from abbe.service.push.journal import StoreBook, check_chain
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import PushState
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
@@ -116,7 +115,7 @@ async def push(controller, store, site, tables, *, base=None, probe=yes, verify=
 
 
 def last(store):
-    entries = read_entries(store, "sim")
+    entries = store.pushes.entries("sim")
     check_chain(entries)
     return entries[-1].state
 

@@ -6,10 +6,10 @@ import pytest
 
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import StoreError
-from abbe.service.push.book import StoreBook
+from abbe.service.push.journal import StoreBook
 from abbe.service.push.operations import Verdict
-from abbe.service.push.states import PushState
 from abbe.service.tables.base_table import read_base
 from tests.scenarios.test_push import active, bench, last, push, steep
 

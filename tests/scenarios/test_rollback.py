@@ -19,10 +19,9 @@ from abbe.service.cli import run
 from abbe.service.compensation import rollback as workflow
 from abbe.service.compensation.recover import recover
 from abbe.service.compensation.rollback import rollback
+from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
-from abbe.service.push.book import StoreBook, read_entries
-from abbe.service.push.entries import check_chain
-from abbe.service.push.states import PushState
+from abbe.service.push.journal import StoreBook, check_chain
 from abbe.service.tables.base_table import read_base
 from abbe.service.tables.nine_tables import table_image
 from tests.scenarios.test_push import active, bench, last, linear_tables, push, steep
@@ -48,7 +47,7 @@ async def test_back_byte_for_byte_and_forward_again_and_to_the_beginning(start_s
         assert found.how == "the table that was in force before push 1"
         now = await read_base(c)
         assert now.image == first.image
-        entries = read_entries(store, "sim")
+        entries = store.pushes.entries("sim")
         check_chain(entries)
         of_it = {e.state: e.doc for e in entries if e.push == 2}
         assert of_it[PushState.APPROVED]["approved_by"].endswith("rollback")
@@ -96,11 +95,11 @@ async def test_a_hand_set_table_is_not_overwritten(start_sims, tmp_path):
     async with bench(sims, tmp_path) as (site, store, session):
         await push(session.controller, store, site, steep(site))
         await by_hand(session, encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7)))
-        gen, entries = await generation(session), len(read_entries(store, "sim"))
+        gen, entries = await generation(session), len(store.pushes.entries("sim"))
         for to in (None, 0, 1):
             with pytest.raises(TableMismatch, match="a table that this database did not push"):
                 await rollback(session.controller, store, site, to)
-        assert (await generation(session), len(read_entries(store, "sim"))) == (gen, entries)
+        assert (await generation(session), len(store.pushes.entries("sim"))) == (gen, entries)
 
 
 async def test_a_table_that_nobody_knows_is_refused_by_the_questions_too(start_sims, tmp_path, monkeypatch):
@@ -136,7 +135,7 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
 
     async def now() -> tuple[tuple[int, int], list[tuple[int, PushState]]]:
         async with bench(sims, tmp_path) as (_, store, session):
-            return await active(session), [(e.push, e.state) for e in read_entries(store, "sim")]
+            return await active(session), [(e.push, e.state) for e in store.pushes.entries("sim")]
 
     with monkeypatch.context() as patch:
         patch.setattr(StoreBook, "append", dies)

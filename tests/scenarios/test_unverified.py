@@ -9,7 +9,6 @@ import re
 import pytest
 
 from abbe.service.cli import run
-from abbe.service.push.book import read_entries
 from abbe.service.storage.store import Store
 from abbe.service.tables.in_force import look_at_table
 from tests.scenarios.test_push import bench, push, steep
@@ -40,11 +39,11 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
     assert first["figures"]
 
     with Store.open(url) as store:
-        before = len(read_entries(store, "sim"))
+        before = len(store.pushes.entries("sim"))
     assert run(["comp", "rollback", file]) == 2  # nobody is at the console
     assert "add --yes" in capsys.readouterr().err
     with Store.open(url) as store:
-        assert len(read_entries(store, "sim")) == before
+        assert len(store.pushes.entries("sim")) == before
     assert run(["comp", "rollback", file, "--yes"]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[-1] == f"the machine is unverified now: abbe measure {file} --recipe quick-check"

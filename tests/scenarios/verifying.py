@@ -21,8 +21,7 @@ from abbe.service.compensation.correct import load_runs
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ignore_progress
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import check_chain
+from abbe.service.push.journal import check_chain
 from abbe.service.push.operations import Verdict
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix
 from abbe.service.sequences.steps import CampaignPlan
@@ -142,7 +141,7 @@ class Push:
 
 
 def state(store: Store) -> str:
-    entries = read_entries(store, "sim")
+    entries = store.pushes.entries("sim")
     check_chain(entries)
     return str(entries[-1].state)
 

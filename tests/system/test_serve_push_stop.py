@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import check_chain
+from abbe.service.push.journal import check_chain
 from abbe.service.storage.store import Store
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import axes_at_rest, registers, wait_for
@@ -44,7 +43,7 @@ def in_force(sims: Sims) -> tuple[int, ...]:
 def told(folder: Path) -> tuple[str, list[str], list[str]]:
     """The push's last state, and the words and sentences that the alarm desk wrote of it."""
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        entries = read_entries(store, "sim")
+        entries = store.pushes.entries("sim")
         check_chain(entries)
         lines = [e.doc for e in store.alarms.entries("sim") if e.kind == "pushed"]
         return str(entries[-1].state), [d["word"] for d in lines], [d["text"] for d in lines]

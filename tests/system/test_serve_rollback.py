@@ -13,9 +13,8 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.clock import SystemClock
-from abbe.service.push.book import read_entries
-from abbe.service.push.entries import check_chain
-from abbe.service.push.states import PushState
+from abbe.service.domain.push_entry import PushState
+from abbe.service.push.journal import check_chain
 from abbe.service.storage.store import Store
 from abbe.service.users.passwords import Passwords
 from abbe.service.users.people import People
@@ -96,7 +95,7 @@ def test_an_approver_orders_the_table_back_and_an_operator_does_not(tmp_path: Pa
             assert "was a rollback itself" in order("ann", old, 2, "k2").json()["detail"]
             assert running.terminate()[0] == 0
     with Store.open(url) as store:
-        entries = read_entries(store, "sim")
+        entries = store.pushes.entries("sim")
         check_chain(entries)
         assert (entries[-1].push, entries[-1].state) == (2, PushState.KEEP)
         assert next(e for e in entries if e.push == 2 and e.state is PushState.APPROVED).doc["approved_by"] == "token:ann/test: rollback"

@@ -79,9 +79,8 @@ def rollback(
     from abbe.service.compensation.rollback import rollback as work_rollback
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
+    from abbe.service.domain.push_entry import TERMINAL
     from abbe.service.errors import ConfigError
-    from abbe.service.push.book import read_entries
-    from abbe.service.push.states import TERMINAL
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
     from abbe.service.verification.verified_by import measure_now
@@ -90,7 +89,7 @@ def rollback(
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> RollbackResult | str | None:
-        last = read_entries(store, site.name, site.control)[-1:]
+        last = store.pushes.entries(site.name, site.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
         if not (finished and to is None) and not yes and not await _confirmed(to):
             raise ConfigError("nothing was taken back", "answer yes, or add --yes if no one is at the console")

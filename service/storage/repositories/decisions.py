@@ -10,8 +10,9 @@ from dataclasses import replace
 
 from sqlalchemy import Connection, func, select
 
-from abbe.service.domain.decisions import ProposalApproval, ProposalRecord, ProposalRejection, PushEntryRecord
+from abbe.service.domain.decisions import ProposalApproval, ProposalRecord, ProposalRejection
 from abbe.service.domain.document import Doc
+from abbe.service.domain.push_entry import PushEntry
 from abbe.service.errors import StoreError
 from abbe.service.storage.repository import APPROVAL, PROPOSAL, PUSH_ENTRY, PUSH_MARK, REJECTION, Repository, if_given, insert_row
 from abbe.service.storage.tables import approvals, proposals, push_entries, rejections
@@ -57,7 +58,7 @@ NAME_LENGTH = 200
 class Pushes(Repository):
     """Journals of pushes."""
 
-    def append(self, entry: PushEntryRecord) -> int:
+    def append(self, entry: PushEntry) -> int:
         """Append an entry to its journal if the entry before it is still the last one; return its id. On return it is on disk.
 
         Raises
@@ -74,7 +75,7 @@ class Pushes(Repository):
                     f"push {entry.push} of {entry.machine}: somebody else has written into the journal meanwhile",
                     "another process pushes or recovers on this machine: wait until it has ended",
                 )
-            return insert_row(connection, push_entries, **PUSH_ENTRY.values(entry, "id"))
+            return insert_row(connection, push_entries, **PUSH_ENTRY.values(entry, "number"))
 
         return self._db.commit(work)
 
@@ -89,21 +90,21 @@ class Pushes(Repository):
         rows = self._db.read(lambda connection: connection.execute(query).all())
         return chain_of([(row.machine, row.name or row.machine, row.control or "") for row in rows], machine, control)
 
-    def entries(self, machine: str, control: str = "") -> list[PushEntryRecord]:
+    def entries(self, machine: str, control: str = "") -> list[PushEntry]:
         """Read the journal of all pushes of a machine's control from its beginning (`chain`)."""
         return self.entries_of(self.chain(machine, control))
 
-    def entries_of(self, chain: str) -> list[PushEntryRecord]:
+    def entries_of(self, chain: str) -> list[PushEntry]:
         """Read a journal by its name."""
         return self._all(PUSH_ENTRY, push_entries.c.machine == chain)
 
-    def last(self, machine: str, control: str = "") -> list[PushEntryRecord]:
+    def last(self, machine: str, control: str = "") -> list[PushEntry]:
         """Read the journal of the last push of a machine's control (`chain`); empty if there was none."""
         chain = self.chain(machine, control)
         latest = select(func.max(push_entries.c.push)).where(push_entries.c.machine == chain).scalar_subquery()
         return self._all(PUSH_ENTRY, push_entries.c.machine == chain, push_entries.c.push == latest)
 
-    def marks(self) -> list[PushEntryRecord]:
+    def marks(self) -> list[PushEntry]:
         """Read the entries of all journals in the order of writing; documents hold `MARKS` only, no images."""
         marks = [push_entries.c.doc[key].as_string().label(f"mark_{key}") for key in MARKS]
         query = PUSH_MARK.select().add_columns(*marks).order_by(push_entries.c.id)

@@ -12,8 +12,8 @@ from fastapi import Header, Request
 from fastapi.responses import Response
 from pydantic import BaseModel
 
+from abbe.service.domain.document import canonical
 from abbe.service.errors import AbbeError, KeyInUse, KeyReused
-from abbe.service.push.entries import canonical
 from abbe.service.storage.store import Store
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.problems import MEDIA_TYPE, problem_of

@@ -11,6 +11,7 @@ from fastapi.responses import Response
 
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import reject as work_reject
+from abbe.service.domain.push_entry import PushEntry
 from abbe.service.queries import proposals as proposed
 from abbe.service.queries import pushes
 from abbe.service.queries.reader import as_stored
@@ -120,6 +121,6 @@ def _add_pushes(app: FastAPI, sources: Sources) -> None:
 
     @app.get("/api/v1/pushes/{number}")
     @needs(Permission.READ)
-    def push_entry(number: Number) -> pushes.PushEntryDetail:
+    def push_entry(number: Number) -> PushEntry:
         """One entry of the journal with the facts that it recorded."""
         return pushes.push_entry(sources.reader, number)

@@ -13,7 +13,6 @@ FORBIDDEN = (
     "pymodbus",
     "serial",
     "abbe.service.devices.session",
-    "abbe.service.push.adapter",
     "abbe.service.push.execute",
     "abbe.service.core",
     "abbe.simulators",

@@ -34,13 +34,13 @@ LASER = "tests/drivers/contract/test_laser.py"
 SILENT = "tests/service/sequences/test_watch_laser.py::test_a_laser_that_is_silent_for_too_long_ends_the_test"
 UNVERIFIED = "tests/push/test_unverified_tables.py"
 PROPOSALS = "tests/scenarios/test_proposals.py"
-MACHINE, BACK, LEARN = "service/push/machine.py", "service/push/back.py", "service/push/learn.py"
-TABLES, ADAPTER = "models/compensation/tables.py", "service/push/adapter.py"
+MACHINE, BACK, LEARN = "service/push/machine.py", "service/push/back.py", "service/push/operations.py"
+TABLES, ADAPTER = "models/compensation/tables.py", "service/push/execute.py"
 NOT_SAFE = '    if truth.unsafe:\n        return _pending(state, f"not safe now: {truth.unsafe}")\n'
 
 MUTANTS = (
     Mutant("lease that ends while it is activated", MACHINE, "truth.lease_ms < LEASE_LEFT_MS", "truth.lease_ms < 0", (SINGLE + "::test_a_lease_that_is_about_to_end_is_no_time_to_activate",), True),
-    Mutant("reference of a table one unit off", "service/push/validate_numbers.py", "abs(v[0]) > ZERO_MM", "abs(v[0]) > 500 * ZERO_MM", ("tests/push/test_bad_tables.py::test_the_reference_stays_where_it_is",), True),
+    Mutant("reference of a table one unit off", "service/push/validate.py", "abs(v[0]) > ZERO_MM", "abs(v[0]) > 500 * ZERO_MM", ("tests/push/test_bad_tables.py::test_the_reference_stays_where_it_is",), True),
     Mutant("jitter of the ball-bar's clock eight times wider", "drivers/ballbar/stream.py", "_JITTER = 0.05", "_JITTER = 0.4", (GATE + "::test_a_clock_that_is_off_by_more_than_a_twentieth_of_a_period_does_not_confirm_the_number",), True),
     Mutant("sign of the nine tables", TABLES, "corrections.append(-(relative @", "corrections.append((relative @", (SIGN + "::test_an_axis_that_goes_too_far_is_told_to_go_less_far",), True),
     Mutant("sign of the grid", "models/compensation/grid.py", "rigid @ frame - error", "rigid @ frame + error", (SIGN,)),

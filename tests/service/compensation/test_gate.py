@@ -11,7 +11,7 @@ from abbe.service.compensation import gate
 from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.errors import TableRefused
-from abbe.service.push.levels import Capabilities
+from abbe.service.push.limits import Capabilities
 
 
 class Control:

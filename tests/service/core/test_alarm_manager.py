@@ -23,14 +23,14 @@ from abbe.service.core.jobs import JobRegistry
 from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.jobs.at_start import push_is_open
 from abbe.service.jobs.investigate import InvestigationContext as Investigation
 from abbe.service.jobs.investigate import Note, investigate
-from abbe.service.push.book import StoreBook
-from abbe.service.push.states import PushState as Push
+from abbe.service.push.journal import StoreBook
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler

@@ -14,14 +14,14 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
-from abbe.service.domain.decisions import PushEntryRecord
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
-from abbe.service.push.entries import GENESIS
+from abbe.service.push.journal import GENESIS
 from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import CheckJobs, carry_out
@@ -217,7 +217,7 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
     await bench.check(result(1, 25.0))
     await bench.follow_up()
     at = START + timedelta(days=1, hours=3)
-    entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="KEEP", doc={}, utc=utc_text(at), prev=GENESIS, digest="d" * 64)
+    entry = PushEntry(machine="mill-7", push=1, seq=0, state=PushState.KEEP, doc={}, utc=utc_text(at), prev=GENESIS, digest="d" * 64)
     bench.store.pushes.append(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq

@@ -23,8 +23,8 @@ from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.core.rights import may
 from abbe.service.domain.job_state import JobOutcome, JobState
+from abbe.service.domain.push_entry import PushState, S
 from abbe.service.errors import StoreError
-from abbe.service.push.states import PushState, S
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control

@@ -11,8 +11,7 @@ import pytest
 
 from abbe.drivers.errors import LinkDown
 from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
-from abbe.service.push.entries import JournalEntry
-from abbe.service.push.states import PushState
+from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.tables.in_force import InForce
 from abbe.service.tables.push_journal import JournalView
 from tests.service.core.fakes import FakeClock, FakeShelf, settle, utc
@@ -148,9 +147,12 @@ def test_the_remedy_names_nothing_that_is_refused_then() -> None:
     assert "accept-table" in REMEDY
 
 
-def entries(state: PushState, *docs: dict[str, int], push: int = 1) -> list[JournalEntry]:
+def entries(state: PushState, *docs: dict[str, int], push: int = 1) -> list[PushEntry]:
     states = [PushState.SNAPSHOT] * (len(docs) - 1) + [state]
-    return [JournalEntry(push, k, one, doc, "", "", "") for k, (one, doc) in enumerate(zip(states, docs, strict=True))]
+    return [
+        PushEntry(machine="", push=push, seq=k, state=one, doc=doc, utc="", prev="", digest="")
+        for k, (one, doc) in enumerate(zip(states, docs, strict=True))
+    ]
 
 
 KEPT = entries(PushState.KEEP, {"crc": 2, "base_crc": 1}, {})
@@ -178,5 +180,5 @@ ON_STRANGE = {"crc": 5, "base_crc": 9}
         (KEPT + entries(PushState.PROBATION, ON_STRANGE, {}, push=2), (None, False)),
     ],
 )
-def test_what_the_journal_left_in_force(journal: list[JournalEntry], wanted: tuple[int | None, bool]) -> None:
+def test_what_the_journal_left_in_force(journal: list[PushEntry], wanted: tuple[int | None, bool]) -> None:
     assert JournalView(tuple(journal)).wanted == wanted

@@ -11,9 +11,8 @@ import pytest
 
 from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.cli import run
-from abbe.service.domain.decisions import PushEntryRecord
-from abbe.service.push.entries import GENESIS, follow
-from abbe.service.push.states import PushState
+from abbe.service.domain.push_entry import PushState
+from abbe.service.push.journal import GENESIS, follow
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import distinct
 from tests.service.formats.test_choice import _document, _known
@@ -95,21 +94,8 @@ def test_of_older_runs_the_database_knows_what_their_table_was(
         if known == "in force before":
             other = encode(TableImage(0, 9, 100, (0.0, 0.0, 0.0), (1e-5, 1e-5, 1e-5), (0, 0, 0), ()))
             store.tables.add(machine, None, other, crc32(other), {})
-            entry = follow(
-                (), 1, PushState.SNAPSHOT, {"base_crc": crc32(image), "base_image": image.hex()}, "2026-06-01T10:00:00Z", GENESIS
-            )
-            store.pushes.append(
-                PushEntryRecord(
-                    machine="sim",
-                    push=1,
-                    seq=entry.seq,
-                    state=str(entry.state),
-                    doc=entry.doc,
-                    utc=entry.utc,
-                    prev=entry.prev,
-                    digest=entry.digest,
-                )
-            )
+            before = {"base_crc": crc32(image), "base_image": image.hex()}
+            store.pushes.append(follow((), 1, PushState.SNAPSHOT, before, utc="2026-06-01T10:00:00Z", head=GENESIS, machine="sim"))
     found, said = export(number, "--db", url)
     assert (found, words in said) == (code, True), said
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from abbe.service.core.board import Board
-from abbe.service.domain.decisions import PushEntryRecord
+from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.plant.facts import UNITS
 from abbe.service.plant.gather import Gatherer, table_in_force
 from abbe.service.plant.opcua.picture import picture_of
@@ -23,11 +23,21 @@ from tests.service.plant.facts_for_tests import NOON, facts
 SNAPSHOT = {"base_bank": 0, "base_crc": 11, "base_image": "00", "target": 1, "crc": 22}
 
 
-def journal(*states: str, **last: Any) -> list[PushEntryRecord]:
+def journal(*states: str, **last: Any) -> list[PushEntry]:
     docs = [SNAPSHOT if state == "SNAPSHOT" else {} for state in states]
     docs[-1] = docs[-1] | last
     return [
-        PushEntryRecord(id=k, machine="mill-7", push=3, seq=k, state=state, doc=doc, utc="2026-06-01T12:00:00.000000Z", prev="", digest="")
+        PushEntry(
+            number=k,
+            machine="mill-7",
+            push=3,
+            seq=k,
+            state=PushState(state),
+            doc=doc,
+            utc="2026-06-01T12:00:00.000000Z",
+            prev="",
+            digest="",
+        )
         for k, (state, doc) in enumerate(zip(states, docs, strict=True))
     ]
 

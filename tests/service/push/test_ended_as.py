@@ -11,9 +11,9 @@ import pytest
 from abbe.drivers.tables import crc32
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.rollback import known_images, table_after
+from abbe.service.domain.push_entry import S
 from abbe.service.errors import TableRefused
-from abbe.service.push.book import StoreBook
-from abbe.service.push.states import S
+from abbe.service.push.journal import StoreBook
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView, ended_as
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed

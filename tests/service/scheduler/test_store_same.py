@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.decisions import ProposalApproval, ProposalRejection, PushEntryRecord
+from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.measured import ChunkRecord, ImportedRun
 from abbe.service.domain.owner import Owner
 from abbe.service.domain.people import TokenRecord
+from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import NewVersion
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.errors import AbbeError
@@ -134,7 +135,7 @@ def found(ask: Any) -> None:
         ask.tables.all(),
         ask.tables.all(2),
     )
-    entry = PushEntryRecord(machine="mill-7", push=1, seq=0, state="SNAPSHOT", doc=DOC, utc="then", prev="", digest="1" * 64)
+    entry = PushEntry(machine="mill-7", push=1, seq=0, state=PushState.SNAPSHOT, doc=DOC, utc="then", prev="", digest="1" * 64)
     ask.pushes.append(entry), ask.pushes.append(entry), ask.pushes.append(replace(entry, seq=1, prev="1" * 64, digest="2" * 64))
     ask.pushes.entries("mill-7"), ask.pushes.entries("MILL-7"), ask.pushes.last("mill-7"), ask.pushes.last("none")
     whose = {"machine": "mill-8", "control": "modbus+tcp://a:502", "base_crc": 1, "crc": 2**32 - 1, "image": "00"}

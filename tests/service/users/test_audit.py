@@ -20,7 +20,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import anchor_of, digest_of, faults, follow, mac_of
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
-from abbe.service.push.entries import GENESIS
+from abbe.service.push.journal import GENESIS
 from abbe.service.storage.store import Store
 from tests.service.users.conftest import World
 

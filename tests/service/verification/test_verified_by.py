@@ -19,13 +19,13 @@ from abbe.drivers.tables import crc32
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.core.board import Board
+from abbe.service.domain.push_entry import S
 from abbe.service.domain.schedule import Schedule
 from abbe.service.plant.facts import PlantFacts
 from abbe.service.plant.gather import Gatherer
 from abbe.service.plant.mtconnect import Agent
 from abbe.service.plant.opcua.picture import picture_of
-from abbe.service.push.book import StoreBook
-from abbe.service.push.states import S
+from abbe.service.push.journal import StoreBook
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusReader
 from abbe.service.rendering.document import Document

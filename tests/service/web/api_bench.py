@@ -23,10 +23,10 @@ from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.progress import ignore_progress
+from abbe.service.domain.push_entry import PushState
 from abbe.service.domain.schedule import Schedule
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.push.book import StoreBook
-from abbe.service.push.states import PushState
+from abbe.service.push.journal import StoreBook
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json

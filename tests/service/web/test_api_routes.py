@@ -172,7 +172,7 @@ async def test_proposals_and_journal(client, plant):
     entries_ = (await got(client, "/pushes", push=1))["entries"]
     assert [entry["state"] for entry in entries_] == ["REJECTED", "SNAPSHOT"]
     assert entries_[0]["prev"] == entries_[1]["digest"]
-    assert (await got(client, f"/pushes/{entries_[1]['number']}"))["known"]["base_bank"] == 0
+    assert (await got(client, f"/pushes/{entries_[1]['number']}"))["doc"]["base_bank"] == 0
 
 
 @pytest.mark.parametrize("kind", ["run", "campaign", "verification", "discovery", "push"])

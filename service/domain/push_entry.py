@@ -1,8 +1,11 @@
-"""States of a push and their transitions (reliability.md 3.2). A state is a journal entry, on disk before what it permits."""
+"""States of a push, their transitions (reliability.md 3.2), and the journal entry of one transition, on disk before what it permits."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
+
+from abbe.service.domain.document import Doc
 
 
 class PushState(StrEnum):
@@ -73,3 +76,29 @@ FOLLOWS: dict[PushState | None, frozenset[PushState]] = {
     S.ROLLED_BACK: frozenset({S.ACCEPTED}),
     S.ACCEPTED: frozenset({S.ACCEPTED}),
 }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushTransition:
+    """One transition of one push, chained by ``prev`` to the entry before it in the same journal.
+
+    ``number``: given by the database; ``machine``: name of the journal (`abbe.service.storage.repositories.decisions.chain_of`); ``push``:
+    number of the push in it; ``seq``: number of the entry in its push, from 0; ``utc``: for people; ``prev``, ``digest``: SHA-256 of the
+    entry before (of any push of the machine) and of this one.
+    """
+
+    number: int = 0
+    machine: str
+    push: int
+    seq: int
+    state: PushState
+    utc: str
+    prev: str
+    digest: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushEntry(PushTransition):
+    """A transition with what became known with its state. Never changed after writing; tables are hexadecimal images."""
+
+    doc: Doc

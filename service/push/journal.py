@@ -1,0 +1,345 @@
+"""The push journal: orders, one chained entry for every transition, the facts that entries state, and the journal in the database.
+
+The journal is also the audit trail: an entry that is changed, removed or swapped breaks the chain. An entry is on disk before what it
+permits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from abbe.service.clock import Clock
+from abbe.service.domain.document import GENESIS, Doc, canonical
+from abbe.service.domain.push_entry import FOLLOWS, TERMINAL, PushEntry, PushState
+from abbe.service.domain.utc import utc_text
+from abbe.service.errors import UnsafeToMove
+from abbe.service.storage.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class OperationOrder:
+    """A table to be pushed into a controller.
+
+    Parameters
+    ----------
+    machine : str
+        Name of the machine.
+    image : bytes
+        As the controller will hold it, with its CRC-32 ``crc``.
+    meaning : str
+        Semantic digest, computed from the tables and not from the image (`abbe.service.push.execute`).
+    limits : str
+        Digest of the limits that it was checked against.
+    owner : int
+        Owner id of the lease, u32, low 16 bits 0: those count the leases of one push.
+    level : int
+        Capability level of the controller (`abbe.service.push.limits`).
+    attended : bool
+        A person who may approve is at the machine.
+    chunk_words : int
+        Registers of one write, even.
+    table : int
+        Id of the table in the store; 0 if it is not stored.
+    control : str
+        Identity of the control (`abbe.service.devices.urls.control_of`); empty: unknown.
+    process : dict
+        The pushing process (`abbe.service.domain.owner.Owner`): while it lives, no other process recovers.
+    """
+
+    machine: str
+    image: bytes
+    crc: int
+    meaning: str
+    limits: str
+    owner: int
+    level: int = 3
+    attended: bool = False
+    chunk_words: int = 100
+    table: int = 0
+    control: str = ""
+    process: Doc = field(default_factory=dict)
+
+    def doc(self) -> Doc:
+        """The document that the journal keeps."""
+        return {
+            "machine": self.machine,
+            "image": self.image.hex(),
+            "crc": self.crc,
+            "meaning": self.meaning,
+            "limits": self.limits,
+            "owner": self.owner,
+            "level": self.level,
+            "attended": self.attended,
+            "chunk_words": self.chunk_words,
+            "table": self.table,
+            "control": self.control,
+            "process": self.process,
+        }
+
+
+NO_PUSH = 0
+"""Push number of a person's acceptance in a journal that has no push yet."""
+
+
+class JournalBroken(ValueError):  # noqa: N818 - reads as what it is
+    """An entry does not follow from the one before it: chain, order or transition are wrong."""
+
+
+Journal = tuple[PushEntry, ...]
+
+
+def digest_of(push: int, seq: int, state: PushState, doc: Doc, utc: str, prev: str) -> str:
+    """SHA-256 of an entry's content and of the digest before it."""
+    return hashlib.sha256(canonical([push, seq, str(state), doc, utc, prev])).hexdigest()
+
+
+def follow(journal: Journal, push: int, state: PushState, doc: Doc, *, utc: str, head: str, machine: str) -> PushEntry:
+    """Make the next entry of a push. ``head``: digest of the last entry of the machine, `GENESIS` if there is none; ``machine``: name of
+    its journal.
+
+    Raises
+    ------
+    JournalBroken
+        This state cannot follow.
+    """
+    last = journal[-1].state if journal else None
+    if not _may_follow(push, last, state):
+        raise JournalBroken(f"push {push}: {state} cannot follow {last or 'nothing'}")
+    seq = len(journal)
+    digest = digest_of(push, seq, state, doc, utc, head)
+    return PushEntry(machine=machine, push=push, seq=seq, state=state, utc=utc, prev=head, digest=digest, doc=doc)
+
+
+def _may_follow(push: int, last: PushState | None, state: PushState) -> bool:
+    return state in FOLLOWS[last] or (push == NO_PUSH and last is None and state is PushState.ACCEPTED)
+
+
+def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
+    """Check all entries of a machine, in the order of writing.
+
+    Raises
+    ------
+    JournalBroken
+        Names the entry that does not follow, or was changed.
+    """
+    last: dict[int, PushEntry] = {}
+    for entry in entries:
+        before = last.get(entry.push)
+        name = f"push {entry.push}, entry {entry.seq}"
+        if entry.prev != head:
+            raise JournalBroken(f"{name}: does not follow the entry before it")
+        if entry.digest != digest_of(entry.push, entry.seq, entry.state, entry.doc, entry.utc, entry.prev):
+            raise JournalBroken(f"{name}: was changed after it was written")
+        if entry.seq != (before.seq + 1 if before else 0) or not _may_follow(entry.push, before.state if before else None, entry.state):
+            raise JournalBroken(f"{name}: {entry.state} cannot stand here")
+        last[entry.push], head = entry, entry.digest
+
+
+NOT_YET = -1
+"""A number that no entry has stated yet: no controller reports it, so no comparison with it succeeds."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedBanks:
+    """Banks as the controller reported them when a person was called: the active one, and the CRC of each."""
+
+    active: int = NOT_YET
+    crc: tuple[int, ...] = ()
+
+    @property
+    def in_force(self) -> int:
+        """CRC of the active bank; `NOT_YET` if nothing was noted."""
+        return self.crc[self.active] if self.crc else NOT_YET
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushFacts(OperationOrder):
+    """Everything that a push's journal states; later entries override earlier ones. By the state whose entry brings it:
+
+    SNAPSHOT: the order; boot id, generation and register map of the controller; bank, CRC, bytes and semantic digest of the table in
+    force; the bank ``target`` for the new table. REJECTED: reasons. APPROVED: digest, approver, expiry. STAGED, ACTIVATING, PROBATION:
+    generations, and the CRC that the activation expects. PROBED, VERIFIED: the findings. RESTAGING, ACTIVATING_BACK: bank, generation and
+    boot id of the rollback. ROLLBACK_PENDING: what blocks it. ROLLED_BACK: the bank of the old table. OPERATOR: the reason, and the
+    controller's report. ACCEPTED: the table that a person vouches for.
+    """
+
+    boot: int = NOT_YET
+    gen: int = NOT_YET
+    map: str = ""
+    base_bank: int = NOT_YET
+    base_crc: int = NOT_YET
+    base_image: bytes = b""
+    base_meaning: str = ""
+    target: int = NOT_YET
+    reasons: tuple[str, ...] = ()
+    approval: str = ""
+    approved_by: str = ""
+    expiry: str = ""
+    staged_gen: int = NOT_YET
+    expect_crc: int = NOT_YET
+    expect_gen: int = NOT_YET
+    probation_gen: int = NOT_YET
+    probe: str = ""
+    verify: str = ""
+    restaged: bool = False
+    back_bank: int = NOT_YET
+    back_gen: int = NOT_YET
+    restage_gen: int = NOT_YET
+    restage_boot: int = NOT_YET
+    why: str = ""
+    again: str = ""
+    pending: str = ""
+    bank: int = NOT_YET
+    controller: ReportedBanks = field(default_factory=ReportedBanks)
+    accepted_bank: int = NOT_YET
+    accepted_crc: int = NOT_YET
+    by: str = ""
+
+    def binding(self, expiry: str) -> str:
+        """What an approval until ``expiry`` has to bind (`approval_digest`)."""
+        return approval_digest(self.image, base_image=self.base_image, machine=self.machine, limits=self.limits, expiry=expiry)
+
+
+def _bytes(text: str) -> bytes:
+    """Bytes of a hexadecimal text; empty if the text was tampered with."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError:
+        return b""
+
+
+_CONVERTED: dict[str, Callable[[Any], Any]] = {
+    "image": _bytes,
+    "base_image": _bytes,
+    "reasons": tuple,
+    "controller": lambda doc: ReportedBanks(doc["active"], tuple(doc["crc"])),
+}
+_NO_ORDER: Doc = {
+    "machine": "",
+    "image": b"",
+    "crc": NOT_YET,
+    "meaning": "",
+    "limits": "",
+    "owner": NOT_YET,
+    "level": NOT_YET,
+    "chunk_words": 0,
+}
+_FIELDS = tuple((one.name, _CONVERTED.get(one.name)) for one in fields(PushFacts))
+_SNAPSHOT = frozenset({
+    "machine", "image", "crc", "meaning", "limits", "owner", "level", "attended", "chunk_words", "boot", "gen", "map",
+    "base_bank", "base_crc", "base_image", "base_meaning", "target",
+})  # fmt: skip
+
+
+def facts(journal: Journal) -> PushFacts:
+    """Facts of a push from its journal; later entries override earlier ones."""
+    return _parsed(_merged(journal))
+
+
+def facts_to_act_on(journal: Journal) -> PushFacts:
+    """Facts that are complete enough to act on a controller.
+
+    Raises
+    ------
+    JournalBroken
+        The SNAPSHOT lacks something that a rollback needs.
+    """
+    doc = _merged(journal)
+    found = _parsed(doc)
+    if (missing := _SNAPSHOT - doc.keys()) or not found.image or not found.base_image:
+        raise JournalBroken(f"push {journal[-1].push}: its first entry does not say {', '.join(sorted(missing)) or 'which tables'}")
+    return found
+
+
+def _merged(journal: Journal) -> Doc:
+    doc: Doc = {}
+    for entry in journal:
+        doc.update(entry.doc)
+    return doc
+
+
+def _parsed(doc: Doc) -> PushFacts:
+    known = {name: doc[name] if convert is None else convert(doc[name]) for name, convert in _FIELDS if name in doc}
+    return PushFacts(**(_NO_ORDER | known))
+
+
+def approval_digest(image: bytes, *, base_image: bytes, machine: str, limits: str, expiry: str) -> str:
+    """SHA-256 that an approval binds: exactly this table on exactly this base, for this machine, under these limits, until ``expiry``.
+
+    ``limits``: their digest (`abbe.service.push.limits.PushLimits.digest`).
+    """
+    return hashlib.sha256(canonical([image.hex(), base_image.hex(), machine, limits, expiry])).hexdigest()
+
+
+class StoreBook:
+    """Journal of the last push into one control, or of its next one. Open it with `last`, `new` or `for_acceptance`.
+
+    ``machine``: name of the journal (`Store.pushes.chain`): all pushes into one control share it, whatever the machine is called now.
+    ``head``: digest of the last entry in it; ``journal``: entries of this push so far.
+    """
+
+    def __init__(self, store: Store, machine: str, clock: Clock, push: int, head: str, journal: Journal) -> None:
+        self._store, self._machine, self._clock = store, machine, clock
+        self._push, self._head, self._journal = push, head, journal
+
+    @classmethod
+    async def last(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook | None:
+        """Journal of the last push of a machine's control, or of acceptances before the first push (`NO_PUSH`); None if there is none."""
+        chain = await asyncio.to_thread(store.pushes.chain, machine, control)
+        return await cls.of_chain(store, chain, clock)
+
+    @classmethod
+    async def of_chain(cls, store: Store, chain: str, clock: Clock) -> StoreBook | None:
+        """Journal of the last push in the journal of this name; None if it is empty."""
+        entries = await asyncio.to_thread(store.pushes.entries_of, chain)
+        if not entries:
+            return None
+        push = entries[-1].push
+        return cls(store, chain, clock, push, entries[-1].digest, tuple(entry for entry in entries if entry.push == push))
+
+    @classmethod
+    async def for_acceptance(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
+        """Journal for a person's acceptance of the table in force: that of the last push, or `NO_PUSH` before the first."""
+        chain = await asyncio.to_thread(store.pushes.chain, machine, control)
+        return await cls.of_chain(store, chain, clock) or cls(store, chain, clock, NO_PUSH, GENESIS, ())
+
+    @classmethod
+    async def new(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
+        """An empty journal for the next push into a machine's control.
+
+        Raises
+        ------
+        UnsafeToMove
+            The last push is unfinished: finish it first.
+        """
+        chain = await asyncio.to_thread(store.pushes.chain, machine, control)
+        book = await cls.of_chain(store, chain, clock)
+        if book is None:
+            return cls(store, chain, clock, 1, GENESIS, ())
+        last = (await book.entries())[-1]
+        if last.state not in TERMINAL or last.state is PushState.OPERATOR:
+            raise UnsafeToMove(f"push {last.push} of {chain} stands at {last.state}", "finish it first")
+        return cls(store, chain, clock, last.push + 1, last.digest, ())
+
+    async def entries(self) -> Journal:
+        """The push so far."""
+        return self._journal
+
+    async def append(self, journal: Journal, state: PushState, doc: Doc) -> PushEntry:
+        """Write the next entry; on return it is on disk.
+
+        Raises
+        ------
+        JournalBroken
+            This state cannot follow.
+        StoreError
+            Somebody else has written an entry meanwhile, or the database refuses it.
+        """
+        entry = follow(journal, self._push, state, doc, utc=utc_text(self._clock.utc()), head=self._head, machine=self._machine)
+        await self._store.write(self._store.pushes.append, entry)
+        self._head, self._journal = entry.digest, (*journal, entry)
+        return entry
