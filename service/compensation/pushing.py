@@ -19,12 +19,13 @@ from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import level_status
+from abbe.service.domain.document import Doc
 from abbe.service.domain.owner import this_process
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
 from abbe.service.push.execute import ControllerPort, Ended, PushActors, semantic_digest_of_tables
-from abbe.service.push.journal import Doc, Journal, OperationOrder, StoreBook, facts
+from abbe.service.push.journal import Journal, OperationOrder, StoreBook, facts
 from abbe.service.push.operations import Approval, Verdict
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site

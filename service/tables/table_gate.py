@@ -9,9 +9,10 @@ import numpy as np
 
 from abbe.drivers.api import BankState, CompStatus, TableController
 from abbe.service.clock import SystemClock
+from abbe.service.domain.document import Doc
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableMismatch
-from abbe.service.push.journal import Doc, StoreBook
+from abbe.service.push.journal import StoreBook
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.base_table import read_base
