@@ -18,8 +18,8 @@ from abbe.service.cli.demo import demo
 from abbe.service.cli.errors import errors
 from abbe.service.cli.listen import listen
 from abbe.service.cli.measure import correct, measure
-from abbe.service.cli.papers import papers
 from abbe.service.cli.plan import plan
+from abbe.service.cli.reference import papers, vectors
 from abbe.service.cli.results.discover import discover
 from abbe.service.cli.results.effects import effects
 from abbe.service.cli.results.exchange import export_campaign, import_campaign
@@ -35,7 +35,6 @@ from abbe.service.cli.tables.comp_commission import commission
 from abbe.service.cli.tables.comp_proposals import approve, diff, propose, reject, show_proposals
 from abbe.service.cli.tables.comp_push import push, rollback
 from abbe.service.cli.tables.table import accept_table
-from abbe.service.cli.vectors import vectors
 
 app = typer.Typer(
     name="abbe",

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 from abbe.service.rendering.numbers import COVERAGE
 
 FORMAT = "abbe-report/1"
-Kind = Literal["run", "campaign", "verification", "discovery", "push", "simulation", "cycle", "plan", "dry-run", "table-change"]
+Kind = Literal["run", "campaign", "verification", "discovery", "push", "simulation", "cycle", "plan", "dry-run", "table-change", "papers"]
 Sign = Literal["ok", "open", "bad"]
 
 DECISION_RULE = (

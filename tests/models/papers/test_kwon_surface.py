@@ -25,8 +25,8 @@ from abbe.models.papers.kwon.layout import layout, rank_of
 from abbe.models.papers.kwon.repeatability import repeatability, residual_statistics
 from abbe.models.papers.kwon.surface import fit_surface
 from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors, term_name
-from abbe.service.papers.kwon_printed import RESTORED, TABLE1
-from abbe.service.papers.printed import values
+from abbe.service.reference.papers.kwon_printed import RESTORED, TABLE1
+from abbe.service.reference.printed import values
 
 Z = 113.61
 

@@ -24,8 +24,8 @@ from abbe.models.solvers.observe import SetupUnknowns, linearise, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.solvers.step_diagonal import increments, wang_eq7
 from abbe.models.volumetric import volume_grid
-from abbe.service.vectors.case import VectorCase
-from abbe.service.vectors.wang_step_diagonal import DEMO_PLANS, IDEAL, NOISY, TILTED, errors_of, tilts_of
+from abbe.service.reference.vector_file import VectorCase
+from abbe.service.reference.vectors.wang import DEMO_PLANS, IDEAL, NOISY, TILTED, errors_of, tilts_of
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 

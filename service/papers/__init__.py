@@ -1,1 +1,0 @@
-"""`abbe papers`: every printed number of the four papers compared with the computed one."""

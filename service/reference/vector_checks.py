@@ -1,0 +1,191 @@
+"""Computed against stored numbers: comparisons, deviations, and numbers that the file's inputs do not determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from abbe.service.reference.vector_file import VectorCase
+
+Unit = Literal["mm", "rad", "1"]
+LIMIT: dict[str, float] = {"mm": 1e-9, "rad": 1e-12, "1": np.inf}
+"""Largest accepted deviation, unless a coarser rounding of the vector is stated (issue: 1e-9 mm, 1e-12 rad)."""
+RELATIVE = 1e-11
+"""Share of the stored value. An altered 8th digit changes an output by 1e-8 or more; the margin catches most altered inputs."""
+
+
+@dataclass
+class Quantity:
+    """All comparisons of one quantity of one file.
+
+    ``floor`` is the rounding of the stored number in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation does
+    not exceed the larger of ``floor`` and ``relative`` times the stored value, nor the larger of ``floor`` and LIMIT. Comparisons of one
+    quantity may have different roundings; the largest is shown. ``allowed`` is the tolerance at the largest deviation (``worst``).
+    """
+
+    name: str
+    unit: Unit
+    floor: float
+    rounding: str
+    relative: float = RELATIVE
+    cases: int = 0
+    values: int = 0
+    max_abs: float = 0.0
+    max_rel: float = 0.0
+    worst: str = ""
+    allowed: float = 0.0
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether every comparison held."""
+        return not self.failures
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON value for ``--json``; a deviation that is not finite (nothing was computed) is null."""
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "cases": self.cases,
+            "values": self.values,
+            "max_abs_deviation": _finite(self.max_abs),
+            "max_rel_deviation": _finite(self.max_rel),
+            "allowed_at_worst": self.allowed,
+            "rounding_of_vector": self.floor,
+            "rounding_relative": self.relative,
+            "rounding_why": self.rounding,
+            "worst": self.worst,
+            "ok": self.ok,
+            "failures": self.failures,
+        }
+
+
+@dataclass
+class NotComputable:
+    """Numbers of a file that its own inputs do not determine, with the reason."""
+
+    name: str
+    numbers: int
+    why: str
+
+
+@dataclass
+class Checks:
+    """Result of one vector file."""
+
+    file: str
+    quantities: dict[str, Quantity] = field(default_factory=dict)
+    forms: dict[str, Quantity] = field(default_factory=dict)
+    """Inputs that are only checked for their form."""
+    not_computable: list[NotComputable] = field(default_factory=list)
+    assumptions: list[str] = field(default_factory=list)
+    """Facts of the layout that the file does not state, found by trial."""
+    unread: list[str] = field(default_factory=list)
+    refused: str = ""
+    """Why a public function refused the inputs of the file; else empty."""
+    error: str = ""
+    """Why the file is unusable (unreadable, another layout); else empty. Earlier comparisons remain valid."""
+
+    def compare(
+        self,
+        name: str,
+        computed: ArrayLike,
+        stored: VectorCase,
+        *,
+        unit: Unit,
+        floor: float = 1e-15,
+        rounding: str = "float64",
+        relative: float = RELATIVE,
+    ) -> None:
+        """Compare a computed value with the stored one (number or nested list of the same shape).
+
+        Parameters
+        ----------
+        name : str
+            Quantity; the same name in every case of a file.
+        computed : array_like
+            From the public functions, using the inputs of the case only.
+        stored : VectorCase
+            Part of the file with the expected value.
+        floor : float
+            Rounding of the stored value in ``unit``.
+        rounding : str
+            Reason of the floor.
+        relative : float
+            Rounding as a share of the stored value: larger for ill-conditioned figures, smaller for plain sums.
+        """
+        self._compare(self.quantities, Quantity(name, unit, floor, rounding, relative), computed, stored)
+
+    def check_form(
+        self, name: str, expected: ArrayLike, stored: VectorCase, *, unit: Unit = "1", floor: float = 1e-18, rounding: str = ""
+    ) -> None:
+        """Check the form of numbers that are not computed: printed digits, a rotation, a grid.
+
+        ``expected`` comes from the stored numbers themselves, so the result is reported separately. Parameters as in `compare`, without a
+        relative tolerance.
+        """
+        self._compare(self.forms, Quantity(name, unit, floor, rounding, 0.0), expected, stored)
+
+    def _compare(self, known: dict[str, Quantity], this: Quantity, computed: ArrayLike, stored: VectorCase) -> None:
+        q = known.setdefault(this.name, this)
+        if this.unit != q.unit:
+            raise TypeError(f"{self.file}: {q.name} is compared in {q.unit} and in {this.unit}")
+        floor, relative = this.floor, this.relative
+        if floor > q.floor:
+            q.floor, q.rounding = floor, this.rounding
+        q.relative = max(q.relative, relative)
+        expected = stored.array()
+        got = np.asarray(computed, dtype=np.float64)
+        q.cases += 1
+        q.values += expected.size
+        if got.shape != expected.shape:
+            q.failures.append(f"{stored.label}: computed shape {got.shape}, stored {expected.shape}")
+            return
+        off = np.where(np.isfinite(got), np.abs(got - expected), np.inf).ravel()
+        size = np.abs(expected).ravel()
+        allowed = np.maximum(floor, np.minimum(LIMIT[q.unit], relative * size))
+        if off.max() >= q.max_abs:
+            worst = int(off.argmax())
+            q.max_abs, q.worst, q.allowed = float(off[worst]), stored.label, float(allowed[worst])
+        large = size > floor
+        if large.any():
+            q.max_rel = max(q.max_rel, float((off[large] / size[large]).max()))
+        for i in np.flatnonzero(off > allowed)[:3]:
+            where = f"[{i}]" if off.size > 1 else ""
+            q.failures.append(f"{stored.label}{where}: stored {float(expected.ravel()[i])!r}, computed {float(got.ravel()[i])!r}")
+
+    def assume(self, text: str) -> None:
+        """Record a fact of the layout that the file does not state, found by trial: the figures agree only with it."""
+        if text not in self.assumptions:
+            self.assumptions.append(text)
+
+    def leave_out(self, name: str, part: VectorCase, why: str) -> None:
+        """Record that numbers of a file cannot be computed from its inputs, and why."""
+        self.not_computable.append(NotComputable(name, part.skip(), why))
+
+    @property
+    def ok(self) -> bool:
+        """Whether every comparison and form holds, every number was used, no input was refused, and the file was readable."""
+        held = all(q.ok for q in (*self.quantities.values(), *self.forms.values()))
+        return held and bool(self.quantities) and not (self.error or self.refused or self.unread)
+
+    def to_document(self) -> dict[str, Any]:
+        """JSON value for ``--json``."""
+        return {
+            "file": self.file,
+            "ok": self.ok,
+            "error": self.error,
+            "quantities": [q.to_document() for q in self.quantities.values()],
+            "forms": [q.to_document() for q in self.forms.values()],
+            "not_computable": [{"name": n.name, "numbers": n.numbers, "why": n.why} for n in self.not_computable],
+            "assumptions": self.assumptions,
+            "unread": self.unread,
+            "refused": self.refused,
+        }
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""Readers of independent vector files: what each stored number is compared with."""

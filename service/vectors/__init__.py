@@ -1,1 +1,0 @@
-"""`abbe vectors`: check of the public functions with independent vector files."""
