@@ -67,10 +67,14 @@ class Facts:
 
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """A table of text and formatted numbers; columns of numbers only are aligned to the right."""
+    """A table of text and formatted numbers; columns of numbers only are aligned to the right.
+
+    ``bold``: headings of the columns that a page or sheet prints in bold.
+    """
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
+    bold: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)

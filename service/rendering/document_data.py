@@ -138,7 +138,8 @@ def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:
             return {"kind": "facts", "items": _pairs(block.items)}
         case TextTable():
             rows = [list(r) for r in block.rows]
-            return {"kind": "table", "head": list(block.head), "rows": rows, "right": _right(len(block.head), rows)}
+            bold = [name in block.bold for name in block.head]
+            return {"kind": "table", "head": list(block.head), "rows": rows, "right": _right(len(block.head), rows), "bold": bold}
         case Picture():
             return {"kind": "picture", "caption": block.caption, "svgs": [draw(s) for s in block.svgs], "layout": block.layout}
         case Section():

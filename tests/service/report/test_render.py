@@ -115,6 +115,13 @@ def test_the_uncertainty_decides_the_digits(full_report: Document) -> None:
     assert re.search(r"18\.20<span class=\"u\"> ± 0\.62<", page)
 
 
+def test_what_the_correction_reached_is_bold(full_report: Document) -> None:
+    row = re.search(r"<tr><th scope=\"row\">Volumetric error, rms</th>.*?</tr>", document_html(full_report))
+    assert row is not None
+    assert re.findall(r"<td class=\"r strong\">([\d.]+)", row[0]) == ["2.91", "6.3"]
+    assert row[0].count("strong") == 2
+
+
 def test_parameters_of_the_set_up_are_folded_away(full_report: Document) -> None:
     page = document_html(full_report)
     fold = page[page.index("<details>") : page.index("</details>")]
