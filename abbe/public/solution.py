@@ -21,7 +21,7 @@ from abbe.service.identification.solve import ProgressText, solve_runs
 from abbe.service.identification.solve_report import Assessment, assess, solution_doc, solution_verdict
 from abbe.service.rendering.document_page import write_document
 from abbe.service.rendering.model import MotionCurve
-from abbe.service.rendering.plots.bands import motion_bands
+from abbe.service.rendering.plots.tables import motion_bands
 from abbe.service.report.report import solution_report
 from abbe.service.report.report_measured import SolutionResult
 from abbe.service.report.report_parts import Rules

@@ -17,8 +17,7 @@ from abbe.service.campaigns.plan_instruments import at_this_machine
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import ConfigError
 from abbe.service.rendering.document import Document, Lines, Picture, Section, TextTable
-from abbe.service.rendering.plots.setups import setups_picture
-from abbe.service.rendering.plots.views import DrawnTest
+from abbe.service.rendering.plots.views import DrawnTest, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
 from abbe.service.sequences.recipes.recipe_file import recipe_text

@@ -11,7 +11,7 @@ from abbe.models.machine import AXES
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.errors import TableRefused
 from abbe.service.rendering.document import Document, Picture, Section, TextTable
-from abbe.service.rendering.plots.table_change import CurveChange, change_plot
+from abbe.service.rendering.plots.tables import CurveChange, change_plot
 from abbe.service.storage.store import Store
 
 ACTIVE = "ACTIVE"

@@ -16,7 +16,7 @@ from abbe.service.demo.demo import DemoResult
 from abbe.service.rendering.document import Block, Document, Lines, Picture, Section
 from abbe.service.rendering.model import SETUP_NOTE, ArrowField, TableCurve
 from abbe.service.rendering.numbers import COVERAGE, tidy
-from abbe.service.rendering.plots.diagonals import diagonal_plot
+from abbe.service.rendering.plots.curves import diagonal_plot
 from abbe.service.rendering.plots.tables import table_plot
 from abbe.service.rendering.plots.volume import volume_pair
 from abbe.service.report.blocks import (

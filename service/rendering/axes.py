@@ -1,12 +1,14 @@
-"""Scales and axes: from numbers to pixels, with ticks at 1, 2 and 5."""
+"""Scales and axes, from numbers to pixels, with ticks at 1, 2 and 5; layers on a panel; panels side by side; keys of scales."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from abbe.service.rendering.numbers import finite, fixed
+from abbe.service.rendering.model import Floats
+from abbe.service.rendering.numbers import finite, fixed, tidy
+from abbe.service.rendering.palette import SEQUENCE
 from abbe.service.rendering.svg import XY, Svg
 
 
@@ -94,6 +96,27 @@ class Panel:
         """Pixel of a data point."""
         return self.x(x), self.y(y)
 
+    def points(self, x: Floats, y: Floats) -> list[XY]:
+        """Pixels of data points."""
+        return [self.at(float(a), float(b)) for a, b in zip(x, y, strict=True)]
+
+    def draw_line(self, svg: Svg, x: Floats, y: Floats, style: str) -> None:
+        """Line through data points, broken at missing ones."""
+        svg.polyline(self.points(x, y), style)
+
+    def draw_band(self, svg: Svg, x: Floats, low: Floats, high: Floats) -> None:
+        """Filled band between two curves."""
+        svg.polygon([*self.points(x, high), *self.points(x[::-1], low[::-1])], "band")
+
+    def draw_bar(self, svg: Svg, end: float, y: float, height: float, style: str, tip: str = "") -> None:
+        """Horizontal bar from the left edge to the value ``end``, centred on the pixel ``y``."""
+        svg.rect((self.left, y - height / 2.0), (self.x(end) - self.left, height), style, tip)
+
+    def draw_whisker(self, svg: Svg, value: float, expanded: float, y: float) -> None:
+        """Horizontal whisker of an uncertainty about a size, cut off at zero because a size is never negative."""
+        low, high = self.x(max(value - expanded, 0.0)), self.x(value + expanded)
+        svg.error_bar((0.5 * (low + high), y), 0.5 * (high - low), horizontal=True)
+
     def draw_y(self, svg: Svg, label: str = "", *, count: int = 5, numbers: bool = True) -> None:
         """Horizontal grid lines with their numbers, a stronger line at zero, and the label along the axis."""
         step = nice_step(self.y_range[1] - self.y_range[0], count)
@@ -121,3 +144,70 @@ class Panel:
     def draw_frame(self, svg: Svg) -> None:
         """Border around the data area."""
         svg.rect((self.left, self.top), (self.width, self.height), "frame")
+
+
+def bar_panel(left: float, top: float, size: XY, ends: Iterable[float | None]) -> Panel:
+    """Panel for horizontal bars from zero to at most the largest of ``ends``; ``size``: width and height."""
+    return Panel(left, top, *size, (0.0, data_range(ends, zero=True)[1]), (0.0, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class PanelGrid:
+    """Panels of one size in rows and columns on one ordinate, with numbers and labels at the outer edges only.
+
+    ``rows``, ``columns``: names; ``top``: pixels above the first row, for headings.
+    """
+
+    rows: Sequence[str]
+    columns: Sequence[str]
+    cell_height: float
+    gap: float
+    top: float
+    y_range: tuple[float, float]
+
+    WIDTH = 1010.0
+    LEFT = 68.0
+    BOTTOM = 48.0
+
+    @property
+    def height(self) -> float:
+        """Height of the picture."""
+        count = max(len(self.rows), 1)
+        return self.top + count * self.cell_height + (count - 1) * self.gap + self.BOTTOM
+
+    @property
+    def _width(self) -> float:
+        count = max(len(self.columns), 1)
+        return (self.WIDTH - self.LEFT - 10.0 - (count - 1) * self.gap) / count
+
+    def panel(self, row: str, column: str, x_range: tuple[float, float]) -> Panel:
+        """Panel of a cell."""
+        left = self.LEFT + self.columns.index(column) * (self._width + self.gap)
+        top = self.top + self.rows.index(row) * (self.cell_height + self.gap)
+        return Panel(left, top, self._width, self.cell_height, x_range, self.y_range)
+
+    def draw_axes(self, svg: Svg, panel: Panel, cell: tuple[str, str], labels: tuple[str, str]) -> None:
+        """Grid lines of a cell (row, column), numbers and ``labels`` (x, y) if it is at the edge."""
+        last, first = cell[0] == self.rows[-1], cell[1] == self.columns[0]
+        panel.draw_y(svg, labels[1] if first else "", count=4, numbers=first)
+        panel.draw_x(svg, labels[0] if last else "", count=5, numbers=last)
+
+    def draw_columns(self, svg: Svg, y: float) -> None:
+        """Moved axis above each column."""
+        for column, axis in enumerate(self.columns):
+            x = self.LEFT + column * (self._width + self.gap) + self._width / 2.0
+            svg.text((x, y), f"moving {axis}", "t-soft", anchor="middle")
+
+
+def draw_sequence(svg: Svg, at: XY, cell: float, top: float, unit: str) -> None:
+    """Key of the five colours for sizes from zero to ``top``; ``at``: upper left corner; ``cell``: width of a colour, pixels."""
+    x, y = at
+    for i in range(SEQUENCE):
+        svg.rect((x + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
+        svg.text((x + i * cell, y + 23.0), tidy(i * top / SEQUENCE), "t-small", anchor="middle")
+    svg.text((x + SEQUENCE * cell, y + 23.0), f"{tidy(top)} {unit}", "t-small", anchor="middle")
+
+
+def sequence_level(size: float, top: float) -> int:
+    """Number of the colour of a size, 1 to 5."""
+    return 1 + min(SEQUENCE - 1, int(SEQUENCE * size / top))

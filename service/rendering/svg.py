@@ -114,6 +114,20 @@ class Svg:
         rotation = f' transform="rotate({coordinate(turn)} {x} {y})"' if turn else ""
         self._body.append(f'<text x="{x}" y="{y}"{kind}{side}{rotation}>{escape(printable(content))}</text>')
 
+    def head(self, heading: str, below: str = "") -> None:
+        """Heading in the middle of the top, with a softer line below."""
+        self.text((self.width / 2.0, 18.0), heading, "t-head", anchor="middle")
+        if below:
+            self.text((self.width / 2.0, 36.0), below, "t-soft", anchor="middle")
+
+    def length_key(self, end: XY, length: float, text: str) -> None:
+        """Bar of ``length`` pixels that ends at ``end``, with its text below: the scale of arrows and magnified errors."""
+        right, y = end
+        self.line((right - length, y), (right, y), "key")
+        for x in (right - length, right):
+            self.line((x, y - 4.0), (x, y + 4.0), "key")
+        self.text((right, y + 18.0), text, "t-small", anchor="end")
+
     def legend(self, at: XY, entries: Sequence[tuple[str, str]]) -> None:
         """Row of line samples with their names. ``entries``: style class of the line, name."""
         x, y = at

@@ -25,9 +25,9 @@ from abbe.service.rendering.model import (
     ResidualSeries,
     Slice,
 )
-from abbe.service.rendering.plots.bands import motion_bands
-from abbe.service.rendering.plots.cells import common_step, correlation_plot, slice_plot
-from abbe.service.rendering.plots.observability import gain_map, share_plot
+from abbe.service.rendering.plots.bars import share_plot
+from abbe.service.rendering.plots.maps import cell_map, common_step, correlation_plot, gain_map
+from abbe.service.rendering.plots.tables import motion_bands
 from abbe.service.report.blocks import U_OF, RunRow, parameter_pictures, parameter_table, residual_picture, run_table, setup_section, stated
 
 CURVE_NODES = 61
@@ -106,7 +106,7 @@ def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Blo
 def _volume(found: Assessment) -> list[Block]:
     slices = [_slice(found, plane) for plane in PLANES]
     step = common_step(slices)
-    maps = [slice_plot(s, step, key=f"slice-{i}", heading=f"U of the predicted vector, {s.at}") for i, s in enumerate(slices)]
+    maps = [cell_map(s, step, key=f"slice-{i}", heading=f"U of the predicted vector, {s.at}") for i, s in enumerate(slices)]
     gains = [gain_map(_gain(found, fixed), key=f"gain-{i}") for i, (_, _, fixed) in enumerate(PLANES)]
     return [
         worst_line(found),

@@ -17,8 +17,8 @@ from abbe.models.verification import U_REPEAT_MM
 from abbe.service.rendering.document import Picture, ReportFigure
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.numbers import plain
+from abbe.service.rendering.plots.curves import PositioningCurves, positioning_plot
 from abbe.service.rendering.plots.polar import polar_plot
-from abbe.service.rendering.plots.positioning import PositioningCurves, positioning_plot
 from abbe.service.runs.coverage import not_judged
 from abbe.service.verification.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
 

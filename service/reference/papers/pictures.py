@@ -17,11 +17,10 @@ from abbe.service.reference.papers.yang import bar_line_um, restored_x_mm
 from abbe.service.reference.printed import values
 from abbe.service.reference.text import minus, short
 from abbe.service.rendering.document import Picture
-from abbe.service.rendering.plots.comparison import Comparison, comparison_plot
-from abbe.service.rendering.plots.contours import contour_plot
-from abbe.service.rendering.plots.deformed import deformed_grid
-from abbe.service.rendering.plots.facets import Surface, lobing_plot, surface_plot
-from abbe.service.rendering.plots.signed import SignedScale
+from abbe.service.rendering.plots.curves import Comparison, comparison_plot
+from abbe.service.rendering.plots.facets import lobing_plot, surface_plot
+from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot
+from abbe.service.rendering.plots.volume import deformed_grid
 
 NODES = 5
 SURFACE_NODES = 41

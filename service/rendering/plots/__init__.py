@@ -1,7 +1,7 @@
 """Plots of the report: each turns plain values into one ``<svg>`` element."""
 
 from abbe.service.rendering.plots.bars import contribution_bars, uncertainty_bars
-from abbe.service.rendering.plots.diagonals import diagonal_plot
+from abbe.service.rendering.plots.curves import diagonal_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.rendering.plots.residuals import residual_plot
 from abbe.service.rendering.plots.tables import table_plot

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from abbe.service.rendering.axes import nice_step, tick_text, ticks
 from abbe.service.rendering.numbers import plain, tidy
 from abbe.service.rendering.plots.isometric import Paper, ViewWindow, depth, draw_box
-from abbe.service.rendering.plots.signed import SignedScale, extremes
+from abbe.service.rendering.plots.maps import SignedScale, Surface, extremes
 from abbe.service.rendering.svg import XY, Svg
 
 Array = NDArray[np.float64]
@@ -18,18 +16,6 @@ Array = NDArray[np.float64]
 WIDTH, HEIGHT = 500.0, 430.0
 FLOOR, ROOF = 0.0, 0.62
 """Bottom and top of the box of a surface, as a share of its side."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surface:
-    """Values over a rectangle: ``x`` (nx,), ``y`` (ny,), ``values`` (ny, nx) in ``unit``; labels: names and units of the axes."""
-
-    x: Array
-    y: Array
-    values: Array
-    x_label: str
-    y_label: str
-    unit: str
 
 
 def draw_facets(svg: Svg, paper: Paper, nodes: Array, values: Array, scale: SignedScale) -> None:
@@ -52,8 +38,7 @@ def surface_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str
     low_value, high_value = extremes(surface.values.ravel())
     summary = f"from {plain(low_value)} to {plain(high_value)} {surface.unit}"
     svg = Svg(WIDTH, HEIGHT, key, heading, f"Surface over a plane: {summary}.")
-    svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), summary, "t-soft", anchor="middle")
+    svg.head(heading, summary)
     low, high = np.array([0.0, 0.0, FLOOR]), np.array([1.0, 1.0, ROOF])
     paper = Paper.around(low, high, ViewWindow((WIDTH / 2.0, 206.0), WIDTH - 120.0, HEIGHT - 150.0))
     top = 4.0 * scale.step
@@ -82,8 +67,7 @@ def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scal
     relief = 0.22 / (4.0 * scale.step)
     summary = f"from {plain(low_value)} to {plain(high_value)} µm; {tidy(4.0 * scale.step)} µm drawn as 22 % of the radius"
     svg = Svg(WIDTH, HEIGHT, key, heading, f"Probe error as relief on a hemisphere: {summary}.")
-    svg.text((WIDTH / 2.0, 18.0), heading, "t-head", anchor="middle")
-    svg.text((WIDTH / 2.0, 36.0), summary, "t-soft", anchor="middle")
+    svg.head(heading, summary)
     paper = Paper.around(
         np.array([-0.95, -0.95, 0.0]), np.array([0.95, 0.95, 1.0]), ViewWindow((WIDTH / 2.0, 208.0), WIDTH - 130.0, HEIGHT - 110.0)
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.service.domain.finding import RunFit
-from abbe.service.rendering.axes import Panel, data_range
+from abbe.service.rendering.axes import Panel, bar_panel, data_range
 from abbe.service.rendering.model import PlaceMap, Trace
 from abbe.service.rendering.numbers import COVERAGE, plain
 from abbe.service.rendering.svg import Svg
@@ -35,14 +35,14 @@ def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
     svg.text((10.0, 18.0), "rms of measured minus simulated, every run", "t-head")
     svg.legend((LABELS, 38.0), [("s-c1", "before"), ("s-c2", "after"), ("band-edge", "noise floor")])
     values = [v for _, r, before, after in rows for v in (before, after, r.floor_um)]
-    panel = Panel(LABELS, TOP, WIDE - LABELS - 16.0, ROW * max(len(rows), 1), (0.0, data_range(values, zero=True)[1]), (0.0, 1.0))
+    panel = bar_panel(LABELS, TOP, (WIDE - LABELS - 16.0, ROW * max(len(rows), 1)), values)
     panel.draw_x(svg, "rms in µm")
     for i, (label, row, before, after) in enumerate(rows):
         y = TOP + ROW * i
         svg.text((LABELS - 8.0, y + 14.0), f"{label} {row.role}"[:30], "" if row.role == "identify" else "t-soft", anchor="end")
         tip = f"{label}, {row.test}, {row.role}: {plain(before)} → {plain(after)} µm, noise {plain(row.floor_um)} µm"
-        svg.rect((LABELS, y + 2.0), (panel.x(before) - LABELS, 7.0), "f-c1", tip)
-        svg.rect((LABELS, y + 10.0), (panel.x(after) - LABELS, 7.0), "f-c2", tip)
+        panel.draw_bar(svg, before, y + 5.5, 7.0, "f-c1", tip)
+        panel.draw_bar(svg, after, y + 13.5, 7.0, "f-c2", tip)
         at = panel.x(row.floor_um)
         svg.line((at, y), (at, y + ROW - 1.0), "band-edge")
     panel.draw_frame(svg)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from abbe.service.rendering.axes import Panel
+from abbe.service.rendering.axes import Panel, draw_sequence, sequence_level
 from abbe.service.rendering.numbers import MM, UM, Unit, placed, plain, tidy
 from abbe.service.rendering.palette import SEQUENCE
 from abbe.service.rendering.plots.isometric import round_down
@@ -105,17 +105,13 @@ def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array],
             svg.circle(foot, 4.0, "frame")
             svg.dot(foot, 0.0, "key-head", tip)
             continue
-        colour = 1 + min(SEQUENCE - 1, int(SEQUENCE * length / top))
-        svg.arrow(foot, panel.at(float(actual[index][across]), float(actual[index][up])), f"seq{colour}", tip)
+        svg.arrow(foot, panel.at(float(actual[index][across]), float(actual[index][up])), f"seq{sequence_level(length, top)}", tip)
 
 
 def _key(svg: Svg, y: float, top: float, texts: SliceTexts) -> None:
     """Key of the colours and lines."""
-    cell, step = 52.0, top / SEQUENCE
-    for i in range(SEQUENCE):
-        svg.rect((LEFT + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")
-        svg.text((LEFT + i * cell, y + 23.0), tidy(i * step), "t-small", anchor="middle")
-    svg.text((LEFT + SEQUENCE * cell, y + 23.0), f"{tidy(top)} {texts.error.sign}", "t-small", anchor="middle")
+    cell = 52.0
+    draw_sequence(svg, (LEFT, y), cell, top, texts.error.sign)
     svg.circle((LEFT + SEQUENCE * cell + 56.0, y + 4.0), 4.0, "frame")
     svg.text((LEFT + SEQUENCE * cell + 66.0, y + 9.0), texts.uncertain, "t-small")
     svg.legend((LEFT, y + 40.0), [("hidden-edge", texts.nominal), ("s-c2", texts.actual)])

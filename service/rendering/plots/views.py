@@ -1,4 +1,4 @@
-"""A campaign's paths in the three views of a drawing: from above, from the front, from the side; strokes, set-ups, bars and cups."""
+"""A campaign's paths in the machine's volume: three views of a drawing (above, front, side), or one isometric view of the set-ups."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from abbe.service.rendering.axes import Panel
 from abbe.service.rendering.numbers import MM, Unit
+from abbe.service.rendering.plots.isometric import Paper, ViewWindow, depth, draw_box, label_edges
 from abbe.service.rendering.svg import Svg
 
 F2 = NDArray[np.float64]
@@ -102,3 +103,31 @@ def _draw(svg: Svg, panel: Panel, test: DrawnTest, plane: tuple[int, int]) -> No
         end = test.path_mm[0]
         svg.line(panel.at(test.mount_mm[a], test.mount_mm[b]), panel.at(end[a], end[b]), "key")
         svg.dot(panel.at(end[a], end[b]), 2.5, "key-head", f"{test.number}: the bar where its path begins")
+
+
+SETUP_STYLES = {"bar": "c1", "line": "c2", "diagonal": "c3"}
+SETUP_NAMES = {"bar": "ball-bar, its cup", "line": "laser along an axis", "diagonal": "laser along a body diagonal"}
+
+
+def setups_picture(stroke_mm: F2, paths: Sequence[DrawnTest], *, key: str = "setups") -> str:
+    """Isometric view of the strokes, shape (3, 2), with all paths in the order of measuring and the numbers of their set-ups."""
+    width, height = 760.0, 620.0
+    count = len({p.number for p in paths})
+    summary = "; ".join(f"{p.number}: {p.text}" for p in paths)
+    svg = Svg(width, height, key, f"{count} set-ups in the machine's volume", summary)
+    low, high = stroke_mm[:, 0], stroke_mm[:, 1]
+    paper = Paper.around(low, high, ViewWindow((width / 2.0, height / 2.0 - 14.0), width - 150.0, height - 130.0))
+    draw_box(svg, paper, low, high)
+    middles = np.array([p.path_mm.mean(axis=0) for p in paths]).reshape(-1, 3)
+    for i in np.argsort(depth(middles), kind="stable"):  # far ones first, near ones on top
+        path = paths[int(i)]
+        thinned = path.path_mm[:: max(1, len(path.path_mm) // 400)]
+        svg.polyline([paper(point) for point in (*thinned, path.path_mm[-1])], f"s-{SETUP_STYLES[path.kind]} thin")
+    for path in {p.number: p for p in reversed(paths)}.values():
+        x, y = paper(path.mount_mm)
+        svg.dot((x, y), 4.0, f"f-{SETUP_STYLES[path.kind]}", path.text)
+        svg.text((x + 7.0, y - 5.0), path.number, "t-head t-halo")
+    label_edges(svg, paper, low, high)
+    used = [k for k in SETUP_STYLES if any(p.kind == k for p in paths)]
+    svg.legend((30.0, height - 12.0), [(f"s-{SETUP_STYLES[k]}", SETUP_NAMES[k]) for k in used])
+    return svg.render()

@@ -11,7 +11,7 @@ from abbe.service.domain.measured import RunRecord
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.numbers import COVERAGE, finite, plain
-from abbe.service.rendering.plots.overlay import difference_plot, overlay_plot
+from abbe.service.rendering.plots.curves import difference_plot, overlay_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data

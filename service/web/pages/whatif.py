@@ -13,7 +13,7 @@ from abbe.service.domain.results import SolutionRecord
 from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import StoredField, stored_field
 from abbe.service.rendering.numbers import COVERAGE, with_uncertainty
-from abbe.service.rendering.plots.paired import Pair, paired_bars
+from abbe.service.rendering.plots.bars import Pair, paired_bars
 from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current

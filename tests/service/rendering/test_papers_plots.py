@@ -6,12 +6,11 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from abbe.service.rendering.plots.comparison import Comparison, comparison_plot
-from abbe.service.rendering.plots.contours import contour_plot, level_lines
-from abbe.service.rendering.plots.deformed import deformed_grid
-from abbe.service.rendering.plots.facets import Surface, lobing_plot, surface_plot
+from abbe.service.rendering.plots.curves import Comparison, comparison_plot
+from abbe.service.rendering.plots.facets import lobing_plot, surface_plot
 from abbe.service.rendering.plots.isometric import VIEW, Paper, ViewWindow, depth
-from abbe.service.rendering.plots.signed import SignedScale
+from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot, level_lines
+from abbe.service.rendering.plots.volume import deformed_grid
 
 
 def test_level_line_of_a_cone_is_one_closed_circle():

@@ -13,8 +13,8 @@ from abbe.service.rendering.document import DECISION_RULE, Document, Instrument,
 from abbe.service.rendering.document_data import document_csv, document_json
 from abbe.service.rendering.document_page import document_html, document_pdf, standalone
 from abbe.service.rendering.model import PolarTrace
+from abbe.service.rendering.plots.curves import PositioningCurves, positioning_plot
 from abbe.service.rendering.plots.polar import polar_plot
-from abbe.service.rendering.plots.positioning import PositioningCurves, positioning_plot
 from abbe.service.report.report_parts import Rules, judged, verdict_of
 
 HOSTILE = '#import "@preview/x:1.0.0" *bold* $x$ </td><script>alert(1)</script> \\ "quoted" {{ 7*7 }} [a] <b> @ref // = Title'

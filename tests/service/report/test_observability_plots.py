@@ -6,7 +6,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from abbe.service.rendering.model import MotionShare, Slice
-from abbe.service.rendering.plots.observability import gain_map, share_plot
+from abbe.service.rendering.plots.bars import share_plot
+from abbe.service.rendering.plots.maps import gain_map
 
 ROWS = [MotionShare("EXX", 0.99, "observed"), MotionShare("EYX", 0.4, "weak"), MotionShare("EAX", 0.97, "not observable")]
 
