@@ -35,8 +35,15 @@ def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
         After a signal, with 128 + its number: 130 Ctrl-C, 143 SIGTERM, 129 terminal closed.
     """
     received: list[int] = []
+    results: list[T] = []
+
+    async def work() -> None:
+        # Not returned: at its end asyncio formats the main task with its result, which takes seconds for a solution.
+        results.append(await _cancelled_by_signal(job, received, control))
+
     try:
-        return asyncio.run(_cancelled_by_signal(job, received, control))
+        asyncio.run(work())
+        return results[0]
     except Stopped as error:
         if not received:
             raise
