@@ -1,18 +1,41 @@
-"""What the tests of the service share because it is always the same and dear to make: the tree of commands, an empty SQLite database."""
+"""What tests share because it is always the same and dear to make: the tree of commands, an empty SQLite database, what a maker gives."""
 
 from __future__ import annotations
 
+import fcntl
+import os
+import pickle
 import re
+import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 from uuid import uuid4
 
 import pytest
 import typer.main
 import typer.testing
 from sqlalchemy import Connection, create_engine
+
+T = TypeVar("T")
+
+
+def once_per_run(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], T]) -> tuple[Path, T]:
+    """Folder and value of ``make``: the first worker of a run makes them, the others read them. What is written to is copied first."""
+    base = factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, kept = shared / name, shared / f"{name}.pickle"
+    with (shared / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not kept.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            made = pickle.dumps(make(folder))
+            kept.write_bytes(made)
+    found: T = pickle.loads(kept.read_bytes())
+    return folder, found
 
 
 @pytest.fixture(scope="session", autouse=True)

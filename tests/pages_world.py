@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
+import pytest
 
 from abbe.drivers.api import CompStatus, TableFormat
 from abbe.drivers.errors import LinkDown
@@ -53,6 +54,7 @@ from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.process.serving import make_server
+from tests.built_once import once_per_run
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
 from tests.scenarios.campaign_files import measured
 from tests.service.discovery.discovery_bench import Search, write_case
@@ -80,25 +82,30 @@ class Filled:
     discovery: int
 
 
-@cache
-def _solved() -> tuple[Solved, str]:
-    site, runs = measured(SEED)
-    solved = solve_runs(site, runs)
+def _solved(_folder: Path) -> tuple[Solved, str]:
+    solved = solve_runs(*measured(SEED))
     return solved, json.dumps(solution_doc(solved))
 
 
-def solved_campaign(machine: str) -> tuple[Site, list[dict[str, Any]], Solved, dict[str, Any]]:
+def solved_campaign(factory: pytest.TempPathFactory, machine: str) -> tuple[Site, list[dict[str, Any]], Solved, dict[str, Any]]:
     """Seventeen simulated runs of one machine, what they say, and that as a document."""
     site, runs = measured(SEED)
     site = replace(site, name=machine, doc=site.doc | {"name": machine})
     for run in runs:
         run["machine"] = site.doc
         run["columns"]["temp_air_C"] = [20.4] * len(run["columns"]["t_s"])
-    solved, doc = _solved()
+    _, (solved, doc) = once_per_run(factory, "solved-campaign", _solved)
     return site, runs, solved, json.loads(doc)
 
 
-def fill(folder: Path, evil: str = "", checks: int = 24) -> Filled:
+def filled_once(factory: pytest.TempPathFactory) -> Filled:
+    """A copy of a filled store, made once in a run of the tests."""
+    made, filled = once_per_run(factory, "filled-screens", lambda folder: fill(factory, folder))
+    folder = shutil.copytree(made, factory.mktemp("screens"), dirs_exist_ok=True)
+    return replace(filled, url=f"sqlite:///{folder / 'abbe.sqlite3'}")
+
+
+def fill(factory: pytest.TempPathFactory, folder: Path, evil: str = "", checks: int = 24) -> Filled:
     """Fill a new store with campaign, solution, discovery, proposals, checks and slots."""
     url = f"sqlite:///{folder / 'abbe.sqlite3'}"
     machine = f"mill-7{evil}"
@@ -108,7 +115,7 @@ def fill(folder: Path, evil: str = "", checks: int = 24) -> Filled:
     with Store.open(url) as store:
         _checks(store, machine, schedules[0], checks, evil)
         _slots(store, machine, schedules, evil)
-        site, runs, solved, doc = solved_campaign(machine)
+        site, runs, solved, doc = solved_campaign(factory, machine)
         campaign = f"june{evil}"
         _import(store, folder / "in", campaign, site, runs)
         _broken_run(store, campaign, evil)

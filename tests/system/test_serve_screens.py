@@ -18,7 +18,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route, sync_playwright
 
 from abbe.service.domain.audit_event import AuditEvent
-from tests.pages_world import PHRASE, PROPOSER, Filled, Served, fill, screens, served
+from tests.pages_world import PHRASE, PROPOSER, Filled, Served, fill, filled_once, screens, served
 from tests.system.serve_bench import require
 from tests.system.test_serve_page import ARTIFACTS, QUIET
 
@@ -64,7 +64,7 @@ def chromium() -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Filled:
-    return fill(tmp_path_factory.mktemp("screens"))
+    return filled_once(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
@@ -153,9 +153,9 @@ def test_the_bar_is_one_row_and_its_last_entry_opens_by_keyboard(chromium, runni
         assert violations(page, axe, "{runOnly: ['color-contrast']}") == []
 
 
-def test_nothing_from_a_store_is_run(chromium, tmp_path) -> None:
+def test_nothing_from_a_store_is_run(chromium, tmp_path, tmp_path_factory) -> None:
     """The payload stands in every name, note, address and refusal there is; it is shown, and never run."""
-    filled = fill(tmp_path, EVIL)
+    filled = fill(tmp_path_factory, tmp_path, EVIL)
     hits: list[int] = []
     with served(filled) as one, context(chromium) as made:
         one.auth.book.write(AuditEvent(who=EVIL, action=EVIL, target=EVIL, outcome=EVIL, doc={"note": EVIL}))

@@ -56,8 +56,7 @@ class Ask:
 
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    found, stack = open_plant(tmp_path_factory.mktemp("plant"))
-    with stack:
+    with open_plant(tmp_path_factory) as found:
         yield found
 
 

@@ -12,8 +12,7 @@ from tests.service.web.api_bench import NAME, Plant, open_plant
 
 @pytest.fixture(scope="session")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    found, stack = open_plant(tmp_path_factory.mktemp("plant"))
-    with stack:
+    with open_plant(tmp_path_factory) as found:
         yield found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import pytest
 from fastapi import FastAPI
 
 from abbe.drivers.api import BarSample, CompStatus, TableFormat
@@ -42,6 +44,7 @@ from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token
 from abbe.service.web.process.serving import make_server
+from tests.built_once import once_per_run
 from tests.service.discovery.discovery_bench import MACHINE, Search, write_case
 
 PHRASE = "correct horse battery staple"
@@ -187,12 +190,22 @@ async def _push(store: Store) -> None:
         await book.append(await book.entries(), state, doc)
 
 
-def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
-    """The plant over a SQLite file in ``folder``, with a user of each role; close the stack."""
-    stack, clock = contextlib.ExitStack(), Hour()
-    url = f"sqlite:///{folder / 'abbe.sqlite3'}"
-    store = stack.enter_context(Store.open(url, utcnow=clock.utc))
-    approvable = fill(store, folder)
+def _filled(folder: Path) -> list[int]:
+    with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}", utcnow=Hour().utc) as store:
+        return fill(store, folder)
+
+
+@contextlib.contextmanager
+def open_plant(factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    """A plant over a SQLite file of its own, with a user of each role."""
+    made, approvable = once_per_run(factory, "filled-plant", _filled)
+    folder = shutil.copytree(made, factory.mktemp("plant"), dirs_exist_ok=True)
+    url, clock = f"sqlite:///{folder / 'abbe.sqlite3'}", Hour()
+    with Store.open(url, utcnow=clock.utc) as store:
+        yield _plant(store, url, clock, approvable)
+
+
+def _plant(store: Store, url: str, clock: Hour, approvable: list[int]) -> Plant:
     people = People(store, clock, Passwords(memory_kib=64, passes=1))
     for role in Role:
         people.add(f"a-{role}", role, PHRASE)
@@ -200,7 +213,7 @@ def open_plant(folder: Path) -> tuple[Plant, contextlib.ExitStack]:
     auth = Authenticator(store, people, book, now_s=clock.monotonic_s, rate_hz=1e9, burst=1e9)
     auth.recorded_refusals._burst = 1e9
     app = app_of(store, clock, auth)
-    return Plant(store, url, clock, people, book, app, auth, approvable), stack
+    return Plant(store, url, clock, people, book, app, auth, approvable)
 
 
 def app_of(store: Store, clock: Hour, auth: Authenticator | None) -> FastAPI:

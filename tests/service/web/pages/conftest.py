@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.pages_world import Served, fill, served
+from tests.pages_world import Served, filled_once, served
 
 
 @pytest.fixture(scope="package")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with served(fill(tmp_path_factory.mktemp("screens"))) as one:
+    with served(filled_once(tmp_path_factory)) as one:
         yield one

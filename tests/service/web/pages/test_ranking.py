@@ -28,8 +28,8 @@ def found_in(doc: Doc) -> tuple[StoredPrediction, dict[str, MotionValue]]:
 
 
 @pytest.fixture(scope="module")
-def known() -> tuple[Machine, dict[str, object], list[Ranked]]:
-    site, _, _, doc = solved_campaign("m")
+def known(tmp_path_factory: pytest.TempPathFactory) -> tuple[Machine, dict[str, object], list[Ranked]]:
+    site, _, _, doc = solved_campaign(tmp_path_factory, "m")
     machine = machine_from_doc(json.loads(json.dumps(site.doc)))
     return machine, doc, ranking(*found_in(doc), machine)
 

@@ -28,8 +28,8 @@ from tests.pages_world import solved_campaign
 
 
 @pytest.fixture(scope="module")
-def known() -> KnownField:
-    site, _, solved, doc = solved_campaign("m")
+def known(tmp_path_factory: pytest.TempPathFactory) -> KnownField:
+    site, _, solved, doc = solved_campaign(tmp_path_factory, "m")
     del solved
     machine = machine_from_doc(json.loads(json.dumps(site.doc)))
     return KnownField(machine, *stored_prediction(StoredPrediction.read(doc["prediction"])), doc["prediction"]["scatter_mm"])
