@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from abbe.public.solution import solve as solve
     from abbe.service.campaign_data.campaign_folder import Campaign as Campaign
     from abbe.service.errors import AbbeError as AbbeError
-    from abbe.service.sequences.recipes.bar_recipes import Circle as Circle
-    from abbe.service.sequences.recipes.bar_recipes import Helix as Helix
+    from abbe.service.sequences.recipes.campaigns import discovery_campaign as discovery_campaign
     from abbe.service.sequences.recipes.campaigns import identification as identification
     from abbe.service.sequences.recipes.campaigns import verification as verification
-    from abbe.service.sequences.recipes.discovery_campaign import discovery_campaign as discovery_campaign
-    from abbe.service.sequences.recipes.laser_recipes import Diagonal as Diagonal
-    from abbe.service.sequences.recipes.laser_recipes import Linear as Linear
+    from abbe.service.sequences.recipes.recipe import Circle as Circle
+    from abbe.service.sequences.recipes.recipe import Diagonal as Diagonal
+    from abbe.service.sequences.recipes.recipe import Helix as Helix
+    from abbe.service.sequences.recipes.recipe import Linear as Linear
     from abbe.service.sequences.steps import CampaignPlan as CampaignPlan
 
 _WHERE = {
@@ -53,17 +53,17 @@ _WHERE = {
     "DiscoveryAnswer": "abbe.public.discovery",
     "Campaign": "abbe.service.campaign_data.campaign_folder",
     "CampaignPlan": "abbe.service.sequences.steps",
-    "Circle": "abbe.service.sequences.recipes.bar_recipes",
+    "Circle": "abbe.service.sequences.recipes.recipe",
     "Deviation": "abbe.public.solution",
-    "Diagonal": "abbe.service.sequences.recipes.laser_recipes",
+    "Diagonal": "abbe.service.sequences.recipes.recipe",
     "Effect": "abbe.models.effects.effect",
     "ErrorMotions": "abbe.models.functions.motions",
     "Estimate": "abbe.public.estimates",
     "Form": "abbe.models.effects.effect",
-    "Helix": "abbe.service.sequences.recipes.bar_recipes",
+    "Helix": "abbe.service.sequences.recipes.recipe",
     "SimulatedInstruments": "abbe.public.simulation",
     "Legendre": "abbe.models.functions.legendre",
-    "Linear": "abbe.service.sequences.recipes.laser_recipes",
+    "Linear": "abbe.service.sequences.recipes.recipe",
     "Machine": "abbe.models.machine",
     "NineTables": "abbe.models.compensation.tables",
     "Parameter": "abbe.models.effects.effect",
@@ -74,7 +74,7 @@ _WHERE = {
     "Solution": "abbe.public.solution",
     "Table": "abbe.models.functions.table",
     "discover": "abbe.public.discovery",
-    "discovery_campaign": "abbe.service.sequences.recipes.discovery_campaign",
+    "discovery_campaign": "abbe.service.sequences.recipes.campaigns",
     "identification": "abbe.service.sequences.recipes.campaigns",
     "read_campaign": "abbe.public.campaign",
     "read_errors": "abbe.public.campaign",

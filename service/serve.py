@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
-from abbe.service.campaigns.builtin_recipes import split_recipe_name
 from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board
@@ -51,6 +50,7 @@ from abbe.service.scheduler.job import CheckJobs
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import JobWatcher
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
+from abbe.service.sequences.recipes.campaigns import split_recipe_name
 from abbe.service.storage.engine import database_readable_by_others, parse_url
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView

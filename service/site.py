@@ -14,7 +14,7 @@ from abbe.service.config_schema import Limits, MachineFile
 from abbe.service.devices.urls import DeviceUrls, control_of
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.interlocks import Suspending, Watching
-from abbe.service.sequences.nc.settings import NcSettings
+from abbe.service.sequences.nc.write import NcSettings
 
 
 @dataclass(frozen=True, slots=True)

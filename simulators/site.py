@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from abbe.simulators.ballbar.port import BytePort, PtyPort, TcpPort
+from abbe.simulators.ballbar.port import PtyPort, TcpPort
 from abbe.simulators.ballbar.wire import BallbarWire
 from abbe.simulators.cnc.log import Command, TableAccess
 from abbe.simulators.cnc.wire import CncRegisters
@@ -49,6 +49,8 @@ class RtuLine:
 
 
 TICK_S = 0.005
+REST_S = 0.2
+"""Time between two ticks while nothing moves, streams or waits in the buffer: every request brings the world up to date anyway."""
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
 
 
@@ -59,9 +61,12 @@ class Site:
         self.world = World(scenario)
         self._scenario = scenario
         self._begin_s = 0.0
-        self._ticking: asyncio.TimerHandle | None = None
+        self._ticking: asyncio.Handle | None = None
+        self._resting = False
         self._links = link_dir
-        port: BytePort = PtyPort(self._link(BALLBAR_LINK)) if scenario.ballbar.transport == "pty" else TcpPort(scenario.ballbar.port)
+        port: PtyPort | TcpPort = (
+            PtyPort(self._link(BALLBAR_LINK)) if scenario.ballbar.transport == "pty" else TcpPort(scenario.ballbar.port)
+        )
         self._port = port
         self._plugged = False
         self.box = BallbarWire(self.world.ballbar, port, secrets.randbits(32), lambda: self.world.time_s)
@@ -96,21 +101,30 @@ class Site:
         """Close all wires and remove the links."""
         if self._ticking is not None:
             self._ticking.cancel()
+            self._ticking = None
         await self._port.close()
         await self._fixture.stop()
         await self._laser.stop()
         await self._cnc.stop()
 
     def advance(self) -> None:
-        """Bring the world up to wall time."""
+        """Bring the world up to wall time. Called before every request, which may set something in motion: a tick follows at once."""
+        self._advance()
+        if self._resting and self._ticking is not None:
+            self._ticking.cancel()
+            self._ticking = asyncio.get_running_loop().call_soon(self._tick)
+            self._resting = False
+
+    def _advance(self) -> None:
         self.world.advance(self._scenario.speed * (asyncio.get_running_loop().time() - self._begin_s))
 
     def _tick(self) -> None:
         """Advance and pass on the samples that are due, again and again."""
-        self.advance()
+        self._advance()
         self.box.flush()
         self._port.pump()
-        self._ticking = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+        self._resting = not (self.world.controller.moving or self.world.ballbar.rate_hz or self._port.backlog)
+        self._ticking = asyncio.get_running_loop().call_later(REST_S if self._resting else TICK_S, self._tick)
 
     def _received(self, data: bytes) -> None:
         self.advance()

@@ -18,8 +18,8 @@ from abbe.service.errors import AbbeError, MeasurementFault, PushNotBegun, Table
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control
-from abbe.service.sequences.recipes.bar_recipes import HelixPoints
 from abbe.service.sequences.recipes.campaigns import hemisphere
+from abbe.service.sequences.recipes.recipe import HelixPoints
 from abbe.service.sequences.steps import CampaignPlan, Point
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -18,12 +18,10 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Suspending, Watching, check_interlocks
 from abbe.service.sequences.journal import DONE, RUN, WAITS, Journal
 from abbe.service.sequences.needed import BEFORE_S
-from abbe.service.sequences.path_resume import PathRemainder
-from abbe.service.sequences.preconditions import ExpectedTable, check_expected
-from abbe.service.sequences.resume_plan import Attempt, ResumeTrail, anew, end_of, remounted, rest_of
+from abbe.service.sequences.resume_plan import Attempt, PathRemainder, ResumeTrail, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, ReadBar, RecordPath, TestPlan
-from abbe.service.sequences.waiting import may_suspend, paused, suspended
+from abbe.service.sequences.waiting import ExpectedTable, check_expected, may_suspend, paused, suspended
 from abbe.service.storage.store import Store
 
 BALLBAR = "ballbar"

@@ -12,7 +12,6 @@ from typing import Any
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.shielded import run_to_end
-from abbe.service.campaigns.builtin_recipes import RecipeSource
 from abbe.service.campaigns.campaign_run import (
     BarBreaks,
     CampaignRun,
@@ -35,14 +34,15 @@ from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, run_named
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
 from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.paths import warnings_of
-from abbe.service.sequences.preconditions import ExpectedTable
+from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import Attempt
 from abbe.service.sequences.runner import Runner, Tick
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
+from abbe.service.sequences.waiting import ExpectedTable
+from abbe.service.sequences.watch import IncidentNotes, incidents_noted, run_named
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

@@ -11,12 +11,12 @@ from datetime import date
 from pathlib import Path
 
 from abbe.drivers.links.urls import FixtureConsoleUrl, parse_url
-from abbe.service.campaigns.builtin_recipes import campaign_source, recipe_plan
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.sequences.check import dry_run_campaign, paced
 from abbe.service.sequences.needed import BALLBAR, LASER, check_configured, needed_by
+from abbe.service.sequences.recipes.campaigns import campaign_source, recipe_plan
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.flags import beam_is_good, is_zeroed
-from abbe.service.campaigns.builtin_recipes import RecipeSource
 from abbe.service.campaigns.campaign_run import (
     Confirm,
     Item,
@@ -32,9 +31,10 @@ from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
 from abbe.service.sequences.interlocks import check_interlocks, check_ours
 from abbe.service.sequences.journal import BEGUN, ENDED, HAND, RUN
-from abbe.service.sequences.preconditions import ExpectedTable, check_expected
+from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import anew, remounted
 from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.sequences.waiting import ExpectedTable, check_expected
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

@@ -21,7 +21,7 @@ def listen(
     accept_table: AcceptTable = False,
 ) -> None:
     """Listen to the laser while the operator runs the NC program of a recipe; its standstills become the readings."""
-    from abbe.service.campaigns import listen_campaign
+    from abbe.service.campaigns.listen import listen_campaign
     from abbe.service.cli.running import run_job
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
@@ -39,7 +39,7 @@ def listen(
 
     async def work(store: Store) -> None:
         async with ready_session(store, site, accept_table=accept_table) as session:
-            await listen_campaign.listen(session, store, site, plan, lambda text: typer.echo(text))
+            await listen_campaign(session, store, site, plan, lambda text: typer.echo(text))
 
     with Store.open(loaded.database_url) as store:
         run_job(work(store))

@@ -12,12 +12,12 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from abbe.service.campaigns.builtin_recipes import RecipeSource
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
     from abbe.service.domain.progress import ProgressSink
     from abbe.service.sequences.control import Control
+    from abbe.service.sequences.recipes.campaigns import RecipeSource
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
@@ -165,7 +165,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
 
 def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:
     """Return the source of a plan; it includes a recipe file's text, so that a resumed campaign does not need the file."""
-    from abbe.service.campaigns.builtin_recipes import RecipeSource
+    from abbe.service.sequences.recipes.campaigns import RecipeSource
     from abbe.service.sequences.recipes.recipe_file import recipe_source
 
     text = recipe_source(Path(recipe)) if recipe.endswith(".toml") else None

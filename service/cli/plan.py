@@ -31,8 +31,7 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
-    from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report
-    from abbe.service.campaigns.plan_instruments import read_instruments
+    from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report, read_instruments
     from abbe.service.cli.progress import display
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import form_of, write_document

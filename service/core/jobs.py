@@ -17,7 +17,6 @@ from typing import Any, Protocol
 
 import structlog
 
-from abbe.service.campaigns.builtin_recipes import split_recipe_name
 from abbe.service.channel.messages import MOST_JOBS, Answer, ConfirmPrompt, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
 from abbe.service.domain.bounds import TEXT, WORD
@@ -26,6 +25,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.job import Job, carry_out
 from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.recipes.campaigns import split_recipe_name
 
 log = structlog.get_logger("abbe.jobs")
 

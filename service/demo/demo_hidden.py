@@ -31,7 +31,7 @@ from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
 from abbe.service.errors import NotObservable, TableRefused
-from abbe.service.sequences.recipes.discovery_campaign import BACK, discovery_campaign, new_measurement
+from abbe.service.sequences.recipes.campaigns import BACK, discovery_campaign, new_measurement
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

@@ -15,8 +15,9 @@ from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run_campaign, paced
+from abbe.service.sequences.recipes.approach import as_point
 from abbe.service.sequences.recipes.campaigns import verification_helix
-from abbe.service.sequences.recipes.recipe import MIN_TURNS, Diagonal, Helix, Linear, Recipe, as_point
+from abbe.service.sequences.recipes.recipe import MIN_TURNS, Diagonal, Helix, Linear, Recipe
 from abbe.service.sequences.steps import CampaignPlan, TestPlan
 
 Maker = Callable[[Helix, str], list[Recipe]]

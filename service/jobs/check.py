@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
-from abbe.service.campaigns.builtin_recipes import recipe_plan
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.plausibility import INSTRUMENTS, ended_certificates
 from abbe.service.capture.live import LiveFeed
@@ -20,6 +19,7 @@ from abbe.service.domain.verification import CheckResult
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.needed import BALLBAR, LASER
+from abbe.service.sequences.recipes.campaigns import recipe_plan
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store

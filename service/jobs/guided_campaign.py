@@ -9,7 +9,6 @@ import asyncio
 from dataclasses import replace
 
 from abbe.models.compensation.tables import Predicted
-from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
 from abbe.service.campaigns.measure import MeasureOptions, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates
 from abbe.service.compensation.gate import check_promise
@@ -23,6 +22,7 @@ from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, make_p
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.needed import check_devices, needed_by
+from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
 from abbe.service.tables.base_table import read_base
 
 SOLVING = "all is measured, and nothing moves while it is solved"

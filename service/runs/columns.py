@@ -6,7 +6,7 @@ Start document:
 - of a ball-bar run ``rate_hz`` and ``path`` {``feed_mm_min``, ``direction``, ``points_mm``}; ``points_mm`` begins at the machine's position
   at the start of the path;
 - ``path.measured``: first and last point of ``points_mm`` between which readings count; without it all count;
-- ``path.pieces`` (run, to_mm) and ``path.offset_mm`` of a path that was interrupted and resumed (`abbe.service.sequences.path_resume`):
+- ``path.pieces`` (run, to_mm) and ``path.offset_mm`` of a path that was interrupted and resumed (`abbe.service.sequences.resume_plan`):
   ``points_mm`` is the rest of the path, and the readings of the interrupted runs belong to it up to those lengths.
 
 A ball-bar run whose ``setup`` states the number of ``samples`` per reading was read at standstill, point by point. It has no ``path``, and

@@ -31,7 +31,7 @@ AGAIN_S = 0.2
 
 
 class Journal(Protocol):
-    """Where checkpoints go."""
+    """Destination of checkpoints."""
 
     async def add(self, kind: str, **doc: Any) -> None:
         """Write a line; on return it is on disk."""

@@ -18,7 +18,7 @@ from abbe.service.errors import AbbeError, BarOutOfRange, MeasurementFault, RunI
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import check_interlocks
-from abbe.service.sequences.path_resume import PathProgress, PathRemainder, StretchComparison
+from abbe.service.sequences.resume_plan import PathProgress, PathRemainder, StretchComparison
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
 

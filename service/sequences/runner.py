@@ -17,10 +17,8 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
-from abbe.service.sequences.path_resume import PathProgress, PathRemainder
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_guard, record_path
-from abbe.service.sequences.preconditions import ExpectedTable
-from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, way_back
+from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back
 from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,
@@ -36,7 +34,7 @@ from abbe.service.sequences.steps import (
     Unmount,
     ZeroLaser,
 )
-from abbe.service.sequences.waiting import paused
+from abbe.service.sequences.waiting import ExpectedTable, paused
 from abbe.service.sequences.watch import NOTHING, Watch, watched
 
 # A ball-bar reading at standstill: the mean of a few samples that the box began after the axes had settled.

@@ -7,10 +7,10 @@ from typing import Annotated
 from fastapi import FastAPI, Header, HTTPException, Path, Request
 from fastapi.responses import JSONResponse, Response
 
-from abbe.service.campaigns.builtin_recipes import named, split_recipe_name
 from abbe.service.channel.messages import Answer, Steering
 from abbe.service.domain.job_state import JobState
 from abbe.service.queries.reader import json_value
+from abbe.service.sequences.recipes.campaigns import named, split_recipe_name
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.login.access import needs

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from abbe.service.campaigns.builtin_recipes import USUAL_HZ
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState
@@ -18,6 +17,7 @@ from abbe.service.queries.people import UserSummary
 from abbe.service.queries.proposals import ProposalSummary
 from abbe.service.queries.results import DiscoverySummary, SolutionSummary
 from abbe.service.queries.timetable import ScheduleState
+from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.web.catalogue import ErrorEntry
 
 LONGEST_RECIPE = 180

@@ -61,6 +61,11 @@ class PtyPort:
         """Room in the buffer; none while unplugged."""
         return 0 if self._serial is None else max(0, self._buffer_bytes - self._serial.backlog)
 
+    @property
+    def backlog(self) -> int:
+        """Bytes that the terminal has not taken yet."""
+        return 0 if self._serial is None else self._serial.backlog
+
     def send(self, data: bytes) -> None:
         """Send bytes."""
         if self._serial is not None:
@@ -101,6 +106,11 @@ class TcpPort:
         if self._writer is None:
             return 0
         return max(0, BUFFER_BYTES - self._writer.transport.get_write_buffer_size())
+
+    @property
+    def backlog(self) -> int:
+        """None: the transport passes its buffer on by itself."""
+        return 0
 
     def send(self, data: bytes) -> None:
         """Send bytes."""

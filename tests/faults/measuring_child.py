@@ -21,7 +21,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, Helix, Linear
-from abbe.service.sequences.recipes.setups import shared_setups
+from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store

@@ -24,7 +24,7 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
 from abbe.service.sequences.recipes import recipe as recipes
-from abbe.service.sequences.recipes.setups import shared_setups
+from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, TestPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store

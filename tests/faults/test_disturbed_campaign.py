@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear
-from abbe.service.sequences.recipes.setups import shared_setups
+from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from tests.experiments.campaigns.disturbed import MACHINE, both, summary
 

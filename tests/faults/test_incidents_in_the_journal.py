@@ -20,9 +20,9 @@ from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.cli.app import app
 from abbe.service.clock import SystemClock
 from abbe.service.sequences.control import State
-from abbe.service.sequences.incident_notes import IncidentNotes, incidents_noted, links_of
 from abbe.service.sequences.journal import ENDED, INCIDENT, StoreJournal, troubles
 from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.sequences.watch import IncidentNotes, incidents_noted, links_of
 from abbe.service.storage.store import Store
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario
@@ -117,7 +117,7 @@ async def test_a_cable_that_is_pulled_is_noted_with_its_run_and_as_not_over(plac
 
 
 async def test_a_locked_database_holds_up_no_link_and_no_end(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("abbe.service.sequences.incident_notes.LAST_LINES_S", 0.2)
+    monkeypatch.setattr("abbe.service.sequences.watch.LAST_LINES_S", 0.2)
     store, session = place.store, place.bench.session
     campaign = store.campaigns.add(store.machines.add("m", {}), "c", {})
     notes = IncidentNotes(StoreJournal(store, campaign), SystemClock())
@@ -143,7 +143,7 @@ async def test_a_locked_database_holds_up_no_link_and_no_end(place: Place, monke
 
 
 async def test_more_incidents_than_may_wait_are_counted_at_the_end_of_the_journal(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("abbe.service.sequences.incident_notes.MOST_WAITING", 3)
+    monkeypatch.setattr("abbe.service.sequences.watch.MOST_WAITING", 3)
     control = AtStep(3, lambda: [(link.note(LinkDown("laser", "read", "gone")), link.good()) for _ in range(5)])  # type: ignore[func-returns-value]
     link = links_of(place.bench.session)["laser"]
     await measure(place.bench.session, place.store, place.bench.site, CampaignPlan("c", (small("Helix"),)), options=MeasureOptions(control))

@@ -64,7 +64,6 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: reported now rather
         than at the first slot, at night.
     """
-    from abbe.service.campaigns.builtin_recipes import RECIPES, campaign_source
     from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
@@ -75,6 +74,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     from abbe.service.report.report import rules_of
     from abbe.service.scheduler.ready import Ready, look_at
     from abbe.service.sequences.check import dry_run_campaign, paced
+    from abbe.service.sequences.recipes.campaigns import RECIPES, campaign_source
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
     from abbe.service.tables.in_force import look_at_table
@@ -210,10 +210,10 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
 
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[Store], MeasureCampaign]:
     """Return how to run a full campaign that a person starts, given the service's store."""
-    from abbe.service.campaigns.builtin_recipes import campaign_source
     from abbe.service.clock import SystemClock
     from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext
+    from abbe.service.sequences.recipes.campaigns import campaign_source
 
     def on(store: Store) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> JobOutcome:
@@ -229,8 +229,8 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
 def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
     """Return the full campaigns that fit this machine: the built-in one, and the machine file's for alarms."""
-    from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, campaign_source
     from abbe.service.sequences.check import dry_run_campaign, paced
+    from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, campaign_source
 
     def fits(name: str) -> bool:
         try:
@@ -250,8 +250,8 @@ def _beside(machine_file: Path, name: str) -> str:
 
 def _fits(recipe: str, site: Site) -> bool:
     """Return whether a recipe's paths lie inside the machine's strokes."""
-    from abbe.service.campaigns.builtin_recipes import recipe_plan
     from abbe.service.sequences.check import dry_run_campaign
+    from abbe.service.sequences.recipes.campaigns import recipe_plan
 
     try:
         dry_run_campaign(site.machine, recipe_plan(recipe, site.machine), site.max_feed_mm_min)

@@ -1,20 +1,227 @@
-"""From a plan to the text of an NC program in one of the dialects."""
+"""From a plan to the text of an NC program: G-code (Siemens, Fanuc, LinuxCNC, plain ISO 6983) or Heidenhain conversational."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from abbe.models.machine import Machine
+from abbe.models.machine import AXES, Machine
 from abbe.models.paths.circles import PLANES
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.nc.blocks import Arc, Block, Dwell, Go, Program, Smooth, program
-from abbe.service.sequences.nc.gcode import DIALECTS, gcode
-from abbe.service.sequences.nc.heidenhain import heidenhain
-from abbe.service.sequences.nc.settings import NcSettings
+from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Halt, Program, Smooth, program
 from abbe.service.sequences.steps import CampaignPlan, Point
+
+USUAL_MEMORY_KIB: Mapping[str, float] = {"fanuc": 256.0, "iso": 256.0}
+"""Assumed program memory of a control without its own disk, where the machine file gives none."""
+
+
+@dataclass(frozen=True, slots=True)
+class NcSettings:
+    """``[nc]`` of the machine file: acceleration along the path, row of the tool table for the holder in the spindle (None: the operator
+    writes it), and program memory by dialect."""
+
+    acceleration_mm_s2: float = 500.0
+    heidenhain_tool: int | None = None
+    memory_kib: Mapping[str, float] = field(default_factory=dict)
+
+    def memory_of(self, dialect: str) -> float | None:
+        """Program memory in KiB; None: no relevant limit."""
+        return self.memory_kib.get(dialect, USUAL_MEMORY_KIB.get(dialect))
+
+
+LAST_NUMBER = 999
+"""Block numbers restart after N9990: old controllers take four digits."""
+PLANE_CODES = {"XY": "G17", "ZX": "G18", "YZ": "G19"}
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """G-code of one controller. ``start`` and ``end``: first and last lines; ``safe``: modes; ``smooth``, ``exact``: corners."""
+
+    title: str
+    suffix: str
+    start: tuple[str, ...]
+    safe: tuple[str, ...]
+    end: tuple[str, ...]
+    smooth: str
+    exact: str
+    dwell: str
+    comment: str
+    message: tuple[str, ...]
+    digits: int = 5
+    numbered: bool = False
+
+
+SIEMENS = Dialect(
+    "Siemens SINUMERIK", "mpf", (), ("G500 G90 G710 G94 G17 G40 D0", "M5"), ("MSG()", "M30"),
+    smooth="G64", exact="G60 G601", dwell="G4 F{seconds}", comment="; {text}", message=('MSG("{text}")', "M0"),
+)  # fmt: skip
+FANUC = Dialect(
+    "Fanuc", "nc", ("%", "O{number:04d} ({name})"), ("G21 G90 G94 G17 G40 G49 G80", "M5"), ("M30", "%"),
+    smooth="G64", exact="G61", dwell="G04 P{milliseconds}", comment="({text})", message=("M00 ({text})",), digits=4, numbered=True,
+)  # fmt: skip
+LINUXCNC = Dialect(
+    "LinuxCNC", "ngc", ("%",), ("G21 G90 G94 G17 G40 G49 G54 G92.1 G80", "M5"), ("M2", "%"),
+    smooth="G64 P0.001", exact="G61", dwell="G4 P{seconds}", comment="({text})", message=("(MSG, {text})", "M0"),
+)  # fmt: skip
+ISO = Dialect(
+    "ISO 6983", "iso", ("%",), ("G71 G90 G94 G17 G40", "M5"), ("M30", "%"),
+    smooth="G64", exact="G61", dwell="G04 X{seconds}", comment="({text})", message=("({text})", "M00"), numbered=True,
+)  # fmt: skip
+DIALECTS = {"siemens": SIEMENS, "fanuc": FANUC, "linuxcnc": LINUXCNC, "iso": ISO}
+
+
+def gcode(made: Program, dialect: Dialect, number: int = 1) -> str:
+    """Return the program text."""
+    writer = _Writer(dialect)
+    lines = [line.format(number=number, name=plain(made.name, dialect)[:30]) for line in dialect.start]
+    body = [_comment(dialect, f"{dialect.title} program written by Abbe"), *(_comment(dialect, text) for text in made.head)]
+    body += [*dialect.safe, dialect.exact]
+    for block in made.blocks:
+        body += writer.lines(block)
+    for k, line in enumerate(body, start=1):
+        lines.append(f"N{10 * ((k - 1) % LAST_NUMBER + 1)} {line}" if dialect.numbered and not line.startswith("(") else line)
+    return "\n".join([*lines, *dialect.end]) + "\n"
+
+
+def plain(text: str, dialect: Dialect) -> str:
+    """Text for old controllers: ASCII, no brackets or quotes, capitals for Fanuc and ISO."""
+    ascii_text = text.replace("µ", "u").encode("ascii", "replace").decode()
+    kept = "".join(c if c.isalnum() or c in " .,:;+-/=" else " " for c in ascii_text).replace(";", ",")
+    kept = " ".join(kept.split())
+    return kept.upper() if dialect is FANUC or dialect is ISO else kept
+
+
+def _comment(dialect: Dialect, text: str) -> str:
+    return dialect.comment.format(text=plain(text, dialect))
+
+
+class _Writer:
+    """Turns blocks into lines; keeps the modal state."""
+
+    def __init__(self, dialect: Dialect) -> None:
+        self._d = dialect
+        self._feed = 0.0
+        self._plane = "XY"
+
+    def lines(self, block: Block) -> list[str]:
+        match block:
+            case Comment(text):
+                return [_comment(self._d, text)]
+            case Halt(text):
+                return [line.format(text=plain(text, self._d)[:100]) for line in self._d.message]
+            case Dwell(seconds, _):
+                return [self._d.dwell.format(seconds=f"{seconds:.3f}", milliseconds=round(seconds * 1e3))]
+            case Smooth(on):
+                return [self._d.smooth if on else self._d.exact]
+            case Go(target, feed):
+                return [f"G1 {self._point(target)}{self._f(feed)}"]
+            case Arc():
+                return self._arc(block)
+
+    def _arc(self, arc: Arc) -> list[str]:
+        out = [] if arc.plane == self._plane else [PLANE_CODES[arc.plane]]
+        self._plane = arc.plane
+        centre = " ".join(f"{'IJK'[k]}{self._n(arc.centre_mm[k] - arc.start_mm[k])}" for k in sorted("XYZ".index(c) for c in arc.plane))
+        return [*out, f"{'G3' if arc.positive else 'G2'} {self._point(arc.target_mm)} {centre}{self._f(arc.feed_mm_min)}"]
+
+    def _f(self, feed_mm_min: float) -> str:
+        if feed_mm_min == self._feed:
+            return ""
+        self._feed = feed_mm_min
+        return f" F{feed_mm_min:.3f}".rstrip("0").rstrip(".") + ("." if self._d is FANUC else "")
+
+    def _point(self, p: Point) -> str:
+        return " ".join(f"{a}{self._n(v)}" for a, v in zip(AXES, p, strict=True))
+
+    def _n(self, value: float) -> str:
+        text = f"{value:.{self._d.digits}f}".rstrip("0")
+        return "0." if text in {"-0.", "0."} else text
+
+
+TOLERANCE_MM = 0.001
+
+
+def heidenhain(made: Program, tool: int | None = None) -> str:
+    """Return the program text; blocks are numbered from 0, as on the controller.
+
+    ``tool``: row of the tool table for the holder in the spindle. TOOL CALL sets the axis of the arcs' plane and the length. Only the
+    operator knows the row, and tool 0 would empty the spindle; without a row the program marks the place of the block and stops there.
+    """
+    name = "".join(c for c in plain(made.name, ISO) if c.isalnum())[:16] or "ABBE"
+    lines = [f"BEGIN PGM {name} MM", "; Heidenhain program written by Abbe", *(f"; {plain(text, ISO)}" for text in made.head)]
+    lines += ["CYCL DEF 7.0 DATUM SHIFT", "CYCL DEF 7.1 X+0", "CYCL DEF 7.2 Y+0", "CYCL DEF 7.3 Z+0"]
+    lines += _tool_call(tool)
+    lines += ["L M5"]
+    for block in made.blocks:
+        lines += _lines(block)
+    lines += ["L M30", f"END PGM {name} MM"]
+    return "\n".join(f"{k} {line}" for k, line in enumerate(lines)) + "\n"
+
+
+def _tool_call(tool: int | None) -> list[str]:
+    if tool is not None:
+        return [f"TOOL CALL {tool} Z"]
+    return [
+        "; WRITE TOOL CALL N Z IN PLACE OF THE NEXT BLOCK, N: THE ROW OF THE TOOL TABLE",
+        "; FOR THE HOLDER IN THE SPINDLE, L 0, R 0; NOT TOOL 0, WHICH EMPTIES THE SPINDLE",
+        "L M0",
+    ]
+
+
+def _lines(block: Block) -> list[str]:
+    match block:
+        case Comment(text):
+            return [f"; {plain(text, ISO)}"]
+        case Halt(text):
+            return [f"; {plain(text, ISO)}", "L M0"]
+        case Dwell(seconds, _):
+            return ["CYCL DEF 9.0 DWELL TIME", f"CYCL DEF 9.1 DWELL {seconds:.3f}"]
+        case Smooth(on):
+            return ["CYCL DEF 32.0 TOLERANCE", f"CYCL DEF 32.1 T{TOLERANCE_MM:g}" if on else "CYCL DEF 32.1"]
+        case Go(target, feed):
+            return [f"L {_point(target, 'XYZ')} R0 F{feed:.0f}"]
+        case Arc(plane, _, target, centre, positive, feed):
+            letters = "".join(sorted(plane))
+            return [f"CC {_point(centre, letters)}", f"C {_point(target, letters)} DR{'+' if positive else '-'} R0 F{feed:.0f}"]
+
+
+def _point(p: Point, letters: str) -> str:
+    return " ".join(f"{a}{v:+.4f}" for a, v in zip(AXES, p, strict=True) if a in letters)
+
+
+NAMES = (*DIALECTS, "heidenhain")
+
+
+@dataclass(frozen=True, slots=True)
+class NcProgram:
+    """Program text, run time, and a warning for the operator about its size."""
+
+    text: str
+    runtime: Runtime
+    size: str
+    warning: str = ""
+
+
+def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, settings: NcSettings | None = None) -> NcProgram:
+    """Return the NC program of a checked plan. Raises ConfigError for an unknown dialect."""
+    if dialect not in NAMES:
+        raise ConfigError(f"there is no NC dialect {dialect!r}", f"use one of: {', '.join(sorted(NAMES))}")
+    settings = settings or NcSettings()
+    arcs = ("XY",) if dialect == "heidenhain" else PLANES  # C runs in the plane across the tool's axis, which TOOL CALL names
+    made = program(name, plan, machine.stroke_mm, arcs)
+    pace = Pace(settings.acceleration_mm_s2)
+    took = runtime(made.blocks, pace)
+    made = replace(made, head=(*made.head, *_runtime_comments(took, pace)))
+    text = heidenhain(made, settings.heidenhain_tool) if dialect == "heidenhain" else gcode(made, DIALECTS[dialect])
+    size, blocks = len(text.encode()), text.count("\n")
+    memory = settings.memory_of(dialect)
+    warning = _too_long(dialect, size, memory) if memory is not None and size > memory * 1024.0 else ""
+    return NcProgram(text, took, f"{size} bytes, {blocks} blocks, {_minutes(made, took)}", warning)
+
 
 # The run time counts every block as a controller drives it, not the plan's length at full feed.
 
@@ -79,36 +286,6 @@ def _way_mm(block: Go | Arc, here: Point | None) -> float:
     first, last = (math.atan2(p[b] - block.centre_mm[b], p[a] - block.centre_mm[a]) for p in (block.start_mm, block.target_mm))
     turn = (last - first if block.positive else first - last) % (2.0 * np.pi)
     return float(turn * math.hypot(block.start_mm[a] - block.centre_mm[a], block.start_mm[b] - block.centre_mm[b]))
-
-
-NAMES = (*DIALECTS, "heidenhain")
-
-
-@dataclass(frozen=True, slots=True)
-class NcProgram:
-    """Program text, run time, and a warning for the operator about its size."""
-
-    text: str
-    runtime: Runtime
-    size: str
-    warning: str = ""
-
-
-def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, settings: NcSettings | None = None) -> NcProgram:
-    """Return the NC program of a checked plan. Raises ConfigError for an unknown dialect."""
-    if dialect not in NAMES:
-        raise ConfigError(f"there is no NC dialect {dialect!r}", f"use one of: {', '.join(sorted(NAMES))}")
-    settings = settings or NcSettings()
-    arcs = ("XY",) if dialect == "heidenhain" else PLANES  # C runs in the plane across the tool's axis, which TOOL CALL names
-    made = program(name, plan, machine.stroke_mm, arcs)
-    pace = Pace(settings.acceleration_mm_s2)
-    took = runtime(made.blocks, pace)
-    made = replace(made, head=(*made.head, *_runtime_comments(took, pace)))
-    text = heidenhain(made, settings.heidenhain_tool) if dialect == "heidenhain" else gcode(made, DIALECTS[dialect])
-    size, blocks = len(text.encode()), text.count("\n")
-    memory = settings.memory_of(dialect)
-    warning = _too_long(dialect, size, memory) if memory is not None and size > memory * 1024.0 else ""
-    return NcProgram(text, took, f"{size} bytes, {blocks} blocks, {_minutes(made, took)}", warning)
 
 
 def _minutes(made: Program, took: Runtime) -> str:

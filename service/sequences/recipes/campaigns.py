@@ -1,17 +1,28 @@
-"""Built-in campaigns, scaled to any machine's strokes.
+"""Built-in campaigns, scaled to any machine's strokes, and the sources of a campaign's plan. Nothing here reaches a device.
 
 The identification campaign lets the joint solution determine every error that nine tables can correct: helices about five centres,
 each axis on two opposite edges, step diagonals in two step orders (math.md 5.5: rank 67 of 67 for translations and one-tool angles).
-The verification uses positions that the identification does not use.
+The verification uses positions that the identification does not use. The campaign of the discovery demonstration separates most candidate
+effects in one session (effects.md 4).
 """
 
 from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Literal, Protocol
 
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS
-from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe, as_point
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.recipes.approach import as_point
+from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_source, recipe_text
 from abbe.service.sequences.steps import CampaignPlan, Point
 
 
@@ -58,3 +69,175 @@ def quick_check(machine: Machine, *, rate_hz: int = 100, name: str = "quick-chec
     recipes: list[Recipe] = [Helix("check-helix", "VB", "holdout", centre, radius, turns=3, rate_hz=rate_hz)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 10, "") for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+
+
+SLOW, MIDDLE, FAST = 1000.0, 2000.0, 3000.0
+STEPS, LINE_N = 12, 13
+JUDGED = "pnp"
+BACK = "check-back"
+CHORD_MM = 0.5
+"""The position of a sample on its path is known to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. By the area law the usual
+chords are 1 mm long at the equator and 3 mm at the pole, and run 0.9 and 10 um inside the sphere: misplaced readings scatter there, and a
+clean machine seems disturbed. Even chords of 0.4 mm run at most 0.24 um inside."""
+ROUND: tuple[Literal[1, -1], ...] = (1, -1)
+
+
+def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "discover") -> CampaignPlan:
+    """Helices at two feeds both ways about one origin, both ways about another, step diagonals; late repeats of the axes and first origin.
+
+    About 20 minutes of machine time for a 600 x 500 x 450 mm machine. A late helix of another feed and the second step order of a diagonal
+    have the role holdout: they share a mounting with fitted runs, so that only the model can cause their deviation.
+    """
+    first = _helix(machine, "A", (0.5, 0.5, 0.3), 0.6, rate_hz)
+    second = _helix(machine, "B", (0.34, 0.38, 0.2), 0.65, rate_hz)
+    recipes: list[Recipe] = _lines(machine, "early")
+    recipes += [*_series(first, "a", [(f, d, "identify") for f in (SLOW, FAST) for d in ROUND])]
+    recipes += _series(second, "b", [(MIDDLE, d, "identify") for d in ROUND])
+    for diagonal in DIAGONALS:
+        judged = diagonal == JUDGED
+        recipes.append(Diagonal(f"step-{diagonal}", f"D{diagonal}", "identify", diagonal, STEPS, "XYZ", unmount=not judged))
+        if judged:
+            recipes.append(Diagonal(f"judge-{diagonal}", f"D{diagonal}", "holdout", diagonal, STEPS, "ZYX", mount=False))
+    late = replace(first, setup_id="L")
+    recipes += _series(late, "late", [(MIDDLE, 1, "identify"), (SLOW, -1, "identify"), (0.5 * (MIDDLE + FAST), 1, "holdout")])
+    recipes += _lines(machine, "late")
+    return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+
+
+def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew") -> CampaignPlan:
+    """The verification, with its helix also run back slowly with the bar left in: the difference shows what changes while a bar hangs.
+
+    One helix alone cannot tell a constantly warm bar from a longer one.
+    """
+    plan = verification(machine, rate_hz=rate_hz, name=name)
+    check = replace(verification_helix(machine, rate_hz=rate_hz), chord_mm=CHORD_MM, even=True)
+    there = replace(check, unmount=False)
+    back = replace(check, label=BACK, feed_mm_min=SLOW, direction=-1, mount=False)
+    return CampaignPlan(name, (there.plan(machine), back.plan(machine), *plan.tests[1:]))
+
+
+def _lines(machine: Machine, when: str) -> list[Recipe]:
+    """One line per axis: its length shows growth during the session, independent of squareness."""
+    return [
+        Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, at_share=(0.5, 0.5), positions=LINE_N)
+        for a in range(len(machine.stroke_mm))
+    ]
+
+
+def _helix(machine: Machine, setup: str, rel: tuple[float, float, float], share: float, rate_hz: int) -> Helix:
+    centre, radius = hemisphere(machine, rel, share)
+    return Helix("", setup, "identify", centre, radius, turns=4, rate_hz=rate_hz, chord_mm=CHORD_MM, even=True)
+
+
+def _series(like: Helix, name: str, ways: list[tuple[float, Literal[1, -1], str]]) -> list[Recipe]:
+    """Consecutive helices with one mounting of the bar."""
+    last = len(ways) - 1
+    return [
+        replace(like, label=_label(name, feed, way), role=role, feed_mm_min=feed, direction=way, mount=k == 0, unmount=k == last)
+        for k, (feed, way, role) in enumerate(ways)
+    ]
+
+
+def _label(name: str, feed: float, way: int) -> str:
+    return f"{name}-{feed:.0f}-{'out' if way > 0 else 'back'}"
+
+
+IDENTIFICATION = "identification"
+"""The full campaign: not a check, and only with a person who mounts its set-ups."""
+USUAL_HZ = 100
+RATES_HZ = (50, 100, 200, 250, 500, 1000)
+"""Offered rates of the ball-bar; any other divisor of 1000 works, too."""
+_RATE = re.compile(r"(?P<name>.+) at (?P<rate>[1-9][0-9]{0,3}) Hz")
+
+
+class BuiltinRecipe(Protocol):
+    """A recipe that scales to a machine."""
+
+    def __call__(self, machine: Machine, *, rate_hz: int = ...) -> CampaignPlan:
+        """Return the plan with this ball-bar rate."""
+        ...
+
+
+RECIPES: dict[str, BuiltinRecipe] = {"quick-check": quick_check, "verification": verification}
+"""Recipes that end with a verdict, as a schedule needs it."""
+CAMPAIGNS: dict[str, BuiltinRecipe] = {IDENTIFICATION: identification, "verification": verification, "quick-check": quick_check}
+
+
+def named(recipe: str, rate_hz: int) -> str:
+    """Recipe name with its rate, as jobs and campaigns show it: ``quick-check at 1000 Hz``; omits the usual rate."""
+    return recipe if rate_hz == USUAL_HZ else f"{recipe} at {rate_hz} Hz"
+
+
+def split_recipe_name(name: str) -> tuple[str, int]:
+    """Split a name made by `named` into recipe and rate; a rate that does not divide 1000 stays part of the name."""
+    found = _RATE.fullmatch(name)
+    if found is None or 1000 % int(found["rate"]):
+        return name, USUAL_HZ
+    return found["name"], int(found["rate"])
+
+
+def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
+    """Return the plan of a built-in recipe; ``NAME at 500 Hz`` sets the ball-bar rate. Raises ConfigError for an unknown recipe."""
+    recipe, rate_hz = split_recipe_name(name)
+    if recipe not in RECIPES:
+        close = get_close_matches(recipe, RECIPES, n=1)
+        meant = f"did you mean {close[0]!r}? " if close else ""
+        raise ConfigError(f"there is no recipe {name!r}", f"{meant}use one of: {', '.join(sorted(RECIPES))}")
+    return RECIPES[recipe](machine, rate_hz=rate_hz)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecipeSource:
+    """Source of a campaign's plan. The journal keeps it, so that a resumed campaign needs no file.
+
+    ``helix``: ``X,Y,Z,RADIUS`` in mm instead of a recipe. ``text``: of a recipe file, which ``recipe`` names.
+    """
+
+    recipe: str
+    helix: str = ""
+    rate_hz: int = USUAL_HZ
+    text: str | None = None
+
+    def plan(self, machine: Machine) -> CampaignPlan:
+        """Return the campaign, named after its recipe.
+
+        Raises
+        ------
+        ConfigError
+            The recipe is unknown, the rate does not divide 1000, or helix or file is not valid.
+        """
+        if self.rate_hz < 1 or 1000 % self.rate_hz:
+            raise ConfigError(f"rate {self.rate_hz} Hz does not divide 1000", "use 1000, 500, 250, 200, 125, 100, 50 ...")
+        if self.helix:
+            return self._helix(machine)
+        if self.text is not None:
+            name, recipes = parse_recipe(self.text, self.recipe)
+            return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+        if self.recipe not in CAMPAIGNS:
+            raise ConfigError(f"there is no recipe {self.recipe!r}", f"use one of: {', '.join(CAMPAIGNS)}, or a FILE.toml")
+        return CAMPAIGNS[self.recipe](machine, rate_hz=self.rate_hz)
+
+    def _helix(self, machine: Machine) -> CampaignPlan:
+        try:
+            x, y, z, radius = numbers = tuple(float(v) for v in self.helix.split(","))
+            if not all(map(math.isfinite, numbers)):
+                raise ValueError(self.helix)
+        except ValueError:
+            raise ConfigError(f"--helix {self.helix!r} is not X,Y,Z,RADIUS", "for example --helix 300,250,100,150") from None
+        wanted = Helix("helix", "B1", "identify", (x, y, z), radius, rate_hz=self.rate_hz)
+        recipe_text("helix", (wanted,))  # applies the limits of recipe files
+        return CampaignPlan("helix", (wanted.plan(machine),))
+
+
+def campaign_source(name: str, folder: Path) -> RecipeSource:
+    """Return the source of a full campaign: ``identification``, optionally with its rate, or a recipe file in the folder.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read.
+    """
+    recipe, rate_hz = split_recipe_name(name)
+    if recipe == IDENTIFICATION:
+        return RecipeSource(recipe=recipe, rate_hz=rate_hz)
+    return RecipeSource(recipe=name, text=recipe_source(folder / name))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from fastapi import FastAPI
 
-from abbe.service.campaigns.builtin_recipes import RECIPES
 from abbe.service.queries.timetable import schedule_state
+from abbe.service.sequences.recipes.campaigns import RECIPES
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.catalogue import entries

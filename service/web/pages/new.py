@@ -10,8 +10,8 @@ from typing import Annotated
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse
 
-from abbe.service.campaigns.builtin_recipes import USUAL_HZ
 from abbe.service.channel.messages import RulesSummary
+from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs

@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.campaigns.builtin_recipes import IDENTIFICATION, RATES_HZ, RECIPES, named, recipe_plan, split_recipe_name
 from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.dry_run_page import picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign
-from abbe.service.sequences.recipes.campaigns import identification
+from abbe.service.sequences.recipes.campaigns import (
+    IDENTIFICATION,
+    RATES_HZ,
+    RECIPES,
+    identification,
+    named,
+    recipe_plan,
+    split_recipe_name,
+)
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MountLaser, TestPlan
 from abbe.service.site import machine_from_doc
 

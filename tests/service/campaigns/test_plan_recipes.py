@@ -13,16 +13,14 @@ from abbe.models.paths.lines import DIAGONALS
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
 from abbe.models.planning.plan import PlanStep
-from abbe.service.campaigns.plan import describe, plan_for, plan_report, recipe_of
-from abbe.service.campaigns.plan_instruments import read_instruments
+from abbe.service.campaigns.plan import describe, plan_for, plan_report, read_instruments, recipe_of
 from abbe.service.cli.app import app
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.rendering.document_page import document_html
 from abbe.service.sequences.check import dry_run, dry_run_campaign
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
-from abbe.service.sequences.recipes.recipe_file import parse_recipe, read_recipe, recipe_text
-from abbe.service.sequences.recipes.setups import shared_setups
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, read_recipe, recipe_text, shared_setups
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
 from abbe.service.site import Site, machine_doc
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from abbe.service.campaigns import listen_campaign
+from abbe.service.campaigns import listen as listen_module
 from abbe.service.capture import ingest as ingest_module
 from abbe.service.capture import recorder as recorder_module
 from abbe.service.capture.settings import CaptureSettings, segment_path
@@ -71,12 +71,12 @@ async def test_a_listened_run_whose_samples_the_database_lacks_stays_open(store:
         return {"mounted_us": 0}
 
     for name, value in {"start_campaign": begin, "start_document": document, "listen_to": listening}.items():
-        monkeypatch.setattr(listen_campaign, name, value)
+        monkeypatch.setattr(listen_module, name, value)
     for name in ("dry_run_campaign", "planned_readings"):
-        monkeypatch.setattr(listen_campaign, name, lambda *words: None)
+        monkeypatch.setattr(listen_module, name, lambda *words: None)
     test = SimpleNamespace(label="r01", test="laser", role="identify", setup={"setup_id": "L1"}, steps=())
     with pytest.raises(StoreError, match="did not take all samples"):
-        await listen_campaign.listen(None, store, SITE, SimpleNamespace(name="c", tests=(test,)), print)  # type: ignore[arg-type]
+        await listen_module.listen_campaign(None, store, SITE, SimpleNamespace(name="c", tests=(test,)), print)  # type: ignore[arg-type]
     go.set()
     (run,) = store.runs.all()
     assert run.status == "running"

@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 
 from abbe.drivers.api import Condition
-from abbe.service.campaigns.builtin_recipes import RecipeSource, campaign_source
 from abbe.service.campaigns.campaign_run import plan_hash
 from abbe.service.cli.administration.serve import _campaigns
 from abbe.service.clock import SystemClock
@@ -27,6 +26,7 @@ from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, 
 from abbe.service.jobs import guided_campaign as work
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.recipes.campaigns import RecipeSource, campaign_source
 from abbe.service.sequences.recipes.recipe import Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.sequences.steps import CampaignPlan

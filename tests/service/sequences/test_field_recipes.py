@@ -13,7 +13,7 @@ from abbe.models.paths.lines import FACES, cycles_of, face_ends, target_shares
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run, dry_run_campaign
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
-from abbe.service.sequences.recipes.setups import shared_setups
+from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, ReadBar, ReadLaser, RecordPath, Unmount
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))

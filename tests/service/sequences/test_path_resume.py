@@ -13,9 +13,17 @@ from hypothesis import strategies as st
 from abbe.drivers.api import BarSample, Condition, ControllerStatus
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import ReadProgress, RunPiece, arc_of
-from abbe.service.sequences.path_resume import SAME_MM, STEADY_MM, PathProgress, PathRemainder, StretchComparison, rest_of_path
 from abbe.service.sequences.recipes.recipe import Circle
-from abbe.service.sequences.resume_plan import rest_of, way_back
+from abbe.service.sequences.resume_plan import (
+    SAME_MM,
+    STEADY_MM,
+    PathProgress,
+    PathRemainder,
+    StretchComparison,
+    rest_of,
+    rest_of_path,
+    way_back,
+)
 from abbe.service.sequences.steps import MountBar, RecordPath
 from tests.faults.sequencer_world import MACHINE
 from tests.pretended_status import controller_status

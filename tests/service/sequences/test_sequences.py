@@ -159,7 +159,7 @@ def test_a_path_the_controller_cannot_hold_is_refused_before_anything_moves():
 
 
 def test_a_discovery_campaign_s_helices_stay_within_a_quarter_of_a_micrometre_of_their_sphere():
-    from abbe.service.sequences.recipes.discovery_campaign import BACK, discovery_campaign, new_measurement
+    from abbe.service.sequences.recipes.campaigns import BACK, discovery_campaign, new_measurement
 
     for plan in discovery_campaign(MACHINE).tests:
         for step in plan.steps:

@@ -13,8 +13,7 @@ from abbe.models.paths.circles import way_on_sphere
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run
 from abbe.service.sequences.recipes.recipe import Circle
-from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text
-from abbe.service.sequences.recipes.setups import shared_setups
+from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text, shared_setups
 from abbe.service.sequences.resume_plan import end_of, remounted, rest_of
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
 

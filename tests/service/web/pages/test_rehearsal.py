@@ -8,11 +8,11 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from abbe.service.campaigns.builtin_recipes import RATES_HZ, named, recipe_plan, split_recipe_name
 from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.clock import SystemClock
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run_campaign
+from abbe.service.sequences.recipes.campaigns import RATES_HZ, named, recipe_plan, split_recipe_name
 from abbe.service.site import machine_from_doc
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import add_jobs
