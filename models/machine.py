@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -115,3 +115,8 @@ def levers_mm(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> 
     if tool.shape not in ((3,), (travel.shape[0], 3)):
         raise ValueError(f"tool_mm: expected shape (3,) or ({travel.shape[0]}, 3), got {tool.shape}")
     return travel + (tool[:, None, :] if tool.ndim == 2 else tool) - machine.pivots_mm[None]
+
+
+def with_tool(machine: Machine, tool_mm: F1 | None) -> Machine:
+    """The machine with another tool, for rule G's levers; None: its own."""
+    return machine if tool_mm is None else replace(machine, tool_mm=tool_mm)

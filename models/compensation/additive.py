@@ -14,10 +14,10 @@ import numpy as np
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term, legendre_values
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.volumetric import volume_grid
 
 DIAGONAL_WEIGHT = 1.0
 """Weight of the four body diagonals together against that of the volume."""

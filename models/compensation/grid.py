@@ -16,14 +16,12 @@ from abbe.models.compensation.distances import Pairs, random_pairs
 from abbe.models.compensation.interpolation import fit_operator, fit_positions, trilinear
 from abbe.models.compensation.tables import check_unit, grid_positions
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import RigidFree, rigid_design
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.uncertainty.frame import RigidFree
 from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.mask import compensable_mask, unseen_mm
-from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.prediction import compensable_mask, predict_deviation, unobserved_mm
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
-from abbe.models.volumetric import rigid_design
 
 # Nodes whose deviation is smaller than its uncertainty are not compensated; this section treats the border to the others.
 #
@@ -197,15 +195,15 @@ def grid_table(
 def compensable_nodes(
     solution: JointSolution, counts: tuple[int, int, int], *, inputs: StatedInputs | None = None, k: float | None = None
 ) -> Mask:
-    """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.mask`), shape ``counts``.
+    """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.prediction`), shape ``counts``.
 
     All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
-    A node is not compensated either where the part that no reading shows may exceed the deviation (`abbe.models.uncertainty.mask`).
+    A node is not compensated either where the part that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`).
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)
     prediction = predict_deviation(error_sources(solution, inputs), points, frame=frame)
-    seen = unseen_mm(solution, points, frame) <= np.linalg.norm(prediction.deviation_mm, axis=1)
+    seen = unobserved_mm(solution, points, frame) <= np.linalg.norm(prediction.deviation_mm, axis=1)
     return np.asarray((compensable_mask(prediction, k=k).points & seen).reshape(counts), dtype=bool)
 
 

@@ -21,14 +21,13 @@ from abbe.models.arrays import F1, F2
 from abbe.models.compensation.tables import grid_positions
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.geometry.bases import term_values
-from abbe.models.geometry.chain import design, deviation_mm
-from abbe.models.geometry.jacobian import squareness_motions
+from abbe.models.geometry.chain import design, deviation_mm, squareness_motions
+from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.solvers.assessment import motions_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.parameters import observable_motions
 from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
-from abbe.models.volumetric import rigid_design, volume_grid
 
 NODES = 7
 RANK_TOLERANCE = 1e-7

@@ -14,12 +14,11 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.compensation.additive import additive_design
 from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import RigidFree, remove_rigid, rigid_design, volume_grid
 from abbe.models.machine import AXES, Machine
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.uncertainty.frame import RigidFree
 from abbe.models.uncertainty.prediction import budget_over, predict_deviation
 from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
-from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.case import Case
 from abbe.models.effects.path import Path
 from abbe.models.geometry.bases import Term, smooth_terms, term_values
-from abbe.models.machine import Machine
+from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import LOST, AxisPlaces, SetupUnknowns, linearise, predict, with_tool
-from abbe.models.solvers.observe_setup import bar_length_name
+from abbe.models.solvers.observe import LOST, AxisPlaces, SetupUnknowns, bar_length_name, linearise, predict
 from abbe.models.solvers.priors import Priors, smooth_shapes, term_prior_sd
 
 ORDER = 14

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from abbe.models.arrays import F2, F3, F4
 from abbe.models.functions.motions import ErrorMotions
-from abbe.models.geometry.jacobian import exact_jacobian, motion_jacobian
+from abbe.models.geometry.chain import exact_jacobian, motion_jacobian
 from abbe.models.machine import Machine
 
 TOLERANCE = 1e-6

@@ -112,6 +112,6 @@ def iso_motions(errors: YangErrors, slide_mm: F2) -> F3:
 def iso_squareness(sxy: float, sxz: float, syz: float) -> dict[str, float]:
     """Squareness of the paper under ISO names, rad: C0Y = +Sxy, B0Z = -Sxz, A0Z = +Syz (math.md 1).
 
-    The paper's datum is the Z line, ours the X line: maps agree after a rigid rotation only (`abbe.models.volumetric.remove_rigid`).
+    The paper's datum is the Z line, ours the X line: maps agree after a rigid rotation only (`abbe.models.geometry.volume.remove_rigid`).
     """
     return {"C0Y": sxy, "B0Z": -sxz, "A0Z": syz}

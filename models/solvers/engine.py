@@ -11,14 +11,12 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term
 from abbe.models.machine import Machine
-from abbe.models.solvers import robust
-from abbe.models.solvers.components import ComponentPosterior, Components, blend, cautious, estimate, fit_length, posterior
+from abbe.models.solvers.components import ComponentPosterior, Components, blend, cautious, estimate, fit_length, folds, posterior
 from abbe.models.solvers.information import I1, KINDS, Grams, InformationSums, PlannedReadings, grams, sums, total
 from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setup_unknowns
-from abbe.models.solvers.order import folds
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
-from abbe.models.solvers.residual_tests import inflation
+from abbe.models.solvers.residuals import inflation, leverage, outlier_threshold, outlier_weights, robust_scale
 
 # Noise of an instrument from its repeats, before any model is fitted.
 
@@ -175,7 +173,7 @@ def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
     gram, measured, sizes = grams(r), problem.measured, problem.sizes
     x, weight = np.zeros(len(problem.names)), np.ones(len(measured))
     c = Components(np.zeros(len(sizes.names)), np.zeros(len(KINDS)))
-    limit = robust.threshold(len(measured))
+    limit = outlier_threshold(len(measured))
     dirty = False
     for step in range(ROUNDS):
         z = (measured - problem.predicted(sizes.typical * x)) / problem.sigma + r.a @ x
@@ -201,12 +199,12 @@ def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
 
 
 def _robust_scale(size: F1, kind: I1) -> F1:
-    return np.array([robust.scale(size[kind == k]) if (kind == k).any() else 1.0 for k in range(len(KINDS))])
+    return np.array([robust_scale(size[kind == k]) if (kind == k).any() else 1.0 for k in range(len(KINDS))])
 
 
 def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
     """First gently (Huber, when something is grossly wrong at all), so that a bad start rejects nothing good; then redescending."""
-    hard = robust.weights(size, limit)
+    hard = outlier_weights(size, limit)
     if gentle and (hard == 0.0).any():
         return np.asarray(np.minimum(1.0, HUBER / np.maximum(np.abs(size), HUBER)))
     return hard
@@ -217,7 +215,7 @@ def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, siz
     information, _, _ = blend(whole.turned(sizes.root, sizes.blocks), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
     low = linalg.cholesky(information, lower=True)
-    h = robust.leverage(problem.readings.a, linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
+    h = leverage(problem.readings.a, linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
     return np.asarray(np.sqrt(np.maximum(1.0 - h / np.exp(c.eta)[problem.readings.kind], 0.05)))
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.geometry.chain import design
-from abbe.models.machine import Machine
+from abbe.models.machine import Machine, with_tool
+from abbe.models.solvers.components import RIGID6, OrderChoice, choose, term_levels
 from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, build, expected_noise, settle
 from abbe.models.solvers.identifiability import Identifiability, combinations_of, taking_part
 from abbe.models.solvers.information import KINDS, total
@@ -23,11 +24,9 @@ from abbe.models.solvers.least_squares import ParameterEstimate
 from abbe.models.solvers.observability.parameters import hidden_free
 from abbe.models.solvers.observability.rank import campaign_columns, compressed, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import SetupUnknowns, with_tool
-from abbe.models.solvers.order import RIGID6, OrderChoice, choose, term_levels
+from abbe.models.solvers.observe import SetupUnknowns
 from abbe.models.solvers.priors import Priors
-from abbe.models.solvers.residual_tests import ResidualTest, residual_tests
-from abbe.models.solvers.robust import Outlier
+from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
 HIGHEST_ORDER = 12
 """Error motions of this order are still solved for, whatever order the runs support: the ones above as nuisance, held by their prior."""

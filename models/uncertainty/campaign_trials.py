@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.volume import RigidFree, unit_deviation
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observe import predict
 from abbe.models.uncertainty.distributions import NORMAL, Distribution
-from abbe.models.uncertainty.frame import RigidFree, field
 from abbe.models.uncertainty.monte_carlo import Draw
 from abbe.models.uncertainty.sources import ErrorSources, Response, response
 
@@ -188,5 +188,5 @@ def campaign_trials(
         raise ValueError(
             f"campaign trials: {len(points_mm)} points need too much memory, at most {MOST_POINTS}: work them in parts, same seed"
         )
-    d = field(sources.solution.machine, sources.terms, points_mm, tool_mm, frame)
+    d = unit_deviation(sources.solution.machine, sources.terms, points_mm, tool_mm, frame)
     return CampaignTrials(sources, response(sources.solution), d.reshape(-1, d.shape[2]), distributions or {})

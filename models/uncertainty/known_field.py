@@ -12,8 +12,8 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term
+from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.models.machine import Machine
-from abbe.models.uncertainty.frame import field, volume_frame
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class KnownField:
 
     def per_unit(self, points_mm: F2) -> F3:
         """Deviation per unit of each coefficient, best-fit rigid motion over the strokes removed, shape (m, 3, P)."""
-        return field(self.machine, self.terms, points_mm, None, volume_frame(self.machine))
+        return unit_deviation(self.machine, self.terms, points_mm, None, volume_frame(self.machine))
 
     def part(self, motions: Iterable[str]) -> KnownField:
         """Only some motions, with what is known of them; ValueError for one that is not there."""

@@ -16,10 +16,10 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
 from abbe.models.uncertainty.known_field import KnownField
-from abbe.models.volumetric import volume_grid
 
 DRAWS = 600
 """Draws that determine a standard uncertainty to 3 %."""

@@ -12,8 +12,8 @@ from functools import partial
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import AXES
-from abbe.models.volumetric import remove_rigid, volume_grid
 from abbe.service.formats.controls import ControlModel
 from abbe.service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable, correction_at

@@ -15,8 +15,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2, F4
 from abbe.models.compensation.interpolation import trilinear
 from abbe.models.functions.motions import PLACES, SQUARENESS
-from abbe.models.geometry.chain import deviation_mm
-from abbe.models.geometry.jacobian import squareness_motions
+from abbe.models.geometry.chain import deviation_mm, squareness_motions
 from abbe.models.machine import AXES, Machine
 
 Lookup = Literal["command", "corrected"]

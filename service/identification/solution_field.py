@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.uncertainty.coverage import apart_from_zero
 from abbe.models.uncertainty.known_field import KnownField, field_map
-from abbe.models.volumetric import volume_grid
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotObservable, Unusable

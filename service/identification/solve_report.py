@@ -9,14 +9,21 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
+from abbe.models.geometry.volume import volume_frame, volume_grid
 from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.robust import Outlier
-from abbe.models.uncertainty.frame import volume_frame
-from abbe.models.uncertainty.mask import CompensableMask, compensable_mask
-from abbe.models.uncertainty.prediction import Budget, BudgetLine, Prediction, budget_over, predict_deviation, worst_point
+from abbe.models.solvers.residuals import Outlier
+from abbe.models.uncertainty.prediction import (
+    Budget,
+    BudgetLine,
+    CompensableMask,
+    Prediction,
+    budget_over,
+    compensable_mask,
+    predict_deviation,
+    worst_point,
+)
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
-from abbe.models.volumetric import volume_grid
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, versions
 from abbe.service.domain.document import Doc
 from abbe.service.domain.machine_object import Point

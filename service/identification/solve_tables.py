@@ -9,8 +9,8 @@ import numpy as np
 from abbe.models.arrays import F2
 from abbe.models.compensation.achievable import achievable
 from abbe.models.compensation.grid import GridTable, compensable_nodes, grid_table, nodes_mm, quantise_grid
+from abbe.models.geometry.volume import volume_frame
 from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
-from abbe.models.uncertainty.frame import volume_frame
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from abbe.models.uncertainty.prediction import worst_point
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow

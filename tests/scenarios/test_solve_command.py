@@ -7,7 +7,7 @@ import tarfile
 import numpy as np
 import pytest
 
-from abbe.models.uncertainty.frame import field, volume_frame
+from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.domain.solution_file import SolutionFile, StoredPrediction
@@ -109,7 +109,7 @@ def test_json_keeps_to_its_schema_and_holds_the_truth(abbe, folder):
     assert worst["expanded_vector_um"] >= max(worst["expanded_um"])
     machine = machine_from_doc(doc["machine"])
     terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
-    field_at = field(machine, terms, np.array([worst["at_mm"]]), None, volume_frame(machine))[0]
+    field_at = unit_deviation(machine, terms, np.array([worst["at_mm"]]), None, volume_frame(machine))[0]
     assert field_at @ coefficients * 1e3 == pytest.approx(worst["deviation_um"], abs=1e-6)
     assert np.sqrt(np.diag(field_at @ covariance @ field_at.T)) * 1e3 == pytest.approx(worst["u_um"], rel=0.01)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.geometry.jacobian import motion_jacobian, squareness_jacobian
+from abbe.models.geometry.chain import motion_jacobian, squareness_jacobian
 from abbe.models.geometry.propagation import checked_covariance
 from abbe.models.machine import Machine
 from abbe.models.notation.pahk import PahkType, pahk_machine, parameter_signs, squareness_slopes

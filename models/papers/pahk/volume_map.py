@@ -9,10 +9,10 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
 from abbe.models.notation.pahk import PahkType, pahk_machine
 from abbe.models.papers.pahk.tables import ParameterTables
-from abbe.models.volumetric import volume_grid
 
 Form = Literal["first", "vector", "zyx", "small"]
 """First order (rule G), or the exact chain with one of the rotations of `abbe.models.geometry.chain.exact_deviation_mm`."""

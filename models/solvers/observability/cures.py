@@ -14,7 +14,7 @@ from scipy import linalg
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
-from abbe.models.machine import AXES, Machine
+from abbe.models.machine import AXES, Machine, with_tool
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.identifiability import project_out
@@ -29,8 +29,7 @@ from abbe.models.solvers.observability.rank import (
     with_knowledge,
 )
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import SetupUnknowns, setup_unknowns, with_tool
-from abbe.models.solvers.observe_setup import SAME_PLACE_MM, straight_line_of
+from abbe.models.solvers.observe import SAME_PLACE_MM, SetupUnknowns, setup_unknowns, straight_line_of
 from abbe.models.solvers.priors import Priors
 
 # Contents of a campaign: a cause states a fact about its runs, and a cure proposes something that it lacks.

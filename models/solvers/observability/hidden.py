@@ -11,13 +11,12 @@ from scipy import linalg
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
-from abbe.models.machine import AXES, Machine
+from abbe.models.machine import AXES, Machine, with_tool
 from abbe.models.solvers.identifiability import RANK_TOLERANCE, sparse_rows
 from abbe.models.solvers.least_squares import singular_values, svd
 from abbe.models.solvers.observability.cures import Addition, CampaignLayout, CureTrial, best_sequence, trials
 from abbe.models.solvers.observability.rank import ObservedInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
-from abbe.models.solvers.observe import with_tool
 
 LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
 """Largest sets of motions that are all tried for hidden combinations: among all orders, and among orders up to LOW (a slope of an angle

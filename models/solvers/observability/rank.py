@@ -24,8 +24,7 @@ from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
 from abbe.models.solvers.least_squares import svd
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import SetupUnknowns, run_design
-from abbe.models.solvers.observe_setup import NEAR_BEAM, STRAIGHT_MM, bar_length_name, straight_line_of
+from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, bar_length_name, run_design, straight_line_of
 
 BAR_TRAVEL_MM = 1.0
 """Measuring range of a usual ball-bar to either side: all intended positions lie within it of the nominal length."""

@@ -15,8 +15,8 @@ from scipy import linalg
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.volumetric import rigid_design, volume_grid
 
 INNER = 0.8
 NODES = 11
@@ -119,7 +119,7 @@ def frame_free_design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2, re
 
 
 def _rigid_about(points_mm: F2, centre_mm: F1) -> F3:
-    """As `abbe.models.volumetric.rigid_design`, about a given centre instead of the points' own."""
+    """As `abbe.models.geometry.volume.rigid_design`, about a given centre instead of the points' own."""
     out = np.zeros((points_mm.shape[0], 3, 6))
     out[:, :, :3] = np.eye(3)
     for k in range(3):

@@ -8,6 +8,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import ErrorArrays, monomials
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.papers.wang.experiments import WangPlan, distance_errors_mm, interpolated_mm, problem, readings
 from abbe.models.papers.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm
 from abbe.models.papers.wang.model import displacement_eq11, exact_positions_mm, monomial_field
@@ -15,7 +16,6 @@ from abbe.models.papers.wang.squareness import AcuteSquareness, diagonal_totals_
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.models.solvers.designs import ranks, shortest_solution
 from abbe.models.solvers.step_diagonal import closure_mm, demeaned, increments, squareness_contrast, wang_eq7, wang_four
-from abbe.models.volumetric import volume_grid
 from abbe.service.errors import FileFormatError
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import LAYOUT, VectorCase

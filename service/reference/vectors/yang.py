@@ -10,6 +10,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import Kind, Monomial, monomials
 from abbe.models.geometry.chain import deviation_mm
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
 from abbe.models.papers.yang.ballbar import measured_mm, reading_eq6, reading_eq8
 from abbe.models.papers.yang.complete import delta_eq1, delta_exact, monomial_errors, monomial_field
@@ -29,7 +30,6 @@ from abbe.models.papers.yang.origins import origin_plan
 from abbe.models.papers.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
 from abbe.models.paths.helix import Law, helix_points
 from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution
-from abbe.models.volumetric import volume_grid
 from abbe.service.errors import FileFormatError
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import LAYOUT, VectorCase

@@ -9,9 +9,8 @@ import numpy as np
 from markupsafe import Markup
 
 from abbe.models.arrays import F1, F2
+from abbe.models.geometry.volume import unit_deviation, volume_frame, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.uncertainty.frame import field, volume_frame
-from abbe.models.volumetric import volume_grid
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction, stored_solution
@@ -73,7 +72,7 @@ def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], ma
     """Every motion of a stored solution, largest contribution first; ``machine``: nominal geometry of the measured machine."""
     terms, coefficients, covariance = stored_prediction(prediction)
     points = volume_grid(machine.stroke_mm, NODES)
-    design = field(machine, terms, points, None, volume_frame(machine))
+    design = unit_deviation(machine, terms, points, None, volume_frame(machine))
     out = []
     for name in dict.fromkeys(t.motion for t in terms):
         at = [k for k, t in enumerate(terms) if t.motion == name]

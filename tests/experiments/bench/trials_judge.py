@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.models.volumetric import remove_rigid
+from abbe.models.geometry.volume import remove_rigid
 from tests.experiments.bench import trials_case as cases
 from tests.experiments.bench.trials_contestants import TRIAL_CASES, Result
 

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 
 from abbe.models.compensation.grid import compensable_nodes, grid_table, nodes_mm
+from abbe.models.geometry.volume import RigidFree, remove_rigid
 from abbe.models.solvers.joint import JointSolution, solve_joint
-from abbe.models.uncertainty.frame import RigidFree
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.volumetric import remove_rigid
 from tests.experiments.campaigns.population import Case, Kind, draw_case
 from tests.experiments.campaigns.traces import Bent, Traces, traces, typical_size
 

@@ -12,10 +12,10 @@ from abbe.models.compensation.additive import additive
 from abbe.models.compensation.summary import mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import remove_rigid, rigid_design, volume_grid
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 from tests.models.solvers.truth import MACHINE, SIGMA, Truth, linear_parameters
 
 SEEDS = range(1, 11) if os.environ.get("ABBE_TEST_LONG") == "1" else range(1, 5)

@@ -5,9 +5,9 @@ import pytest
 
 import abbe.models.compensation.additive as additive
 from abbe.models.compensation.tables import nine_tables
+from abbe.models.geometry.volume import field_statistics, volume_grid
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.volumetric import field_statistics, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
 

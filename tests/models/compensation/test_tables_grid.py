@@ -13,14 +13,12 @@ from abbe.models.compensation.grid import check_steps, grid_table, node_design, 
 from abbe.models.compensation.interpolation import cells, fit_positions, trilinear
 from abbe.models.compensation.tables import grid_positions, model_uncertainty_mm, nine_tables
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import RigidFree, remove_rigid, rigid_design, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observations import block_average
-from abbe.models.uncertainty.frame import RigidFree
 from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.mask import compensable_mask
-from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.prediction import compensable_mask, predict_deviation
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.volumetric import remove_rigid, rigid_design, volume_grid
 from tests.models.solvers.truth import MACHINE, Truth
 
 PAIRS = random_pairs(inner_box_mm(MACHINE), 3000, seed=5)

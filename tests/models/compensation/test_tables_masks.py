@@ -11,9 +11,9 @@ from scipy import linalg
 from abbe.models.compensation.distances import inner_box_mm, random_pairs
 from abbe.models.compensation.grid import blend, compensable_nodes, grid_table, nodes_mm
 from abbe.models.compensation.interpolation import trilinear
+from abbe.models.geometry.volume import remove_rigid, rigid_design
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observations import block_average
-from abbe.models.volumetric import remove_rigid, rigid_design
 from tests.models.solvers.truth import MACHINE, Truth
 
 NODES = (np.linspace(0.0, 600.0, 5), np.linspace(0.0, 500.0, 4), np.linspace(0.0, 450.0, 4))

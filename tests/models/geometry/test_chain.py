@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import all_chains, design, deviation_mm, exact_deviation_mm, travel_sign
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import AXES, Machine, levers_mm, split_chain
 from abbe.models.solvers.identifiability import analyse
-from abbe.models.volumetric import volume_grid
 from tests.experiments.mathematics.presets import PRESETS, preset
 
 STROKE = np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]])

@@ -10,8 +10,16 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from abbe.models.geometry.bases import smooth_terms
-from abbe.models.geometry.chain import all_chains, design, deviation_mm, exact_deviation_mm
-from abbe.models.geometry.jacobian import exact_jacobian, motion_jacobian, squareness_jacobian, squareness_motions
+from abbe.models.geometry.chain import (
+    all_chains,
+    design,
+    deviation_mm,
+    exact_deviation_mm,
+    exact_jacobian,
+    motion_jacobian,
+    squareness_jacobian,
+    squareness_motions,
+)
 from abbe.models.machine import Machine
 from tests.experiments.mathematics.datum import (
     change_datum,

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from abbe.models.geometry.volume import volume_frame, volume_grid
 from abbe.models.planning.instruments import Instruments
 from abbe.models.planning.plan import plan_campaign
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.uncertainty.frame import volume_frame
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.volumetric import volume_grid
 from abbe.simulators.campaign.sampler import Conditions, Rig
 from tests.experiments.campaigns.accuracy_plan import measured
 from tests.experiments.campaigns.population import draw_machine

@@ -9,6 +9,7 @@ import numpy as np
 from abbe.models.functions.monomials import monomials
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import design, travel_sign
+from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.notation import wang as wang_notation
 from abbe.models.notation import yang as yang_notation
@@ -29,7 +30,6 @@ from abbe.models.solvers.observability.rank import (
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import perpendicular, setup_unknowns
 from abbe.models.solvers.priors import Priors
-from abbe.models.volumetric import rigid_design, volume_grid
 
 TRAVEL = np.array([812.8, 495.0, 508.0])
 TOOL = np.array([0.0, 0.0, 150.0])

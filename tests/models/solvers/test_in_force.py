@@ -11,13 +11,13 @@ import pytest
 from abbe.models.compensation.smooth import smooth_of
 from abbe.models.compensation.tables import NineTables, model_uncertainty_mm, nine_tables, quantise
 from abbe.models.geometry.chain import travel_sign
+from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.in_force import LEAD_IN_MM, AppliedTables
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average
-from abbe.models.volumetric import remove_rigid, volume_grid
 from abbe.simulators.campaign.sampler import Conditions, Rig
 from abbe.simulators.scenario import MachineConfig, Scenario
 from abbe.simulators.truth.play import Play

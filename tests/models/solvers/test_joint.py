@@ -10,13 +10,13 @@ import pytest
 
 from abbe.models.compensation.summary import mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual, quantise
+from abbe.models.geometry.volume import field_statistics, remove_rigid, rigid_design, volume_grid
 from abbe.models.paths.lines import diagonal_ends, straight_line
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import block_average, nominal_reading
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
 from abbe.models.verification import diagonal_figure, helix_figure
-from abbe.models.volumetric import field_statistics, remove_rigid, rigid_design, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from abbe.models.solvers.components import folds
 from abbe.models.solvers.engine import repeat_noise_mm
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import predict, setup_unknowns
-from abbe.models.solvers.order import folds
 from abbe.models.solvers.priors import Priors
-from abbe.models.solvers.residual_tests import residual_tests
-from abbe.models.solvers.robust import threshold, weights
+from abbe.models.solvers.residuals import outlier_threshold, outlier_weights, residual_tests
 from tests.models.solvers.truth import MACHINE, Truth
 
 
@@ -68,8 +67,8 @@ def test_outliers_are_listed_and_change_little(runs, clean):
 
 def test_clean_readings_lose_nothing():
     z = np.random.default_rng(0).normal(size=5000)
-    assert threshold(5000) > np.abs(z).max()
-    assert (weights(z, threshold(5000)) == 1.0).all()
+    assert outlier_threshold(5000) > np.abs(z).max()
+    assert (outlier_weights(z, outlier_threshold(5000)) == 1.0).all()
 
 
 def test_residuals_of_a_good_solution_are_noise_and_those_of_a_poor_one_are_not(runs, clean):

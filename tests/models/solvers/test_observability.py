@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import all_chains, design, travel_sign
+from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
@@ -22,7 +23,6 @@ from abbe.models.solvers.observability.volume import inner_box
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import predict, setup_unknowns
 from abbe.models.solvers.priors import Priors, size_model
-from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.models.solvers.observability_cases import ONE, YANG, laser
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 

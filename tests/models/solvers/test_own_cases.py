@@ -12,6 +12,7 @@ import pytest
 
 from abbe.models.geometry.bases import Term, smooth_terms
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
 from abbe.models.papers.wang.experiments import WangPlan, distance_errors_mm, interpolated_mm, readings
 from abbe.models.papers.wang.mirror import diagonal_beam
@@ -23,7 +24,6 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns, linearise, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.solvers.step_diagonal import increments, wang_eq7
-from abbe.models.volumetric import volume_grid
 from abbe.service.reference.vector_file import VectorCase
 from abbe.service.reference.vectors.wang import DEMO_PLANS, IDEAL, NOISY, TILTED, errors_of, tilts_of
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.summary import mean_linear
+from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors
-from abbe.models.volumetric import remove_rigid, volume_grid
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.observations import run_data
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import RigidFree, remove_rigid, rigid_at, volume_frame, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.least_squares import solve_map
 from abbe.models.solvers.observe import run_design
 from abbe.models.uncertainty import prediction as module
-from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
 from abbe.models.uncertainty.inputs import STEEL_PER_K, StatedInputs
-from abbe.models.uncertainty.mask import compensable_mask
-from abbe.models.uncertainty.prediction import budget_over, predict_deviation
+from abbe.models.uncertainty.prediction import budget_over, compensable_mask, predict_deviation
 from abbe.models.uncertainty.sources import SOURCE_TEXTS, error_sources, omitted_prior_sd, response
-from abbe.models.volumetric import remove_rigid, volume_grid
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
 GRID = volume_grid(MACHINE.stroke_mm, 4)

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from abbe.models.solvers.observations import RunData
 from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.mask import compensable_mask
-from abbe.models.uncertainty.prediction import Prediction, budget_at, budget_over, worst_point
+from abbe.models.uncertainty.prediction import Prediction, budget_at, budget_over, compensable_mask, worst_point
 from tests.experiments.mathematics.repeatability import machine_repeatability
 
 

@@ -9,17 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from abbe.models.geometry.volume import RigidFree, rigid_at, rigid_design, volume_frame, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observations import block_average
 from abbe.models.uncertainty import campaign_trials as module
 from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from abbe.models.uncertainty.distributions import Distribution
-from abbe.models.uncertainty.frame import RigidFree, rigid_at, volume_frame
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.volumetric import rigid_design, volume_grid
 from tests.experiments.campaigns.population import draw_case
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
-from abbe.models.volumetric import volume_grid
 from abbe.service.cli import run
 from abbe.service.compensation.comp_export import export, identified
 from abbe.service.formats.choice import FormatJudge, best_of, choices
@@ -86,7 +86,7 @@ def test_residual_is_what_a_machine_would_show() -> None:
         left.append(known.deviation_mm(p) - 0.5 * way * lost + correction_at(comp, p, np.full(p.shape, float(way))))
     spread = np.concatenate(left)
     assert np.abs(left[0] - left[1]).max() < 2e-6  # lost motion is gone: moving in + and in − end at one place
-    from abbe.models.volumetric import remove_rigid
+    from abbe.models.geometry.volume import remove_rigid
 
     rms = np.sqrt(np.mean(np.sum(remove_rigid(np.concatenate([p, p]), spread) ** 2, axis=1)))
     assert rms < 0.0005

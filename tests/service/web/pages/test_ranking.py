@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.chain import design
+from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.volumetric import remove_rigid, volume_grid
 from abbe.service.domain.document import Doc
 from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction
 from abbe.service.identification.stored_prediction import stored_prediction

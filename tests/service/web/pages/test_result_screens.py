@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from abbe.models.functions.motions import motion_names
-from abbe.models.uncertainty.frame import field, volume_frame
+from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.models.verification import U_REPEAT_MM
 from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.identification.stored_prediction import stored_prediction
@@ -50,7 +50,7 @@ def test_the_interface_answers_the_map_with_the_whole_covariance(running: Served
     terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
     machine = machine_from_doc(running.store.machines.all()[-1].doc | doc["machine"])
     points = np.array([[x, y, z] for x in told["x_mm"] for y in told["y_mm"] for z in told["z_mm"]])
-    d = field(machine, terms, points, None, volume_frame(machine))
+    d = unit_deviation(machine, terms, points, None, volume_frame(machine))
     assert np.allclose(told["deviation_um"], 1e3 * d @ coefficients, atol=6e-4)
     variance = np.einsum("mik,kl,mil->mi", d, covariance, d, optimize=True) + doc["prediction"]["scatter_mm"] ** 2
     assert np.allclose(np.array(told["expanded_um"])[:, :3], 2e3 * np.sqrt(variance), atol=6e-4)

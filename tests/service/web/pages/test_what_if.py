@@ -10,6 +10,7 @@ import pytest
 
 from abbe.models.geometry.bases import term_values
 from abbe.models.geometry.chain import design, deviation_mm
+from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
@@ -20,7 +21,6 @@ from abbe.models.uncertainty.known_field import KnownField, field_map
 from abbe.models.uncertainty.what_if import Forecast, check_figures, diagonal_figures, expected_rms, helix_figure, volume_figures, what_if
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
-from abbe.models.volumetric import remove_rigid, volume_grid
 from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.grid import compensable_nodes, grid_positions, nodes_mm
+from abbe.models.geometry.volume import RigidFree
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observe import predict, run_jacobian
 from abbe.models.solvers.priors import Priors, term_prior_sd
-from abbe.models.uncertainty.frame import RigidFree
-from abbe.models.uncertainty.mask import NO_TRACE_SIGMA, unseen_directions, unseen_mm
-from abbe.models.uncertainty.prediction import predict_deviation
+from abbe.models.uncertainty.prediction import NO_TRACE_SIGMA, predict_deviation, unobserved_directions, unobserved_mm
 from abbe.models.uncertainty.sources import error_sources
 from tests.experiments.campaigns.population import draw_case
 from tests.experiments.campaigns.scoring import INPUTS, judge
@@ -25,12 +24,12 @@ def lasers_only():
     return case, solve_joint(case.machine, case.runs)
 
 
-def test_unseen_directions_change_no_reading_that_set_ups_would_not_take(lasers_only):
+def test_unobserved_directions_change_no_reading_that_set_ups_would_not_take(lasers_only):
     """By the exact model, not by the normal equations that they were found with."""
     _, s = lasers_only
     n, theta = len(s.terms), s.estimate.theta
     weight = np.sqrt(s.weight_per_mm2)
-    hidden = unseen_directions(s)
+    hidden = unobserved_directions(s)
     assert hidden.shape[1] > 20  # seven lines of a laser do not tell 21 motions
     setups = np.concatenate([run_jacobian(s.machine, s.terms, r, s.setup, theta)[:, n:] for r in s.data]) * weight[:, None]
     known = np.concatenate([setups, np.diag(1.0 / s.prior_sd[n:])])
@@ -55,7 +54,7 @@ def test_no_node_is_compensated_by_less_than_what_nothing_shows(lasers_only):
     _, s = lasers_only
     points = nodes_mm(grid_positions(s.machine, NODES))
     frame = RigidFree(points)
-    unseen = unseen_mm(s, points, frame)
+    unseen = unobserved_mm(s, points, frame)
     deviation = np.linalg.norm(predict_deviation(error_sources(s, INPUTS), points, frame=frame).deviation_mm, axis=1)
     mask = compensable_nodes(s, NODES, inputs=INPUTS).ravel()
     assert not mask[unseen > deviation].any()

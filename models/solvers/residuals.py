@@ -1,4 +1,6 @@
-"""Are the residuals noise? Tests of whitened residuals per run: size, signs in sequence, likeness of neighbours, both directions."""
+"""Residuals of a fit: outliers are down-weighted or rejected and listed; tests per run tell whether the rest is noise.
+
+The tests are of whitened residuals: size, signs in sequence, likeness of neighbours, both directions."""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from abbe.models.arrays import F1
+from abbe.models.arrays import F1, F2
 from abbe.models.solvers.observations import RunData
 
 LEVEL = 0.01
@@ -151,3 +153,53 @@ def inflation(z: tuple[F1, ...]) -> float:
     small = np.flatnonzero(r < noise)
     end = int(small[0]) if small.size else lags
     return 1.0 + 2.0 * float(r[:end].sum())
+
+
+FALSE_ALARM = 0.05
+"""Chance that a campaign without any outlier has a reading that counts less."""
+REJECT = 1.5
+"""From this multiple of the threshold on a reading counts nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outlier:
+    """A reading that counts less: its run, its index in the run's values, its size in standard deviations, its weight 0 to 1."""
+
+    run: str
+    index: int
+    size: float
+    weight: float
+
+
+def leverage(a: F2, root: F2) -> F1:
+    """Share of each reading's variance that the fit takes, shape (n,): squared length of the rows of ``a @ root.T``.
+
+    Parameters
+    ----------
+    a : array, shape (n, p)
+        Whitened design.
+    root : array, shape (p, p)
+        ``root.T @ root`` is the covariance of the unknowns.
+    """
+    z = a @ root.T
+    return np.asarray(np.einsum("np,np->n", z, z))
+
+
+def outlier_threshold(n: int) -> float:
+    """Size in standard deviations that ``n`` normal readings exceed with the chance `FALSE_ALARM` only; never below 3.5."""
+    return max(3.5, float(-special.ndtri(0.5 * FALSE_ALARM / max(n, 1))))
+
+
+def outlier_weights(size: F1, limit: float) -> F1:
+    """Redescending weights: 1 below the limit, falling to 0 at `REJECT` times the limit (Hampel's third part), shape (n,).
+
+    Clean readings all keep weight 1, so nothing is lost on them and the estimated noise is not biased.
+    """
+    s: F1 = np.abs(size)
+    inside = np.maximum(s, 1e-300)
+    return np.asarray(np.where(s <= limit, 1.0, np.clip((REJECT * limit - s) / ((REJECT - 1.0) * inside), 0.0, 1.0)))
+
+
+def robust_scale(size: F1) -> float:
+    """Robust standard deviation (median absolute value), so that outliers do not hide themselves by widening the noise."""
+    return float(np.median(np.abs(size)) / 0.6744897501960817) if size.size else 1.0
