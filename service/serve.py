@@ -39,8 +39,7 @@ from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import ConfigError
 from abbe.service.jobs.at_start import push_is_open
-from abbe.service.mqtt.outbox import StoreOutbox
-from abbe.service.mqtt.publisher import Publisher
+from abbe.service.mqtt.publisher import Publisher, StoreOutbox
 from abbe.service.plant.gather import Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader

@@ -25,8 +25,8 @@ from abbe.models.compensation.tables import NineTables, nine_tables, predict_res
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.candidates import Promise, candidate_of
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
+from abbe.service.compensation.proposals import Promise, candidate_of
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
@@ -43,10 +43,8 @@ from abbe.service.runs.exchange import import_folder
 from abbe.service.scheduler import record
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import Base
-from abbe.service.tables.nine_tables import table_image
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.tables.nine_tables import Base, table_image
+from abbe.service.users.people import Passwords, People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.logtail import LogTail

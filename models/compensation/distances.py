@@ -5,17 +5,21 @@ They measure a table, before and after, with the whole uncertainty of the field.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.compensation.correction import Correction
 from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.sources import ErrorSources, approach_variance_mm2, error_sources, joint_factor
+
+Correction = Callable[[F2], F2]
+"""Commanded positions, shape (n, 3), to corrections added to the command, shape (n, 3), mm."""
+
 
 INNER_SHARE = 0.8
 """Share of each stroke, about its middle, over which distances are judged."""

@@ -1,8 +1,12 @@
-"""Sign probe of a table: its sign, axis and unit, from a ball-bar's readings of the same places before and after its activation.
+"""Sign, axis and unit of a control's corrections, proved physically with a ball-bar that stays mounted while a table changes.
 
-The bar stays mounted while the table changes: at each place the reading changes by u . (new correction - old correction), u being the
-direction from cup to spindle. Read-back from a control cannot show this (reliability.md 3.2, PROBE). A place at which the reading changes
-differently refutes the table, whether or not the change is large enough to prove it.
+Sign, axis and unit are conventions of a control; reading a table back byte for byte does not show them (reliability.md 3.2, PROBE). The
+reading changes by u . (new correction - old correction), u being the direction from cup to spindle.
+
+- `sign_proof`: before the first real table, from a small known step in the table of one axis. The tool's shift S changes every reading by
+  u . S: three numbers from many readings.
+- `probe`: of every table that is pushed, from readings of the same places before and after its activation. A place at which the reading
+  changes differently refutes the table, whether or not the change is large enough to prove it.
 """
 
 from __future__ import annotations
@@ -12,9 +16,137 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.compensation.sign_proof import FLOOR_MM, SHARE
 from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
+
+FLOOR_MM, SHARE = 0.002, 0.2
+"""Tolerance of a response, the larger of the two: absolute, and as a share of the step (reliability.md 3.2, PROBE)."""
+KNOWN_RATIOS = ((1000.0, "µm taken for mm"), (25.4, "mm taken for inch"), (1e-3, "mm taken for µm"), (1 / 25.4, "inch taken for mm"))
+
+
+def step_tables(base: NineTables, axis: int, step_mm: float, low_mm: float, high_mm: float) -> NineTables:
+    """The tables with a step of one axis by itself between two positions, zero at the reference as before.
+
+    Parameters
+    ----------
+    base : NineTables
+        The tables in force.
+    axis : int
+        0, 1, 2 for X, Y, Z: its correction as a function of itself gets the step.
+    low_mm, high_mm : float
+        Between them the whole step is in force; it rises over one grid step below, and stays above.
+
+    Raises
+    ------
+    ValueError
+        There is no grid position below ``low_mm``, where the step could rise from zero.
+    """
+    grid = base.position_mm[axis]
+    rise = int(np.searchsorted(grid, low_mm, side="right")) - 1
+    if rise < 1 or high_mm > grid[-1]:
+        raise ValueError(f"table of {AXES[axis]}: {low_mm:g} to {high_mm:g} mm leaves no grid position before it for the step to rise")
+    curves = [c.copy() for c in base.correction_mm]
+    curves[axis][rise:, axis] += step_mm
+    return NineTables(base.position_mm, (curves[0], curves[1], curves[2]), base.u_mm)
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Displacement of the tool, shape (3,), mm, and its covariance, shape (3, 3), mm^2."""
+
+    shift_mm: F1
+    covariance_mm2: F2
+
+    @property
+    def u_mm(self) -> F1:
+        """Standard uncertainty of each component, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_mm2)))
+
+
+def bar_shift(directions: F2, before_mm: F1, with_step_mm: F1, after_mm: F1, u_mm: float, share: float = 0.5) -> Shift:
+    """Shift of the tool from the bar's readings at the same places without, with, and once more without the step.
+
+    Parameters
+    ----------
+    directions : array, shape (n, 3)
+        Unit vectors from the cup to the tool.
+    before_mm, with_step_mm, after_mm : array, shape (n,)
+        Readings; positive means longer. Drift at a constant rate between the first and the last falls out.
+    u_mm : float
+        Standard uncertainty of one reading; a larger scatter of the readings about the shift counts instead of it.
+    share : float
+        When the step was read, as a share of the time between before and after.
+
+    Raises
+    ------
+    ValueError
+        The places do not separate three components and a change of the bar's length.
+    """
+    change = with_step_mm - (1.0 - share) * before_mm - share * after_mm
+    known = np.column_stack([directions, np.ones(len(directions))])
+    if len(directions) < 6 or np.linalg.matrix_rank(known, tol=0.1) < 4:
+        raise ValueError("sign proof: six places or more are needed, all about the hemisphere")
+    found, *_ = np.linalg.lstsq(known, change, rcond=None)
+    left, free = change - known @ found, len(change) - 4
+    scatter = float(left @ left) / free if free > 0 else 0.0
+    # A quarter of their difference counts as drift that was not at a constant rate, of the length and of the cup.
+    drifted, *_ = np.linalg.lstsq(known, after_mm - before_mm, rcond=None)
+    covariance = max(1.5 * u_mm**2, scatter) * np.linalg.inv(known.T @ known) + np.diag((0.25 * drifted) ** 2 / 3.0)
+    return Shift(np.asarray(found[:3], dtype=np.float64), covariance[:3, :3])
+
+
+@dataclass(frozen=True)
+class SignProof:
+    """Result of three steps.
+
+    ``response``: shape (3, 3), component i of the shift per step written for axis a; ``u``: its standard uncertainty. ``faults``: one
+    sentence for each axis that does not do what was written; empty when sign, axis and unit are proved.
+    """
+
+    step_mm: float
+    response: F2
+    u: F2
+    faults: tuple[str, ...]
+
+    @property
+    def proved(self) -> bool:
+        """Whether tables may be written."""
+        return not self.faults
+
+
+def sign_proof(step_mm: float, shifts: tuple[Shift, Shift, Shift]) -> SignProof:
+    """Judge the shifts by a step for X, Y and Z. A positive correction must move its own axis in the positive direction.
+
+    A response whose uncertainty exceeds half the tolerance is a fault as well: nothing was proved.
+    """
+    response = np.column_stack([s.shift_mm for s in shifts]) / step_mm
+    u = np.column_stack([s.u_mm for s in shifts]) / step_mm
+    allowed = max(FLOOR_MM / step_mm, SHARE)
+    faults = [text for a in range(3) if (text := _fault(a, response[:, a], u[:, a], allowed))]
+    return SignProof(step_mm, response, u, tuple(faults))
+
+
+def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
+    wanted = np.eye(3)[axis]
+    name = AXES[axis]
+    if 2.0 * u.max() > 0.5 * allowed * max(1.0, float(np.abs(moved).max())):
+        return f"{name}: the readings tell the response only to {200.0 * u.max():.0f} % (k = 2): nothing is proved"
+    if (np.abs(moved - wanted) <= allowed).all():
+        return ""
+    main = int(np.argmax(np.abs(moved)))
+    if abs(moved[main]) <= allowed:
+        return f"{name}: the step has no effect: is compensation switched on, and the axis referenced?"
+    faults = [] if main == axis else [f"it moves {AXES[main]}"]
+    faults += ["the sign is turned over"] if moved[main] < 0.0 else []
+    size = abs(float(moved[main]))
+    if abs(size - 1.0) > allowed:
+        why = next((f": {text}" for ratio, text in KNOWN_RATIOS if abs(size / ratio - 1.0) < SHARE), "")
+        faults.append(f"it moves by {size:.3g} times the step{why}")
+    other = np.delete(moved, main)
+    if np.abs(other).max() > allowed:
+        faults.append("other axes move with it")
+    return f"{name}: {', '.join(faults)}"
+
 
 SHOWN = 3
 SEEN_MM = 0.003

@@ -11,8 +11,7 @@ from datetime import datetime
 from pathlib import Path
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base, this_account
-from abbe.service.backup.backup import BackupSource, sqlite_file
-from abbe.service.backup.backup_files import CAPTURE, DATABASE, HEADS, KEY, Backup, audit_faults, read_backup
+from abbe.service.backup.backup import CAPTURE, DATABASE, HEADS, KEY, Backup, BackupSource, audit_faults, read_backup, sqlite_file
 from abbe.service.capture.settings import segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused

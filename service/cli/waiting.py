@@ -25,7 +25,7 @@ async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s:
     the same consequence.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.deferred_rollback import finish_when_safe
+    from abbe.service.compensation.recover import finish_when_safe
     from abbe.service.errors import StillActive
 
     try:

@@ -15,7 +15,7 @@ import numpy as np
 
 from abbe.drivers.api import Identity
 from abbe.models.arrays import F2
-from abbe.models.compensation.sign_proof import Shift, SignProof, bar_shift, sign_proof, step_tables
+from abbe.models.compensation.sign_probe import Shift, SignProof, bar_shift, sign_proof, step_tables
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.models.machine import AXES
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
@@ -29,8 +29,7 @@ from abbe.service.push.operations import Verdict
 from abbe.service.sequences.interlocks import Suspending
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import Base, read_base
-from abbe.service.tables.nine_tables import check_limits
+from abbe.service.tables.nine_tables import Base, check_limits, read_base
 
 KIND = "sign-proof"
 STEP_MM, FIRST_MM = 0.010, 0.0005

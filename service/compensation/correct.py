@@ -15,8 +15,7 @@ from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.campaigns.measure import MeasureOptions, measure
-from abbe.service.compensation.gate import Admission, PushContext, admit, check_preconditions, check_promise
-from abbe.service.compensation.proposal_checks import PushPrecheck
+from abbe.service.compensation.gate import Admission, PushContext, PushPrecheck, admit, check_preconditions, check_promise
 from abbe.service.compensation.proposals import (
     StoredProposal,
     check_before_runs,

@@ -1,19 +1,114 @@
-"""A person approves or rejects a stored proposal. Both are possible only while it waits for a push."""
+"""The status of a proposal, and the decisions of people on it: approval and rejection, possible only while it waits for a push.
+
+The status is derived from the proposal's row, its approvals and the push journal. It is stored nowhere else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from datetime import timedelta
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
 
 from abbe.service.clock import Clock
-from abbe.service.compensation.proposal_checks import same_person
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.proposals import login
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
+from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableRefused
+from abbe.service.push.journal import Journal, facts
 from abbe.service.storage.store import Store
+from abbe.service.tables.push_journal import KIND, JournalView
+
+
+@dataclass(frozen=True, slots=True)
+class ProposalStatus:
+    """A status word and one sentence. Words: refused, rejected, proposed, approved, expired, superseded, pushed, kept, rolled back."""
+
+    word: str
+    text: str
+
+
+def proposal_status(store: Store, number: int, proposed: Proposed, now_s: float, journal: JournalView | None = None) -> ProposalStatus:
+    """The status of a stored proposal. ``journal``: that of its machine, if the caller has read it already."""
+    journal = journal or JournalView.read(store, proposed.candidate.machine)
+    return status_of_proposal(number, proposed, store.proposals.approvals(number), store.proposals.rejections(number), journal, now_s)
+
+
+def status_of_proposal(
+    number: int,
+    proposed: Proposed,
+    approvals: Sequence[ProposalApproval],
+    rejections: Sequence[ProposalRejection],
+    journal: JournalView,
+    now_s: float,
+) -> ProposalStatus:
+    """The status of a proposal from plain values; reads no store."""
+    own = [push for push in journal.pushes.values() if journal.origin(push).proposal == number]
+    if own:
+        found = _pushed(own[-1], journal)
+        if found is not None:
+            return found
+    if rejections:
+        return ProposalStatus("rejected", f"by {rejections[-1].name}: {rejections[-1].reason}")
+    if proposed.reasons:
+        return ProposalStatus("refused", f"{len(proposed.reasons)} reasons against it when it was proposed")
+    wrote = [e.push for e in journal.entries if e.state is PushState.STAGING and e.utc > proposed.utc]
+    if wrote:
+        return ProposalStatus("superseded", f"push {wrote[-1]} wrote into the controller since it was proposed")
+    if now_s >= proposed.valid_until_s:
+        return ProposalStatus("expired", f"its measurement is older than {proposed.limits.age_h:g} h")
+    approval, why = valid_approval(proposed, approvals, now_s, two_people=proposed.two_people)
+    if approval is not None:
+        return ProposalStatus("approved", f"by {approval.name} until {approval.expiry}")
+    return ProposalStatus("proposed", why if approvals or proposed.two_people else "waits for a push")
+
+
+def _pushed(own: Journal, journal: JournalView) -> ProposalStatus | None:
+    """How the proposal's last push ended; None if that push ended before the new table was in force."""
+    last, f = own[-1], facts(own)
+    if last.state in (PushState.REJECTED, PushState.ABORTED):
+        return None
+    if last.state is PushState.ROLLED_BACK:
+        return ProposalStatus("rolled back", f"by push {last.push} itself: {f.why}")
+    if last.state is not PushState.KEEP:
+        open_ = "" if last.state in TERMINAL else "; the next command that uses the machine finishes it"
+        return ProposalStatus("pushed", f"push {last.push} stands at {last.state}{open_}")
+    later = [j for n, j in journal.pushes.items() if n > last.push and j[-1].state is PushState.KEEP]
+    if not later:
+        return ProposalStatus("kept", f"push {last.push}: {f.verify}")
+    if facts(later[-1]).image == f.image:
+        return ProposalStatus("kept", f"push {last.push} kept it; in force again since push {later[-1][-1].push}")
+    number = later[0][-1].push
+    if journal.origin(later[0]).kind == KIND:
+        return ProposalStatus("rolled back", f"by order of a person with push {number}, after push {last.push} had kept it")
+    return ProposalStatus("superseded", f"push {last.push} kept it; push {number} put another table in its place")
+
+
+def valid_approval(
+    proposed: Proposed, approvals: Sequence[ProposalApproval], now_s: float, *, two_people: bool
+) -> tuple[ProposalApproval | None, str]:
+    """The last valid approval; otherwise None and the reason."""
+    why = "nobody has approved it: abbe comp approve"
+    for row in reversed(approvals):
+        if two_people and same_person(row.name, proposed.by):
+            why = f"{row.name} proposed it and cannot approve it"
+        elif row.digest != proposed.binding(row.expiry):
+            why = f"what {row.name} approved is not this table on this base under these limits"
+        elif now_s >= _utc_s(row.expiry):
+            why = f"the approval of {row.name} expired at {row.expiry}"
+        else:
+            return row, ""
+    return None, why
+
+
+def same_person(one: str, other: str) -> bool:
+    """Whether two names belong to the same person: letter case and outer blanks do not count."""
+    return one.strip().casefold() == other.strip().casefold()
+
+
+def _utc_s(text: str) -> float:
+    return datetime.fromisoformat(text).timestamp()
 
 
 def approve(store: Store, number: int, name: str, hours: float, clock: Clock, account: str | None = None) -> ProposalApproval:

@@ -14,12 +14,11 @@ from abbe.drivers.errors import DriverError
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.clock import Clock
 from abbe.service.compensation.correct import push
-from abbe.service.compensation.deferred_rollback import finish_when_safe
 from abbe.service.compensation.gate import PushContext, admit
+from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.compensation.recover import finish_when_safe, recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink

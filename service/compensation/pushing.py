@@ -30,8 +30,7 @@ from abbe.service.push.operations import Approval, Verdict
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import Base
-from abbe.service.tables.nine_tables import table_image
+from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed, push_log
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"

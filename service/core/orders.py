@@ -17,11 +17,10 @@ import structlog
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, Outcome, PushNow, RollBack
 from abbe.service.clock import Clock
-from abbe.service.compensation.ordered_rollback import RollbackOrder
+from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.compensation.push_approved import PushOrder
-from abbe.service.compensation.rollback import RollbackRequest
+from abbe.service.compensation.rollback import RollbackOrder, RollbackRequest
 from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand
 from abbe.service.core.rights import person
 from abbe.service.domain.audit_event import AuditEvent

@@ -12,16 +12,15 @@ from abbe.service.clock import Clock
 from abbe.service.config_schema import OpcUa, Web
 from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
+from abbe.service.core.table_watch import LookAtTable
 from abbe.service.devices.urls import control_of
 from abbe.service.domain.schedule import Schedule, Window
-from abbe.service.mqtt.broker import Broker
-from abbe.service.mqtt.topics import Topics
+from abbe.service.mqtt.broker import Broker, Topics
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
 from abbe.service.scheduler.ready import AlwaysReady
 from abbe.service.storage.store import Store
-from abbe.service.tables.in_force import LookAtTable
 
 
 @dataclass(frozen=True, slots=True)

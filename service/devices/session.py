@@ -112,7 +112,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First 
     """Open and identify every configured device; always close all of them at the end.
 
     ``ask`` asks the person at the console. ``first`` runs on the open controller before any other device is opened
-    (`abbe.service.compensation.recovered_session`); its errors end the session.
+    (`abbe.service.compensation.recover`); its errors end the session.
 
     Raises
     ------

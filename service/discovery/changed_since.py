@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from abbe.models.compensation.smooth import smooth_of
+from abbe.models.compensation.tables import smooth_of
 from abbe.models.discovery.changed.comparison import Change, Changed, changed_since
 from abbe.models.solvers.in_force import AppliedTables
 from abbe.models.uncertainty.known_field import KnownField
@@ -21,8 +21,7 @@ from abbe.service.discovery.changed_text import proved
 from abbe.service.domain.finding import ChangedSince, ChangeRival, EffectFound, GapUm, MotionChange
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import stored_solution
-from abbe.service.effects.known_effects import LASTING, applies
-from abbe.service.effects.model_book import version
+from abbe.service.effects.model_book import LASTING, applies, version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
 from abbe.service.identification.effect_removal import subtract_effects
 from abbe.service.identification.solution_field import stored_field

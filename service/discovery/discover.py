@@ -32,8 +32,7 @@ from abbe.service.domain.finding import Finding
 from abbe.service.domain.model_book import ModelBook, ModelVersion
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.effects.axis_test import SLOW_DRIFT
-from abbe.service.effects.known_effects import applies, readings_of, without
-from abbe.service.effects.model_book import extended_book
+from abbe.service.effects.model_book import applies, extended_book, readings_of, without
 from abbe.service.errors import NotObservable
 from abbe.service.identification.solve import ALL_READINGS
 from abbe.service.identification.table_removal import NO_TABLE, CampaignTable, remove_table, table_line

@@ -1,11 +1,22 @@
-"""Capabilities of controls from their documents: kinds, number and resolution of tables, and order of action (controllers.md 1, 5)."""
+"""Capabilities of controls from their documents (controllers.md 1, 5), and the best use of a control for an identified machine.
+
+`choices` gives the residual errors with each kind of table, judged over the whole volume in both directions of motion, with the best-fit
+rigid motion removed and the numbers rounded as in the control. A limited number of tables is filled greedily by the largest reduction.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.volume import remove_rigid, volume_grid
+from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.model import Lookup
+from abbe.service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Lookup, Motions, ProductTable, correction_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,3 +121,179 @@ def control_of(key: str) -> ControlModel:
     if key not in CONTROLS:
         raise FormatRefused(f"there is no control {key!r}", f"known are {', '.join(CONTROLS)}")
     return CONTROLS[key]
+
+
+JUDGE_NODES, COARSE_NODES = 12, 6
+MIN_GAIN = 0.02
+"""A larger set of tables must reduce the residual rms of a smaller one by at least this share."""
+
+
+@dataclass(frozen=True)
+class FormatChoice:
+    """One kind of tables with its residual error (rms and largest vector over the volume, mm); ``best``: the recommended kind."""
+
+    kind: str
+    compensation: Compensation
+    rms_mm: float
+    max_mm: float
+    best: bool = False
+
+    @property
+    def numbers(self) -> int:
+        """Count of numbers in all tables."""
+        return self.compensation.numbers
+
+
+class FormatJudge:
+    """The identified error field at the nodes at which tables are judged."""
+
+    def __init__(self, known: Identified, control: ControlModel, nodes: int = JUDGE_NODES) -> None:
+        self.points_mm: F2 = volume_grid(known.machine.stroke_mm, nodes)
+        self._moving = {way: known.moving_mm(self.points_mm, way) for way in (1, -1)}
+        self._control = control
+
+    def left_mm(self, comp: Compensation) -> F1:
+        """Length of the residual error at every node, moving in + and in −, mm, shape (2 n,)."""
+        stored = rounded(comp, self._control.unit_mm)
+        parts = []
+        for way, field in self._moving.items():
+            direction = np.full(self.points_mm.shape, float(way))
+            parts.append(field + correction_at(stored, self.points_mm, direction, lookup=self._control.lookup))
+        both = np.concatenate([self.points_mm, self.points_mm])
+        return np.asarray(np.linalg.norm(remove_rigid(both, np.concatenate(parts)), axis=1))
+
+    def choice(self, kind: str, comp: Compensation) -> FormatChoice:
+        """Evaluate one kind of tables."""
+        left = self.left_mm(comp)
+        return FormatChoice(kind, comp, float(np.sqrt(np.mean(left**2))), float(left.max()))
+
+
+def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple[FormatChoice, ...]:
+    """Every kind of tables that the control can hold, from none to all; one is marked as the best."""
+    judge = FormatJudge(known, control)
+    found = [judge.choice("no table", Compensation())]
+    if control.own:
+        build = _Builder(known, control, reference_mm)
+        found.append(judge.choice("one-axis tables", build.together((), ())))
+        found += _crossed(control, build, judge) if control.cross else []
+    if control.lattice:
+        nodes = _grids(known, control.nodes, reference_mm)
+        grid = Compensation(lattice=lattice_of(known, nodes, reference_mm), lost_motion_mm=dict(known.lost_motion_mm))
+        found.append(judge.choice(f"3-D grid of {' x '.join(str(g.size) for g in nodes)} nodes", grid))
+    if control.motions:
+        grids = _grids(known, control.own_points, reference_mm)
+        comp = Compensation(motions=motions_of(known, grids), lost_motion_mm=dict(known.lost_motion_mm))
+        found.append(judge.choice("error motions, worked out by the control", comp))
+    return _marked(found)
+
+
+def best_of(found: tuple[FormatChoice, ...]) -> FormatChoice:
+    """The choice marked as the best."""
+    return next(c for c in found if c.best)
+
+
+def _marked(found: list[FormatChoice]) -> tuple[FormatChoice, ...]:
+    best = found[0]
+    for c in sorted(found[1:], key=lambda c: c.numbers):
+        if c.rms_mm < (1.0 - MIN_GAIN) * best.rms_mm:
+            best = c
+    return tuple(replace(c, best=c is best) for c in found)
+
+
+def _grids(known: Identified, points: int, reference_mm: F1) -> tuple[F1, F1, F1]:
+    x, y, z = (grid_mm(known.machine, a, points, reference_mm) for a in range(3))
+    return x, y, z
+
+
+def _own(known: Identified, control: ControlModel, tables: tuple[AxisTable, ...]) -> Compensation:
+    """Own-axis tables with lost motion in their two columns or in the control's backlash parameter."""
+    if control.both_directions:
+        return Compensation(tables)
+    plain = tuple(replace(t, backward_mm=t.forward_mm) for t in tables)
+    return Compensation(plain, lost_motion_mm=dict(known.lost_motion_mm))
+
+
+def _crossed(control: ControlModel, build: _Builder, judge: FormatJudge) -> list[FormatChoice]:
+    """Own-axis tables with as many cross tables and products as the control can hold."""
+    kinds: list[tuple[str, tuple[ProductTable, ...]]] = [("one-axis and cross tables", ())]
+    kinds += [("one-axis, cross and product tables", build.offered)] if control.products else []
+    out = []
+    for kind, offered in kinds:
+        chosen, pairs = offered, PAIRS
+        if control.tables is not None:
+            chosen, pairs = build.greedy(FormatJudge(build.known, control, nodes=COARSE_NODES), offered, control.tables)
+        out.append(judge.choice(kind, build.together(chosen, pairs)))
+    return out
+
+
+Pair = tuple[str, str]
+PAIRS: tuple[Pair, ...] = tuple((a, o) for a in AXES for o in AXES if a != o)
+
+
+class _Builder:
+    """Builds sets of tables that correct every error once. All parts are linear, so each is computed once."""
+
+    def __init__(self, known: Identified, control: ControlModel, reference_mm: F1) -> None:
+        self.known, self._control = known, control
+        self._sets = tuple(_grids(known, n, reference_mm) for n in (control.own_points, control.cross_points))
+        self.offered = products_of(known, self._sets[1], reference_mm) if control.products else ()
+        self._whole = table_values(known, known.deviation_mm, self._sets, reference_mm, smooth=True)
+        self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
+
+    def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
+        """Own-axis and cross tables, each on its own grid, for the error that the products leave."""
+        fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
+        own = _own(self.known, self._control, tuple(t for t in fine if t.own))
+        cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)
+        return replace(own, tables=(*own.tables, *cross), products=products)
+
+    def _values(self, k: int, products: tuple[ProductTable, ...]) -> Values:
+        x, y, z = (self._whole[k][a] + sum((self._of[p.name][k][a] for p in products), np.zeros((1, 3))) for a in range(3))
+        return x, y, z
+
+    def greedy(self, judge: FormatJudge, offered: tuple[ProductTable, ...], room: int) -> tuple[tuple[ProductTable, ...], tuple[Pair, ...]]:
+        """Add the part with the largest reduction per table until ``room`` tables are used or nothing helps."""
+        products: tuple[ProductTable, ...] = ()
+        pairs: tuple[Pair, ...] = ()
+        left = float(np.mean(judge.left_mm(self.together(products, pairs)) ** 2))
+        while True:
+            free = room - len(pairs) - 2 * len(products)
+            steps = [((*products, p), pairs, 2) for p in offered if p not in products]
+            steps += [(products, (*pairs, pair), 1) for pair in PAIRS if pair not in pairs]
+            tried = []
+            for more, cross, cost in steps:
+                if cost <= free:
+                    now = float(np.mean(judge.left_mm(self.together(more, cross)) ** 2))
+                    tried.append(((left - now) / cost, now, more, cross))
+            gain, left, products_, pairs_ = max(tried, key=lambda t: t[0], default=(0.0, left, products, pairs))
+            if gain <= 0.0:
+                return products, pairs
+            products, pairs = products_, pairs_
+
+
+def _added_by(product: ProductTable, points_mm: F2) -> F2:
+    """Correction by one product, to be subtracted from the other tables."""
+    return correction_at(Compensation(products=(product,)), points_mm)
+
+
+def rounded(comp: Compensation, unit_mm: float) -> Compensation:
+    """Corrections rounded to the control's unit; angles are a thousand times finer."""
+
+    def to(v: F1, unit: float = unit_mm) -> F1:
+        return np.asarray(np.round(v / unit) * unit)
+
+    def curve(c: AxisCurve, unit: float) -> AxisCurve:
+        return replace(c, value=to(c.value, unit))
+
+    tables = tuple(replace(t, forward_mm=to(t.forward_mm), backward_mm=to(t.backward_mm)) for t in comp.tables)
+    products = tuple(replace(p, angle=curve(p.angle, unit_mm * 1e-3), lever=curve(p.lever, unit_mm)) for p in comp.products)
+    lattice = comp.lattice
+    if lattice is not None:
+        lattice = Lattice(lattice.position_mm, np.round(lattice.correction_mm / unit_mm) * unit_mm)
+    motions = comp.motions
+    if motions is not None:
+        curves = {n: curve(c, unit_mm * (1e-3 if n[1] in "ABC" else 1.0)) for n, c in motions.curves.items()}
+        motions = Motions(
+            motions.machine, curves, {n: round(v / unit_mm * 1e3) * unit_mm * 1e-3 for n, v in motions.squareness_rad.items()}
+        )
+    return Compensation(tables, products, lattice, motions, comp.lost_motion_mm)

@@ -9,11 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_positions, check_size
+from abbe.service.formats.files import FormatSettings, TextFile, integers, whole
 from abbe.service.formats.model import Compensation, Lattice
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, integers, whole
+from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_positions, check_size, from_file, to_file
 
 LIMITS = FormatLimits(points=1000, equidistant=True, own=False, lattice=True)
 WHAT = "Fanuc 3-D error compensation"

@@ -12,11 +12,9 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, fixed, increasing
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, fixed, increasing
+from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_table, from_file, to_file
 
 LIMITS = FormatLimits(points=256, cross=True)
 WHAT = "Heidenhain .COM"

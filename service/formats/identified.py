@@ -14,8 +14,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.compensation.additive import additive
-from abbe.models.compensation.grid import nodes_mm
-from abbe.models.compensation.interpolation import FIT_SAMPLES, cells
+from abbe.models.compensation.grid import FIT_SAMPLES, cells, nodes_mm
 from abbe.models.functions.legendre import legendre_values
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.geometry.bases import Term, term_values

@@ -12,11 +12,9 @@ import numpy as np
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING, FormatLimits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, increasing, short
 from abbe.service.formats.model import AxisCurve, Compensation, Motions
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, increasing, short
+from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_positions, check_size, check_table, from_file, to_file
 
 LIMITS = FormatLimits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
 WHAT = "ISG volumetric CSV"

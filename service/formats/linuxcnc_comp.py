@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.service.formats.limits import PLAUSIBLE_MM, FormatLimits, check_kinds, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, fixed, increasing, whole
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import SIGNS, from_file, to_file
-from abbe.service.formats.text import TextFile, fixed, increasing, whole
+from abbe.service.formats.rules import PLAUSIBLE_MM, SIGNS, FormatLimits, check_kinds, check_table, from_file, to_file
 
 LIMITS = FormatLimits(points=256)
 POSITION_DECIMALS = 6

@@ -12,11 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from abbe.service.formats.limits import FormatLimits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, increasing, short
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, increasing, short
+from abbe.service.formats.rules import FormatLimits, check_kinds, check_positions, check_size, check_table, from_file, to_file
 
 LIMITS = FormatLimits(points=16, directional=False, own=True, cross=True, products=True)
 LEVERS = FormatLimits(points=16, size_mm=1e5)

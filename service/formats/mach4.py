@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.service.formats.limits import FormatLimits, check_kinds, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, fixed, short
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, fixed, short
+from abbe.service.formats.rules import FormatLimits, check_kinds, check_table, from_file, to_file
 
 LIMITS = FormatLimits(points=10000, equidistant=True)
 WHAT = "Mach4 screw map"

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F4
-from abbe.models.compensation.interpolation import trilinear
+from abbe.models.compensation.grid import trilinear
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.geometry.chain import deviation_mm, squareness_motions
 from abbe.models.machine import AXES, Machine

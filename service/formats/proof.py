@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
+from abbe.service.formats.files import FormatSettings
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS, Format
-from abbe.service.formats.settings import FormatSettings
 
 STEP_MM = 0.010
 POSITION_MM = np.array([0.0, 50.0, 100.0, 150.0, 200.0])

@@ -19,11 +19,9 @@ from abbe.service.formats import (
     siemens_cec,
     siemens_eec,
 )
-from abbe.service.formats.limits import FormatLimits
+from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import Compensation
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.signs import SIGNS, SignRule
-from abbe.service.formats.text import TextFile
+from abbe.service.formats.rules import SIGNS, FormatLimits, SignRule
 
 Write = Callable[[Compensation, FormatSettings], tuple[TextFile, ...]]
 Read = Callable[[tuple[TextFile, ...], FormatSettings], Compensation]

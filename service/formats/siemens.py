@@ -9,8 +9,8 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.limits import NOTHING
-from abbe.service.formats.text import TextFile
+from abbe.service.formats.files import TextFile
+from abbe.service.formats.rules import NOTHING
 
 _LINE = re.compile(r"\$(\w+)\s*\[([^\]]*)\]\s*=\s*\(?([^;)]*?)\)?\s*(;.*)?")
 HEAD = "CHANDATA(1)"

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.machine import AXES
-from abbe.service.formats.limits import FormatLimits, check_kinds, check_positions, check_size, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, short
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable
-from abbe.service.formats.settings import FormatSettings
+from abbe.service.formats.rules import FormatLimits, check_kinds, check_positions, check_size, check_table, from_file, to_file
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, short
 
 LIMITS = FormatLimits(points=2000, equidistant=True, own=True, cross=True, products=True)
 LEVERS = FormatLimits(points=2000, equidistant=True, size_mm=1e5)

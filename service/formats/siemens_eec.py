@@ -7,12 +7,10 @@ The table must be zero at the reference point. Lost motion that does not depend 
 from __future__ import annotations
 
 from abbe.models.machine import AXES
-from abbe.service.formats.limits import FormatLimits, check_kinds, check_table
+from abbe.service.formats.files import FormatSettings, TextFile, short
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.settings import FormatSettings
+from abbe.service.formats.rules import FormatLimits, check_kinds, check_table, from_file, to_file
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, grid, parse, step_of
-from abbe.service.formats.signs import from_file, to_file
-from abbe.service.formats.text import TextFile, short
 
 LIMITS = FormatLimits(points=5000, equidistant=True, directional=False)
 WHAT = "Siemens ENC_COMP"

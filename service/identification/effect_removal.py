@@ -14,8 +14,7 @@ from abbe.service.campaign_data.provenance import machine_digest, with_changed_c
 from abbe.service.domain.finding import EffectSize
 from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.effects.known_effects import applies, readings_of
-from abbe.service.effects.model_book import current, no_table_lines
+from abbe.service.effects.model_book import applies, current, no_table_lines, readings_of
 from abbe.service.identification.table_removal import CampaignTable, remove_table
 from abbe.service.runs.cases import case_of
 from abbe.service.storage.store import Store

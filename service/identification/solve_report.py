@@ -8,7 +8,7 @@ from typing import Literal, cast
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.compensation.summary import SCALE_NOTE, MeanParameter, mean_linear
+from abbe.models.compensation.additive import SCALE_NOTE, MeanParameter, mean_linear
 from abbe.models.geometry.volume import volume_frame, volume_grid
 from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from abbe.service.capture.recovery import recover_segments
-from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.push_entry import TERMINAL, PushState

@@ -11,7 +11,7 @@ from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.plausibility import INSTRUMENTS, ended_certificates
 from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.compensation.recover import recovered_session
 from abbe.service.config_schema import MachineFile
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.progress import ProgressSink

@@ -13,7 +13,7 @@ from abbe.service.campaigns.measure import MeasureOptions, measure, start_campai
 from abbe.service.campaigns.plausibility import certificates
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
-from abbe.service.compensation.recovered_session import recovered_session
+from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import Session
 from abbe.service.domain.job_state import JobOutcome
@@ -23,7 +23,7 @@ from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.needed import check_devices, needed_by
 from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 
 SOLVING = "all is measured, and nothing moves while it is solved"
 

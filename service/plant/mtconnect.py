@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from abbe.service.domain.verification import Verification
-from abbe.service.plant.facts import PlantFacts
+from abbe.service.plant.gather import PlantFacts
 
 VERSION = "1.8"
 BUFFER = 4096

@@ -14,8 +14,8 @@ from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.verification import Verification
-from abbe.service.queries.checks import latest_checks
 from abbe.service.queries.reader import Reader
+from abbe.service.queries.results import latest_checks
 from abbe.service.queries.timetable import NextDue, next_due
 from abbe.service.verification.alarm_states import folded, is_open
 from abbe.service.verification.alarms import alarm_doc

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.compensation.summary import SCALE_NOTE, mean_linear
+from abbe.models.compensation.additive import SCALE_NOTE, mean_linear
 from abbe.models.geometry.bases import term_values
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution

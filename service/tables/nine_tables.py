@@ -1,13 +1,14 @@
-"""Nine tables as bytes and back: encoding, decoding, limits, and adding a change to the active tables."""
+"""Nine tables as bytes and back: encoding, decoding, limits, adding a change to the active tables, and reading the table in force."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from abbe.drivers.api import CompStatus, TableController
 from abbe.drivers.second_decoder import UnreadableImage, read_axis_tables
-from abbe.drivers.tables import TableImage
+from abbe.drivers.tables import TableImage, crc32
 from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.errors import TableMismatch, TableRefused
@@ -111,3 +112,36 @@ def added(active: NineTables | None, change: NineTables) -> NineTables:
         old = [np.interp(change.position_mm[a], active.position_mm[a], active.correction_mm[a][:, i]) for i in range(3)]
         curves.append(change.correction_mm[a] + np.column_stack(old) - np.array([v[0] for v in old]))
     return NineTables(change.position_mm, (curves[0], curves[1], curves[2]), change.u_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """The table in force before a push."""
+
+    status: CompStatus
+    image: bytes
+
+    @property
+    def crc(self) -> int:
+        """CRC-32 of the active bank as the controller sealed it."""
+        return self.status.bank_crc[self.status.active_bank]
+
+    @property
+    def tables(self) -> NineTables | None:
+        """The corrections in force; None for no correction."""
+        return tables_from_image(self.image)
+
+
+async def read_base(controller: TableController) -> Base:
+    """Read the active bank and prove it against its CRC.
+
+    Raises
+    ------
+    TableMismatch
+        The CRC of the bytes differs from the one the controller states.
+    """
+    status = await controller.comp_status()
+    base = Base(status, await controller.read_bank(status.active_bank))
+    if crc32(base.image) != base.crc:
+        raise TableMismatch("the active table does not have the CRC the controller states", "read the tables again; nothing was written")
+    return base

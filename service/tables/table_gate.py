@@ -15,7 +15,7 @@ from abbe.service.errors import TableMismatch
 from abbe.service.push.journal import StoreBook
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from abbe.service.tables.unverified import Endorsement, KnownTables, PushedTable, known_tables
 
 LOOK_REMEDY = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"

@@ -14,8 +14,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from abbe.service.clock import SystemClock
-from abbe.service.plant.facts import FactsSource
-from abbe.service.plant.gather import Gatherer
+from abbe.service.plant.gather import FactsSource, Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusSource
 from abbe.service.storage.store import Store

@@ -14,8 +14,8 @@ from abbe.service.domain.push_entry import PushTransition
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.measured import CampaignSummary, MachineDescription, RunSummary
 from abbe.service.queries.people import UserSummary
-from abbe.service.queries.proposals import ProposalSummary
 from abbe.service.queries.results import DiscoverySummary, SolutionSummary
+from abbe.service.queries.tables import ProposalSummary
 from abbe.service.queries.timetable import ScheduleState
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.web.catalogue import ErrorEntry

@@ -159,7 +159,7 @@ def push() -> Hops:
     from abbe.service.push.operations import Verdict
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.tables.base_table import read_base
+    from abbe.service.tables.nine_tables import read_base
 
     async def yes() -> Verdict:
         return Verdict(True, "a stand-in")

@@ -20,7 +20,7 @@ from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
 from abbe.service.push.journal import facts
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc import bank
 from abbe.simulators.cnc.compensation import BankState, Compensation, CompResult
 from tests.faults.sequencer_world import bench

@@ -24,7 +24,7 @@ from abbe.service.devices.session import DeviceUrls
 from abbe.service.push.operations import Verdict
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.linuxcnc.instance import Instance
 from tests.mbpoll import poll_table
 from tests.models.solvers.truth import MACHINE

@@ -17,7 +17,7 @@ from abbe.service.push.limits import PushLimits
 from abbe.service.push.operations import Verdict
 from abbe.service.push.validate import reasons_against
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.faults.sequencer_world import bench
 from tests.push.bad_tables import CLASSES, EACH, good
 

@@ -16,7 +16,7 @@ from abbe.service.errors import Stopped
 from abbe.service.push.operations import Verdict
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.faults.sequencer_world import Bench, bench
 from tests.patience import within
 from tests.push.test_bad_tables_on_the_wire import counted, tables

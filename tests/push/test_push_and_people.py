@@ -20,7 +20,7 @@ from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
 from abbe.service.push.execute import BEAT_S, ControllerPort, no_actors
 from abbe.service.push.operations import Done, Operation, OperationKind, Verdict
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc.compensation import CompResult
 from tests.faults.sequencer_world import Bench, bench
 from tests.push.test_bad_tables_on_the_wire import kept, never, tables

@@ -14,7 +14,7 @@ from abbe.service.compensation.recover import accept, recover
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.faults.sequencer_world import Bench, bench
 from tests.push.test_bad_tables_on_the_wire import kept, never, tables
 

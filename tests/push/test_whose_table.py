@@ -16,6 +16,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
+from abbe.service.core.table_watch import look_at_table
 from abbe.service.devices.urls import DeviceUrls, address_of, control_of
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableMismatch, UnsafeToMove
@@ -24,9 +25,8 @@ from abbe.service.push.operations import Verdict
 from abbe.service.report.report_table import table_remarks
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
-from abbe.service.tables.in_force import look_at_table
 from abbe.service.tables.measured_with import KIND_AT
+from abbe.service.tables.nine_tables import read_base
 from abbe.service.tables.push_journal import JournalView, open_pushes
 from abbe.service.tables.unverified import known_tables
 from abbe.service.verification.verified_by import verified_by

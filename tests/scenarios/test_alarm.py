@@ -18,9 +18,8 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
 from abbe.service.cli.administration.serve import duties_on
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.proposal_decisions import approve
+from abbe.service.compensation.proposal_decisions import approve, proposal_status
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.config import load_machine
 from abbe.service.config_schema import AlarmSection
 from abbe.service.core.board import Board

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.deferred_rollback import finish_when_safe
+from abbe.service.compensation.recover import finish_when_safe
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import StatusUnknown, StillActive
 from abbe.service.storage.store import Store

@@ -18,11 +18,9 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.correct import Correction, push
-from abbe.service.compensation.gate import PushContext, admit
-from abbe.service.compensation.proposal_checks import precheck
-from abbe.service.compensation.proposal_decisions import approve
+from abbe.service.compensation.gate import PushContext, admit, precheck
+from abbe.service.compensation.proposal_decisions import approve, proposal_status, status_of_proposal
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
-from abbe.service.compensation.proposal_states import proposal_status, status_of_proposal
 from abbe.service.compensation.proposals import load_runs, login
 from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder, next_approved, push_approved
 from abbe.service.config import load_machine

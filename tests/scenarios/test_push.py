@@ -30,8 +30,7 @@ from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
-from abbe.service.tables.nine_tables import table_image
+from abbe.service.tables.nine_tables import read_base, table_image
 from tests.pretended import as_if_commissioned
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]

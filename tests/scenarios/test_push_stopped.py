@@ -10,7 +10,7 @@ from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import StoreError
 from abbe.service.push.journal import StoreBook
 from abbe.service.push.operations import Verdict
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.scenarios.test_push import active, bench, last, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]

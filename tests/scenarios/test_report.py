@@ -33,7 +33,7 @@ from abbe.service.runs.columns import load_run
 from abbe.service.scheduler import record
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from abbe.service.verification.verify import figure_rows, figures
 from tests.scenarios.conftest import simulated
 

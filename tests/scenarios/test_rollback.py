@@ -22,8 +22,7 @@ from abbe.service.compensation.rollback import rollback
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import PushNotBegun, StoreError, TableMismatch, TableRefused
 from abbe.service.push.journal import StoreBook, check_chain
-from abbe.service.tables.base_table import read_base
-from abbe.service.tables.nine_tables import table_image
+from abbe.service.tables.nine_tables import read_base, table_image
 from tests.scenarios.test_push import active, bench, last, linear_tables, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]

@@ -9,8 +9,8 @@ import re
 import pytest
 
 from abbe.service.cli import run
+from abbe.service.core.table_watch import look_at_table
 from abbe.service.storage.store import Store
-from abbe.service.tables.in_force import look_at_table
 from tests.scenarios.test_push import bench, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]

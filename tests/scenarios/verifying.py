@@ -27,7 +27,7 @@ from abbe.service.sequences.recipes.recipe import Diagonal, Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from abbe.service.verification.verify import VerificationFigures, decide, figures
 from tests.scenarios.conftest import simulated
 from tests.scenarios.test_push import linear_tables, site_of

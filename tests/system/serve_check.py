@@ -19,8 +19,7 @@ from abbe.service.core.setup import ServiceSetup
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.logs import configure_logs
-from abbe.service.mqtt.broker import parse
-from abbe.service.mqtt.topics import Topics
+from abbe.service.mqtt.broker import Topics, parse
 from abbe.service.sequences.control import Control, State
 from abbe.service.serve import serve
 

@@ -26,7 +26,7 @@ from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.jobs.at_start import recover_at_start
 from abbe.service.logs import configure_logs
-from abbe.service.mqtt.topics import Topics
+from abbe.service.mqtt.broker import Topics
 from abbe.service.push.operations import Verdict
 from abbe.service.scheduler import alarm_manager
 from abbe.service.sequences.recipes.recipe import Diagonal
@@ -34,7 +34,7 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
 from abbe.service.site import Site, machine_doc, machine_from_doc
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.scenarios.test_push import linear_tables
 
 PROPOSAL = ApprovedProposal(4, 9, 0)

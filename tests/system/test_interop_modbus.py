@@ -24,7 +24,7 @@ from abbe.models.compensation.tables import NineTables, grid_positions
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.push.operations import Verdict
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc.device import Controller
 from abbe.simulators.cnc.wire import CncRegisters
 from abbe.simulators.faults.modbus_frames import crc16

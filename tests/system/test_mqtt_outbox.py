@@ -14,10 +14,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from abbe.service.clock import SystemClock
-from abbe.service.mqtt.broker import parse
-from abbe.service.mqtt.outbox import StoreOutbox
-from abbe.service.mqtt.publisher import Publisher
-from abbe.service.mqtt.topics import Topics
+from abbe.service.mqtt.broker import Topics, parse
+from abbe.service.mqtt.publisher import Publisher, StoreOutbox
 from abbe.service.storage.store import Store
 from tests.certificates import authority, issued
 from tests.patience import within

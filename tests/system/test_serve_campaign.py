@@ -21,11 +21,10 @@ from playwright.sync_api import Page as Screen
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaigns.resume import begun_source
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.storage.store import Store
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.users.people import Passwords, People
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import wait_for
 from tests.system.serve_bench import Process, abbe, free_port

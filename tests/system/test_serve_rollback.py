@@ -16,8 +16,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.push_entry import PushState
 from abbe.service.push.journal import check_chain
 from abbe.service.storage.store import Store
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.users.people import Passwords, People
 from abbe.service.web.api.once import REPLAYED
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.test_push import bench, push, steep

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from abbe.service.capture.live import LiveFeed
     from abbe.service.channel.messages import MachineSummary
-    from abbe.service.compensation.ordered_rollback import RollbackOrder
     from abbe.service.compensation.push_approved import PushOrder
+    from abbe.service.compensation.rollback import RollbackOrder
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import AlarmSection, OpcUa, Web
     from abbe.service.core.orders import CampaignOrder, MeasureCampaign, OrderActions
@@ -68,16 +68,16 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
     from abbe.service.core.setup import ServiceSetup
+    from abbe.service.core.table_watch import look_at_table
     from abbe.service.jobs.at_start import recover_at_start
     from abbe.service.jobs.check import run_check
-    from abbe.service.mqtt.topics import Topics
+    from abbe.service.mqtt.broker import Topics
     from abbe.service.report.report import rules_of
     from abbe.service.scheduler.ready import Ready, look_at
     from abbe.service.sequences.check import dry_run_campaign, paced
     from abbe.service.sequences.recipes.campaigns import RECIPES, campaign_source
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
-    from abbe.service.tables.in_force import look_at_table
 
     config = loaded.machine
     check_unattended(config, loaded.path.resolve().parent)
@@ -192,8 +192,8 @@ def duties_on(
 def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
     """Return the orders for tables, given the service's store. People can order a push only if the service does not push by itself."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.ordered_rollback import ordered_rollback
     from abbe.service.compensation.push_approved import push_approved
+    from abbe.service.compensation.rollback import ordered_rollback
     from abbe.service.core.orders import OrderActions
 
     def on(store: Store) -> OrderActions:

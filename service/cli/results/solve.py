@@ -229,7 +229,7 @@ def _lines(heading: str, lines: list[str]) -> None:
 
 
 def _parameters(summary: Assessment) -> None:
-    from abbe.models.compensation.summary import SCALE_NOTE
+    from abbe.models.compensation.additive import SCALE_NOTE
     from abbe.service.identification.solve_report import HIDDEN_NOTE
 
     status = {m.name: m.status for m in summary.observability.motions}

@@ -26,8 +26,8 @@ def trend(
 ) -> None:
     """Show the trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
     from abbe.service.cli.common import reader_of
-    from abbe.service.queries.checks import trends
     from abbe.service.queries.reader import json_value
+    from abbe.service.queries.results import trends
     from abbe.service.verification.trend_table import HEADINGS, chart, row
     from abbe.service.verification.verified_by import measure_now
 

@@ -11,7 +11,7 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 
 if TYPE_CHECKING:
     from abbe.service.config_schema import MachineFile
-    from abbe.service.formats.choice import FormatChoice
+    from abbe.service.formats.controls import FormatChoice
     from abbe.service.formats.model import Compensation
 
 comp = typer.Typer(help="Compensation tables: as files of controls, and back.", no_args_is_help=True)
@@ -64,8 +64,17 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
 ) -> None:
     """Write the best tables that a control can hold, and show what each kind of table would leave."""
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.comp_export import control_for, export, formats_in, identified, reference_of, write_files
-    from abbe.service.compensation.comp_signed import TableSeal, check_signing, sign_files
+    from abbe.service.compensation.comp_export import (
+        TableSeal,
+        check_signing,
+        control_for,
+        export,
+        formats_in,
+        identified,
+        reference_of,
+        sign_files,
+        write_files,
+    )
 
     doc = _solution(solution, db, machine)
     known = identified(doc)
@@ -108,8 +117,17 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     they differ from a solution's.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.comp_export import control_for, expected, identified, read_files, read_key, reference_of, settings_for
-    from abbe.service.compensation.comp_signed import SigningRequest, seal_status
+    from abbe.service.compensation.comp_export import (
+        SigningRequest,
+        control_for,
+        expected,
+        identified,
+        read_files,
+        read_key,
+        reference_of,
+        seal_status,
+        settings_for,
+    )
     from abbe.service.formats.compare import check_same
 
     control, known, at = control_for(form), None, reference_of(reference)

@@ -12,7 +12,7 @@ from abbe.service.cli.measure import MachineArgument, ready_session
 
 if TYPE_CHECKING:
     from abbe.service.compensation.proposals import StoredProposal
-    from abbe.service.queries.proposals import ProposalSummary
+    from abbe.service.queries.tables import ProposalSummary
     from abbe.service.storage.store import Store
 
 MOST = 100_000
@@ -51,8 +51,8 @@ def propose(
 
 
 def _print_made(store: Store, made: StoredProposal, *, as_json: bool) -> None:
-    from abbe.service.queries.proposals import proposal
     from abbe.service.queries.reader import json_value
+    from abbe.service.queries.tables import proposal
 
     found = proposal(reader(store), made.number)
     if as_json:
@@ -76,14 +76,14 @@ def show_proposals(
     as_json: JsonOption = False,
 ) -> None:
     """Show proposals: their promise with uncertainty, their state, the reasons against them."""
-    from abbe.service.queries import proposals
+    from abbe.service.queries import tables
     from abbe.service.queries.reader import json_value
 
     with open_store(database_url(db, machine)) as store:
         if proposal is None:
-            _print_list(proposals.proposals(reader(store), None, None, MOST)[0], as_json=as_json)
+            _print_list(tables.proposals(reader(store), None, None, MOST)[0], as_json=as_json)
             return
-        found = proposals.proposal(reader(store), proposal)
+        found = tables.proposal(reader(store), proposal)
     if as_json:
         print_json(json_value(found))
         return
@@ -122,8 +122,8 @@ def diff(
     """Show what a proposal changes: each of the nine tables in numbers, and as a picture."""
     from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_report, largest, rows
     from abbe.service.compensation.proposal_doc import load
-    from abbe.service.queries.proposals import difference_of
     from abbe.service.queries.reader import json_value
+    from abbe.service.queries.tables import difference_of
     from abbe.service.rendering.document_page import form_of, write_document
 
     if html is not None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
-from abbe.service.queries import measured, samples
+from abbe.service.queries import measured
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
@@ -90,19 +90,19 @@ def _add_runs(app: FastAPI, sources: Sources) -> None:
 def _add_samples(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/runs/{number}/samples")
     @needs(Permission.READ)
-    def stretch(number: Number, channel: ChannelName = "bar", first: First = 0, limit: Rows = 1000) -> samples.Samples:
+    def stretch(number: Number, channel: ChannelName = "bar", first: First = 0, limit: Rows = 1000) -> measured.Samples:
         """A stretch of a channel as it arrived."""
-        return samples.samples(sources.reader, number, channel, first, limit)
+        return measured.samples(sources.reader, number, channel, first, limit)
 
     @app.get("/api/v1/runs/{number}/samples.bin", response_class=Response, responses=OCTETS)
     @needs(Permission.READ)
     def packed(number: Number, first: First = 0, limit: Annotated[int, Query(ge=1, le=BINARY_ROWS)] = BINARY_ROWS) -> Response:
         """A stretch of the ball-bar's samples, packed."""
-        data, total = samples.packed_samples(sources.reader, number, first, limit)
+        data, total = measured.packed_samples(sources.reader, number, first, limit)
         return Response(data, media_type="application/octet-stream", headers={"Abbe-Total": str(total)})
 
     @app.get("/api/v1/runs/{number}/columns")
     @needs(Permission.READ)
-    def columns(number: Number, first: First = 0, limit: Rows = 1000) -> samples.RunColumns:
+    def columns(number: Number, first: First = 0, limit: Rows = 1000) -> measured.RunColumns:
         """A stretch of the evaluated readings: position, time, deviation."""
-        return samples.columns(sources.reader, number, first, limit)
+        return measured.columns(sources.reader, number, first, limit)

@@ -9,7 +9,6 @@ from fastapi import FastAPI, Query
 from pydantic import BeforeValidator
 
 from abbe.service.domain.verification import Verification
-from abbe.service.queries import checks as checked
 from abbe.service.queries import results
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
@@ -86,20 +85,20 @@ def _add_checks(app: FastAPI, sources: Sources) -> None:
     @needs(Permission.READ)
     def checks(machine: Filter = None, verdict: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> CheckList:
         """Checks of all machines of the store, newest first."""
-        found, after = checked.checks(sources.reader, machine, verdict, cursor, limit)
+        found, after = results.checks(sources.reader, machine, verdict, cursor, limit)
         return CheckList(verifications=found, next_cursor=after)
 
     @app.get("/api/v1/checks/{number}")
     @needs(Permission.READ)
     def check(number: Number) -> Verification:
         """One check: figures with uncertainties (k = 2), limits, verdict."""
-        return checked.check(sources.reader, number)
+        return results.check(sources.reader, number)
 
     @app.get("/api/v1/trends")
     @needs(Permission.READ)
     def trends(
         machine: Annotated[str | None, Query(description="Absent: the machine of this service.")] = None, after: After = None
-    ) -> checked.Trends:
+    ) -> results.Trends:
         """Whether the figures of the checks drift, since when, and when they reach their limits."""
         since = after.replace(tzinfo=UTC) if after is not None and after.tzinfo is None else after
-        return checked.trends(sources.reader, sources.reader.machine if machine is None else machine, since)
+        return results.trends(sources.reader, sources.reader.machine if machine is None else machine, since)

@@ -12,8 +12,7 @@ from fastapi.responses import Response
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import reject as work_reject
 from abbe.service.domain.push_entry import PushEntry
-from abbe.service.queries import proposals as proposed
-from abbe.service.queries import pushes
+from abbe.service.queries import tables
 from abbe.service.queries.reader import as_stored
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
@@ -38,14 +37,14 @@ def _add_proposals(app: FastAPI, sources: Sources) -> None:
     @needs(Permission.READ)
     def proposals(machine: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> ProposalList:
         """Proposed tables with their states, newest first."""
-        found, after = proposed.proposals(sources.reader, machine, cursor, limit)
+        found, after = tables.proposals(sources.reader, machine, cursor, limit)
         return ProposalList(proposals=found, next_cursor=after)
 
     @app.get("/api/v1/proposals/{number}")
     @needs(Permission.READ)
-    def proposal(number: Number) -> proposed.ProposalDetail:
+    def proposal(number: Number) -> tables.ProposalDetail:
         """One proposal: predicted improvement with uncertainty, state, and the reasons against it."""
-        return proposed.proposal(sources.reader, number)
+        return tables.proposal(sources.reader, number)
 
     @app.get("/api/v1/proposals/{number}/diff")
     @needs(Permission.READ)
@@ -54,9 +53,9 @@ def _add_proposals(app: FastAPI, sources: Sources) -> None:
         other: Annotated[
             int | None, Query(alias="with", ge=1, le=LARGEST, description="Another proposal; absent: the table in force.")
         ] = None,
-    ) -> proposed.ProposalDifference:
+    ) -> tables.ProposalDifference:
         """Changes of a proposal: nine tables in numbers, with uncertainty."""
-        return proposed.difference(sources.reader, number, other)
+        return tables.difference(sources.reader, number, other)
 
 
 def _add_decisions(app: FastAPI, sources: Sources) -> None:
@@ -116,11 +115,11 @@ def _add_pushes(app: FastAPI, sources: Sources) -> None:
         limit: Limit = 50,
     ) -> PushJournal:
         """The push journal, newest entry first; a renamed machine keeps its journal under the first name."""
-        found, after = pushes.push_entries(sources.reader, machine, push, state, cursor, limit)
+        found, after = tables.push_entries(sources.reader, machine, push, state, cursor, limit)
         return PushJournal(entries=found, next_cursor=after)
 
     @app.get("/api/v1/pushes/{number}")
     @needs(Permission.READ)
     def push_entry(number: Number) -> PushEntry:
         """One entry of the journal with the facts that it recorded."""
-        return pushes.push_entry(sources.reader, number)
+        return tables.push_entry(sources.reader, number)

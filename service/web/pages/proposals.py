@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from abbe.service.compensation.proposal_diff import ACTIVE, HEADINGS, compare, largest, rows
-from abbe.service.queries.proposals import ProposalDetail, ProposalSummary, proposal
 from abbe.service.queries.reader import Reader
+from abbe.service.queries.tables import ProposalDetail, ProposalSummary, proposal
 from abbe.service.rendering.plots.tables import change_plot
 from abbe.service.web.frame import current
 from abbe.service.web.units import INCH

@@ -13,8 +13,8 @@ from pydantic import AfterValidator
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.errors import NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
-from abbe.service.queries.proposals import proposals
 from abbe.service.queries.results import discoveries
+from abbe.service.queries.tables import proposals
 from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
 from abbe.service.users.roles import Permission

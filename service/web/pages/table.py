@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 
 from abbe.service.errors import JournalChanged
-from abbe.service.queries.pushes import tables
+from abbe.service.queries.tables import tables
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs

@@ -9,8 +9,8 @@ from markupsafe import Markup
 
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import Verification
-from abbe.service.queries.checks import trends
 from abbe.service.queries.reader import Reader
+from abbe.service.queries.results import trends
 from abbe.service.queries.status import Status
 from abbe.service.queries.timetable import NextDue, past_slots
 from abbe.service.verification.trend_table import FigureTrend

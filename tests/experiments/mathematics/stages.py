@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.arrays import F2
-from abbe.models.compensation.correction import Correction
+from abbe.models.compensation.distances import Correction
 from abbe.models.compensation.tables import NineTables
 
 Lookup = Literal["command", "corrected"]

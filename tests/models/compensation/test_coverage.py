@@ -8,8 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from abbe.models.compensation.additive import additive
-from abbe.models.compensation.summary import mean_linear
+from abbe.models.compensation.additive import additive, mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import remove_rigid, rigid_design, volume_grid

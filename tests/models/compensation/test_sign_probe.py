@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 import pytest
 
-from abbe.models.compensation.sign_probe import expected_changes, probe
+from abbe.models.compensation.sign_probe import Shift, bar_shift, expected_changes, probe, sign_proof, step_tables
 from abbe.models.compensation.tables import NineTables
 from abbe.models.paths.helix import helix_points
 
@@ -92,3 +92,98 @@ def test_the_change_is_between_old_and_new():
     assert step == pytest.approx(whole, abs=1e-12)
     with pytest.raises(ValueError, match="same places"):
         probe(step, np.zeros(3), np.zeros(12))
+
+
+STEP, U = 0.010, 0.0002
+
+
+def places(n: int = 24) -> np.ndarray:
+    k = np.arange(n) + 0.5
+    z = k / n
+    turn = 2.399963 * k
+    return np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+
+
+def shift(response: np.ndarray, axis: int, rng: np.random.Generator, *, drift_mm: float = 0.0005, noise_mm: float = U) -> Shift:
+    """Readings of exact distances from a cup off the centre, on a machine whose tables do ``response`` (3, 3); drift along Z with time."""
+    out, cup = places(), np.array([0.012, -0.031, 0.02])
+
+    def read(moved: np.ndarray, t: float) -> np.ndarray:
+        tool = 100.0 * out + moved + np.array([0.0, 0.0, drift_mm * t])
+        return np.linalg.norm(tool - cup, axis=1) - 100.0 + noise_mm * rng.standard_normal(len(out))
+
+    none = np.zeros(3)
+    return bar_shift(out, read(none, 0.0), read(STEP * response[:, axis], 1.0), read(none, 2.0), U)
+
+
+def proof(response: np.ndarray, seed: int, **more: float):
+    rng = np.random.default_rng(seed)
+    return sign_proof(STEP, (shift(response, 0, rng, **more), shift(response, 1, rng, **more), shift(response, 2, rng, **more)))
+
+
+def test_a_control_that_does_what_is_written_is_proved():
+    for seed in range(200):
+        assert proof(np.eye(3), seed).proved
+
+
+def test_every_sign_and_every_exchange_of_axes_is_found():
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        response = np.zeros((3, 3))
+        for a in range(3):
+            response[order[a], a] = signs[a]
+        found = proof(response, 7)
+        wrong = [a for a in range(3) if order[a] != a or signs[a] < 0]
+        assert [f[0] for f in found.faults] == ["XYZ"[a] for a in wrong]
+        for text, a in zip(found.faults, wrong, strict=True):
+            assert ("the sign is turned over" in text) == (signs[a] < 0)
+            assert (f"it moves {'XYZ'[order[a]]}" in text) == (order[a] != a)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "word"), [(25.4, "inch"), (1 / 25.4, "no effect"), (0.0, "no effect"), (0.5, "times the step"), (2.0, "times the step")]
+)
+def test_units_and_dead_tables_are_found(ratio, word):
+    for seed in range(20):
+        found = proof(ratio * np.eye(3), seed)
+        assert len(found.faults) == 3
+        assert all(word in text for text in found.faults), found.faults
+
+
+def test_one_axis_alone_is_named():
+    response = np.diag([1.0, -1.0, 1.0])
+    assert proof(response, 1).faults == ("Y: the sign is turned over",)
+
+
+def test_noise_that_hides_the_step_proves_nothing():
+    found = proof(np.eye(3), 3, noise_mm=0.01)
+    assert len(found.faults) == 3
+    assert all("nothing is proved" in text for text in found.faults)
+
+
+def test_the_uncertainty_covers():
+    off = [
+        np.abs(proof(np.eye(3), seed, drift_mm=0.0).response - np.eye(3)) / proof(np.eye(3), seed, drift_mm=0.0).u for seed in range(200)
+    ]
+    assert 0.9 < float(np.mean(np.array(off) < 2.0)) <= 1.0
+
+
+def test_places_on_one_circle_are_refused():
+    turn = np.linspace(0, 6, 12)
+    flat = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    with pytest.raises(ValueError, match="six places or more"):
+        bar_shift(flat, turn, turn, turn, U)
+
+
+def test_the_step_rises_from_the_reference_and_leaves_the_rest():
+    grid = np.linspace(0.0, 600.0, 25)
+    none = NineTables((grid,) * 3, (np.zeros((25, 3)),) * 3, (np.zeros((25, 3)),) * 3)
+    made = step_tables(none, 1, STEP, 200.0, 400.0)
+    at = np.array([[x, y, z] for x, y, z in product((0.0, 200.0, 300.0, 400.0), repeat=3)])
+    correction = made.correction_at(at)
+    assert np.array_equal(correction[:, [0, 2]], np.zeros((len(at), 2)))
+    assert np.allclose(correction[:, 1], np.where(at[:, 1] >= 200.0, STEP, 0.0))
+    assert made.correction_mm[1][0, 1] == 0.0
+    assert none.correction_mm[1][:, 1].max() == 0.0
+    for low, high in ((10.0, 400.0), (200.0, 700.0)):
+        with pytest.raises(ValueError, match="leaves no grid position"):
+            step_tables(none, 1, STEP, low, high)

@@ -9,8 +9,17 @@ from hypothesis import strategies as st
 
 from abbe.models.compensation.additive import additive
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, pair_design, predict_distances, random_pairs
-from abbe.models.compensation.grid import check_steps, grid_table, node_design, nodes_mm, quantisation_mm, quantise_grid
-from abbe.models.compensation.interpolation import cells, fit_positions, trilinear
+from abbe.models.compensation.grid import (
+    cells,
+    check_steps,
+    fit_positions,
+    grid_table,
+    node_design,
+    nodes_mm,
+    quantisation_mm,
+    quantise_grid,
+    trilinear,
+)
 from abbe.models.compensation.tables import grid_positions, model_uncertainty_mm, nine_tables
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import RigidFree, remove_rigid, rigid_design, volume_grid

@@ -6,11 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.compensation.achievable import achievable, cross_only, positioning_only, squareness_tables
+from abbe.models.compensation.achievable import (
+    achievable,
+    cross_only,
+    enough_for_the_field,
+    motion_tables,
+    observable_alone,
+    positioning_only,
+    squareness_tables,
+)
+from abbe.models.compensation.additive import SQUARENESS_SLOPES, mean_linear
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import quantisation_mm
-from abbe.models.compensation.per_motion import enough_for_the_field, motion_tables, observable_alone
-from abbe.models.compensation.summary import SQUARENESS, mean_linear
 from abbe.models.compensation.tables import NineTables, nine_tables, quantise
 from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import solve_joint
@@ -96,7 +103,7 @@ def test_squareness_parameters_carry_the_uncertainty_of_the_very_slopes_they_are
         coefficients = {t.name.replace(".", "_"): v for t, v in zip(s.terms, root @ rng.standard_normal(len(root)), strict=True)}
         nine = nine_tables(only(s, **coefficients), counts, sources=replace(data, coefficients=np.array(list(coefficients.values()))))
         slope = [np.polyfit(nine.position_mm[a], nine.correction_mm[a], 1)[0] for a in range(3)]
-        drawn.append([-sign * (slope[a][b] + slope[b][a]) for _, a, b, sign in SQUARENESS])
+        drawn.append([-sign * (slope[a][b] + slope[b][a]) for _, a, b, sign in SQUARENESS_SLOPES])
     assert [p.u for p in found] == pytest.approx(np.std(drawn, axis=0), rel=0.3)  # 60 draws (of the long run) know it to 9 %, 30 to 13 %
     mean = [p.value for p in mean_linear(s)[3:]]
     assert max(abs(p.value - m) / p.u for p, m in zip(found, mean, strict=True)) > 3.0

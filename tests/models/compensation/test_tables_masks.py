@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy import linalg
 
 from abbe.models.compensation.distances import inner_box_mm, random_pairs
-from abbe.models.compensation.grid import blend, compensable_nodes, grid_table, nodes_mm
-from abbe.models.compensation.interpolation import trilinear
+from abbe.models.compensation.grid import blend, compensable_nodes, grid_table, nodes_mm, trilinear
 from abbe.models.geometry.volume import remove_rigid, rigid_design
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observations import block_average

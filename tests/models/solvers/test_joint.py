@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from abbe.models.compensation.summary import mean_linear
+from abbe.models.compensation.additive import mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual, quantise
 from abbe.models.geometry.volume import field_statistics, remove_rigid, rigid_design, volume_grid
 from abbe.models.paths.lines import diagonal_ends, straight_line

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from abbe.models.compensation.per_motion import observable_alone
+from abbe.models.compensation.achievable import observable_alone
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.assessment import motions_of, observability, observability_of

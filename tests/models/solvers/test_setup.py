@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.compensation.summary import mean_linear
+from abbe.models.compensation.additive import mean_linear
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observe import setup_unknowns

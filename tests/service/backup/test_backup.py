@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.backup.backup_files import read_backup
+from abbe.service.backup.backup import read_backup
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.cli import run

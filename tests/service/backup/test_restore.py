@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.backup.backup_files import file_list
+from abbe.service.backup.backup import file_list
 from abbe.service.cli import run
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store

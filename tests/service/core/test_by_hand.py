@@ -21,8 +21,7 @@ from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.users.people import Passwords, People
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 

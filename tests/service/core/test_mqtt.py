@@ -11,10 +11,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from abbe.service.errors import ConfigError
-from abbe.service.mqtt.broker import parse
-from abbe.service.mqtt.outbox import with_id
-from abbe.service.mqtt.publisher import Publisher
-from abbe.service.mqtt.topics import Topics, client_id, level
+from abbe.service.mqtt.broker import Topics, client_id, level, parse
+from abbe.service.mqtt.publisher import Publisher, with_id
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, utc
 

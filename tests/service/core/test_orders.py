@@ -18,7 +18,7 @@ import pytest
 from abbe.drivers.tables import crc32
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, RollBack, StartJob
-from abbe.service.compensation.ordered_rollback import RollbackOrder
+from abbe.service.compensation.rollback import RollbackOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.core.rights import may
@@ -30,8 +30,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.users.people import Passwords, People
 from abbe.service.users.roles import Permission, Role
 from tests.patience import within
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed

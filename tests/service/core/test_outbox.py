@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.mqtt.outbox import DROPPED, StoreOutbox
-from abbe.service.mqtt.topics import Topics
+from abbe.service.mqtt.broker import Topics
+from abbe.service.mqtt.publisher import DROPPED, StoreOutbox
 from abbe.service.storage.store import Store
 from tests.service.core.fakes import FakeClock, utc
 

@@ -10,9 +10,8 @@ from dataclasses import replace
 import pytest
 
 from abbe.drivers.errors import LinkDown
-from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, TableWatch
+from abbe.service.core.table_watch import AGAIN_S, CODE, LOOK_S, REMEDY, InForce, TableWatch
 from abbe.service.domain.push_entry import PushEntry, PushState
-from abbe.service.tables.in_force import InForce
 from abbe.service.tables.push_journal import JournalView
 from tests.service.core.fakes import FakeClock, FakeShelf, settle, utc
 

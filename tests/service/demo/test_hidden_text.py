@@ -13,7 +13,7 @@ from abbe.service.demo.demo_hidden import HiddenDemo
 from abbe.service.demo.demo_hidden_text import hidden_json, judged, truth_lines
 from abbe.service.discovery.new_measurement import NewMeasurement
 from abbe.service.domain.finding import EffectFound, Finding, GapUm
-from abbe.service.effects.known_effects import _usual
+from abbe.service.effects.model_book import _usual
 
 PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}
 SURGE = {"name": "counterbalance_surge", "key": "", "parameters": {"strength": 4.0}, "wild": 0}

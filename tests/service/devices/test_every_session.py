@@ -9,7 +9,7 @@ import pytest
 
 import abbe.service
 from abbe.drivers.errors import LinkDown
-from abbe.service.compensation import recovered_session
+from abbe.service.compensation import recover
 from abbe.service.devices import session
 from abbe.service.devices.urls import DeviceUrls
 from abbe.service.errors import TableMismatch
@@ -19,16 +19,16 @@ from tests.faults.sequencer_world import MACHINE
 ROOT = Path(abbe.service.__file__).parent
 ONLY_LOOKS = {
     ("scheduler/ready.py", "look_at"): "reads the status",
-    ("tables/in_force.py", "look_at_table"): "reads which table is in force",
+    ("core/table_watch.py", "look_at_table"): "reads which table is in force",
     ("cli/tables/table.py", "accept_table"): "a person vouches",
-    ("compensation/ordered_rollback.py", "ordered_rollback"): "goes through `rollback`, which recovers",
+    ("compensation/rollback.py", "ordered_rollback"): "goes through `rollback`, which recovers",
     ("demo/demo.py", "run_demo"): "a control of its own, begun with this database",
     ("demo/demo_serve.py", "run_served_demo"): "the same",
     ("demo/demo_hidden.py", "run_hidden_demo"): "the same",
 }
 
 
-HELPER = ("compensation/recovered_session.py", "recovered_session")
+HELPER = ("compensation/recover.py", "recovered_session")
 
 
 def doors() -> dict[tuple[str, str], set[str]]:
@@ -84,10 +84,10 @@ async def opened(monkeypatch: pytest.MonkeyPatch, done: list[str], error: Except
             raise error
         return "taken back"
 
-    monkeypatch.setattr(recovered_session, "recover", recovers)
+    monkeypatch.setattr(recover, "recover", recovers)
     urls = DeviceUrls("cnc", "ballbar", "laser", "fixture")
     site = Site("m", MACHINE, {}, urls)
-    async with recovered_session.recovered_session(None, site, accept_by="ann", report=done.append):  # type: ignore[arg-type]
+    async with recover.recovered_session(None, site, accept_by="ann", report=done.append):  # type: ignore[arg-type]
         done.append("in use")
 
 

@@ -26,7 +26,7 @@ from abbe.service.sequences.paths import follow_path
 from abbe.service.sequences.steps import FollowPath
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import read_base
+from abbe.service.tables.nine_tables import read_base
 from tests.drivers.acme.control import AcmeControl, serving
 from tests.pretended import as_if_commissioned
 

@@ -14,8 +14,7 @@ from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
 from abbe.service.cli import run
 from abbe.service.compensation.comp_export import export, identified
-from abbe.service.formats.choice import FormatJudge, best_of, choices
-from abbe.service.formats.controls import CONTROLS
+from abbe.service.formats.controls import CONTROLS, FormatJudge, best_of, choices
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import AxisTable, Compensation, correction_at
 

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable, correction_at
 from abbe.service.formats.proof import all_proofs
 from abbe.service.formats.registry import FORMATS
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.text import TextFile
 from tests.service.formats.page import PAGE, page
 
 # controllers.md 5.7, by hand: what +10 µm of error at 100 mm must be in each file.

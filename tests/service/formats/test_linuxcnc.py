@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.formats.files import FormatSettings
 from abbe.service.formats.model import AxisTable, Compensation, correction_at
 from abbe.service.formats.registry import FORMATS
-from abbe.service.formats.settings import FormatSettings
 from tests.conftest import Require
 
 HUNDREDTHS_OF_NM = 5e-8

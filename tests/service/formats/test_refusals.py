@@ -9,10 +9,9 @@ import pytest
 
 from abbe.service.errors import FormatRefused, TableContradicts, TableFileError
 from abbe.service.formats.compare import check_same
+from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import AxisTable, Compensation, Lattice
 from abbe.service.formats.registry import FORMATS
-from abbe.service.formats.settings import FormatSettings
-from abbe.service.formats.text import TextFile
 
 P = np.array([0.0, 100.0, 200.0])
 V = np.array([0.0, -0.010, 0.004])

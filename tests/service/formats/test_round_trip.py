@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.machine import AXES, Machine
+from abbe.service.formats.files import FormatSettings
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable
 from abbe.service.formats.registry import FORMATS, Format
-from abbe.service.formats.settings import FormatSettings
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [-400.0, 0.0], [-300.0, 100.0]]))
 EXACT_MM = 1e-9

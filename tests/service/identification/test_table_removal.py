@@ -32,8 +32,7 @@ from abbe.service.identification.table_removal import (
     table_line,
 )
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import Base
-from abbe.service.tables.nine_tables import table_image
+from abbe.service.tables.nine_tables import Base, table_image
 from tests.service.discovery.discovery_bench import WIDTH_MM, write_case
 
 DB = "sqlite:///book.sqlite3"

@@ -11,7 +11,7 @@ from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.verification import Verdict, Verification
 from abbe.service.errors import StoreError
-from abbe.service.plant.facts import ActiveTable, PlantAlarm, PlantFacts
+from abbe.service.plant.gather import ActiveTable, PlantAlarm, PlantFacts
 from tests.patience import within
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)

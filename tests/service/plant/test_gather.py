@@ -11,9 +11,8 @@ import pytest
 
 from abbe.service.core.board import Board
 from abbe.service.domain.push_entry import PushEntry, PushState
-from abbe.service.plant.facts import UNITS
-from abbe.service.plant.gather import Gatherer, table_in_force
-from abbe.service.plant.opcua.picture import picture_of
+from abbe.service.plant.gather import UNITS, Gatherer, table_in_force
+from abbe.service.plant.opcua.space import picture_of
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.storage.store import Store

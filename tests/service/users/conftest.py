@@ -11,8 +11,7 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.storage.store import Store
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.users.people import Passwords, People
 
 PHRASE = "correct horse battery staple"
 

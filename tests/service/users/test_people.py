@@ -12,8 +12,7 @@ import pytest
 
 from abbe.service.errors import PasswordRefused, StoreError, UserRefused
 from abbe.service.users.lockout import MOST, Buckets, Lockout, LoginOrigin
-from abbe.service.users.passwords import AT_A_TIME, Passwords
-from abbe.service.users.people import ANONYMOUS, digest_of
+from abbe.service.users.people import ANONYMOUS, AT_A_TIME, Passwords, digest_of
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.users.conftest import PHRASE, World
 

@@ -21,10 +21,9 @@ from abbe.service.clock import SystemClock
 from abbe.service.core.board import Board
 from abbe.service.domain.push_entry import S
 from abbe.service.domain.schedule import Schedule
-from abbe.service.plant.facts import PlantFacts
-from abbe.service.plant.gather import Gatherer
+from abbe.service.plant.gather import Gatherer, PlantFacts
 from abbe.service.plant.mtconnect import Agent
-from abbe.service.plant.opcua.picture import picture_of
+from abbe.service.plant.opcua.space import picture_of
 from abbe.service.push.journal import StoreBook
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusReader

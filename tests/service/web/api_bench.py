@@ -34,9 +34,8 @@ from abbe.service.queries.status import StatusReader
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
-from abbe.service.tables.base_table import Base
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.tables.nine_tables import Base
+from abbe.service.users.people import Passwords, People
 from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app

@@ -9,10 +9,8 @@ from typing import Any
 import httpx
 import pytest
 
-from abbe.service.compensation.proposal_checks import valid_approval
-from abbe.service.compensation.proposal_decisions import check_waiting, reject
+from abbe.service.compensation.proposal_decisions import check_waiting, proposal_status, reject, valid_approval
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.domain.decisions import ProposalRejection
 from abbe.service.errors import TableRefused
 from tests.service.web.api_bench import Plant
@@ -129,7 +127,7 @@ async def test_a_rejection_is_final_and_says_why(client, plant, fresh):
 
 
 async def test_a_push_is_told_of_a_rejection(plant, fresh):
-    from abbe.service.compensation.proposal_checks import PushPrecheck
+    from abbe.service.compensation.gate import PushPrecheck
 
     rejection = reject(plant.store, fresh, "somebody", "no", plant.clock, "user:somebody")
     assert isinstance(rejection, ProposalRejection)

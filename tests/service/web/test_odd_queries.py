@@ -19,8 +19,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.storage.store import Store
-from abbe.service.users.passwords import Passwords
-from abbe.service.users.people import People
+from abbe.service.users.people import Passwords, People
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.login.auth_middleware import CSRF_HEADER

@@ -1,4 +1,6 @@
-"""Text files and their numbers, written unambiguously for controls and read with file and line of every mistake."""
+"""Files of an export: text files and their numbers, written unambiguously for controls and read with file and line of every mistake; and
+the settings of an export for one machine.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1
+from abbe.models.machine import Machine
 from abbe.service.errors import TableFileError
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -76,3 +79,45 @@ def increasing(file: TextFile, position: list[float], lines: list[int]) -> None:
     for before, now, line in zip(position, position[1:], lines[1:], strict=False):
         if not now > before:
             raise file.wrong(line, f"position {now:g} after {before:g}: positions have to increase from line to line")
+
+
+@dataclass(frozen=True)
+class FormatSettings:
+    """Attributes.
+
+    reference_mm : (x, y, z), optional
+        Position at which the tables must be zero (reference point, home); None: not checked.
+    decimals : int
+        Decimals of millimetres. Angles have three more.
+    points : int, optional
+        Largest number of points of a table on this machine (Siemens MD38000, MD18342; Fanuc option); None: limit of the format.
+    machine : Machine, optional
+        Nominal geometry for a control with a kinematic model (ISG).
+    axis_names : (str, str, str)
+        Siemens machine axes of X, Y, Z.
+    unit_mm, magnification, largest_step : Fanuc
+        Detection unit; parameter 3623; largest number of a point (127, on old series 7).
+    first_point : int
+        Fanuc: number of the first point that may be used.
+    counts_per_mm : float
+        Centroid: encoder counts per millimetre.
+    power_of_two : bool
+        Heidenhain TNC 4xx: spacing is a power of two times 0.1 µm.
+    """
+
+    reference_mm: tuple[float, float, float] | None = None
+    decimals: int = 6
+    points: int | None = None
+    machine: Machine | None = None
+    axis_names: tuple[str, str, str] = ("X1", "Y1", "Z1")
+    unit_mm: float = 0.001
+    magnification: int = 1
+    largest_step: int = 127
+    first_point: int = 0
+    counts_per_mm: float = 1000.0
+    power_of_two: bool = False
+
+    @property
+    def step_mm(self) -> float:
+        """Value of one unit in the last decimal, mm."""
+        return float(10.0**-self.decimals)

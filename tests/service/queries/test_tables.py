@@ -7,12 +7,11 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from abbe.service.compensation.proposal_decisions import approve, reject
+from abbe.service.compensation.proposal_decisions import approve, proposal_status, reject
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.proposal_states import proposal_status
 from abbe.service.errors import NotStored, TableRefused, Unusable
-from abbe.service.queries.proposals import ProposalSummary, difference, proposal, proposals
 from abbe.service.queries.reader import Reader
+from abbe.service.queries.tables import ProposalSummary, difference, proposal, proposals
 from tests.service.web.api_bench import Plant
 
 

@@ -1,4 +1,4 @@
-"""Proposed tables and the state of each."""
+"""Proposed tables and the state of each, the push journal, and the table in force with its history."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
+from abbe.service.compensation.proposal_decisions import ProposalStatus, proposal_status
 from abbe.service.compensation.proposal_diff import ACTIVE, TableDifference, compare
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposal_states import ProposalStatus, proposal_status
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
+from abbe.service.domain.push_entry import PushEntry, PushState, PushTransition
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
-from abbe.service.tables.push_journal import JournalView
+from abbe.service.tables.push_journal import JournalView, TableHistory
 
 ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
 OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
@@ -180,3 +181,23 @@ def difference_of(found: TableDifference) -> ProposalDifference:
         for c in found.curves
     ]
     return ProposalDifference(new=found.new, old=found.old, tables=tables)
+
+
+def push_entries(
+    reader: Reader, machine: str | None, push: int | None, state: str | None, cursor: int | None, limit: int
+) -> tuple[list[PushTransition], int | None]:
+    """The push journal, newest entry first; a renamed machine keeps its journal under the first name."""
+    journal = machine and reader.store.pushes.chain(machine, reader.control_of(machine))
+    rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
+    return [of_row(PushTransition, row, state=PushState(row["state"])) for row in rows], after
+
+
+def push_entry(reader: Reader, number: int) -> PushEntry:
+    """One entry of the journal with the facts that it recorded. Raises NotStored."""
+    row = reader.row("pushes", number, "entry of a push")
+    return of_row(PushEntry, row, state=PushState(row["state"]))
+
+
+def tables(reader: Reader) -> TableHistory:
+    """The table in force on this service's machine, its pushes, and the possible rollback. Raises JournalChanged."""
+    return JournalView.read(reader.store, reader.machine, reader.control).history()
