@@ -54,6 +54,7 @@ from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_to
 from abbe.service.web.process.serving import make_server
 from tests.built_once import once_per_run
 from tests.pretended_push import KEPT, TAKEN_BACK, as_if_pushed
+from tests.run_documents import runs_of
 from tests.scenarios.campaign_files import measured
 from tests.service.discovery.discovery_bench import Search, write_case
 from tests.system.serve_check import Result
@@ -81,7 +82,8 @@ class Filled:
 
 
 def _solved(_folder: Path) -> tuple[Solved, str]:
-    solved = solve_runs(*measured(SEED))
+    site, runs = measured(SEED)
+    solved = solve_runs(site, runs_of(runs))
     return solved, json.dumps(solution_doc(solved))
 
 

@@ -15,10 +15,11 @@ from abbe.models.effects.path import Path, Places
 from abbe.models.effects.probe_paths import probe_paths
 from abbe.models.functions.motions import ErrorMotions
 from abbe.models.geometry.chain import deviation_mm
-from abbe.models.machine import AXES, Machine
+from abbe.models.machine import Machine
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.devices.urls import DeviceUrls
-from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT
+from abbe.service.domain.run import Columns, Run, parsed_setup
+from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT
 from abbe.service.effects.effect_catalogue import catalogue, checked
 from abbe.service.errors import EffectUnknown, Unusable
 from abbe.service.runs.cases import path_of
@@ -90,9 +91,8 @@ def simulate(
     for test in tests:
         clock_s += SETUP_S if test.mounts else 0.0
         run = _run(name, doc, test, clock_s, settings)
-        clock_s = run["columns"]["t_s"][-1]
-        run["columns"]["deviation_mm"] = simulated.read(path_of(run, machine, 2, 0.0), wanted).tolist()
-        runs.append(run)
+        clock_s = float(run.columns.t_s[-1])
+        runs.append(run.with_readings(simulated.read(path_of(run, machine, 2, 0.0), wanted)))
     head = {
         "format": CAMPAIGN_FORMAT,
         "campaign": name,
@@ -164,14 +164,27 @@ def _coefficient(effect: Effect, strength: float, values: Values) -> float:
     return float(brentq(above, -reach, reach, xtol=1e-12))
 
 
-def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, instruments: SimulatedInstruments) -> dict[str, Any]:
-    """An ``abbe-run/1`` object without readings."""
+def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, instruments: SimulatedInstruments) -> Run:
+    """A run without readings."""
     paths = [_path_rows(step, begins_s, instruments) for step in test.steps if isinstance(step, RecordPath)]
     t_s, q_mm, feed, direction = paths[0] if paths else _standing_rows(test, begins_s)
-    columns = {"t_s": t_s.tolist(), **{f"{a.lower()}_mm": q_mm[:, k].tolist() for k, a in enumerate(AXES)}}
-    columns |= {"feed_mm_min": feed.tolist(), "direction": [int(v) for v in direction], "deviation_mm": None}
-    head = {"format": RUN_FORMAT, "campaign": campaign, "run_id": test.label, "test": test.test, "role": test.role, "machine": machine}
-    return head | {"setup": test.setup | {"t_set_s": begins_s}, "columns": columns}
+    return Run(
+        campaign=campaign,
+        run_id=test.label,
+        test=test.test,
+        role=test.role,
+        machine=machine,
+        setup=parsed_setup(test.test, test.setup | {"t_set_s": begins_s}),
+        columns=Columns(
+            t_s=t_s,
+            q_mm=q_mm,
+            feed_mm_min=feed,
+            direction=direction,
+            deviation_mm=None,
+            valid=np.ones(t_s.size, dtype=np.bool_),
+            valid_stated=False,
+        ),
+    )
 
 
 _Rows = tuple[F1, F2, F1, F1]

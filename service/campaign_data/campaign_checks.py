@@ -19,9 +19,10 @@ from abbe.service.campaign_data.campaign_issue import CampaignIssue
 from abbe.service.campaign_data.copied_runs import copy_issues
 from abbe.service.campaign_data.run_geometry import geometry_mistake
 from abbe.service.campaign_data.run_times import time_issues
+from abbe.service.domain.document import Doc
+from abbe.service.domain.run import BarSetup, Run
 from abbe.service.errors import CampaignRefused
 
-Doc = dict[str, Any]
 LARGEST_MM = 2.0
 """Largest plausible deviation: many larger numbers are in another unit, single ones are outliers."""
 NO_READING_MM = 1000.0
@@ -61,21 +62,21 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
         raise CampaignRefused(f"run {bad[0].run}: {bad[0].what}{more}", f"{bad[0].remedy}; nothing was stored")
 
 
-def check_files(machine: Doc, runs: Sequence[Doc]) -> list[CampaignIssue]:
+def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
     """Issues that need no model: machine, geometry, units, times, copies, too few readings.
 
-    ``machine``: the campaign's machine object; ``runs``: ``abbe-run/1`` objects with readings.
+    ``machine``: the campaign's machine object; ``runs``: with readings.
     """
-    out = _twice([str(r["run_id"]) for r in runs])
+    out = _twice([r.run_id for r in runs])
     for run in runs:
         out += _other_machine(machine, run) or geometry_issues(machine, run)
         out += _readings(run)
     return _nothing_measured(runs) + out + time_issues(runs) + copy_issues(runs)
 
 
-def _nothing_measured(runs: Sequence[Doc]) -> list[CampaignIssue]:
+def _nothing_measured(runs: Sequence[Run]) -> list[CampaignIssue]:
     """Runs with constant readings: refused if all runs are constant, otherwise flagged."""
-    still = [r["run_id"] for r in runs if _constant(r)]
+    still = [r.run_id for r in runs if _constant(r)]
     if not still:
         return []
     if len(still) == len(runs):
@@ -84,15 +85,15 @@ def _nothing_measured(runs: Sequence[Doc]) -> list[CampaignIssue]:
     return [CampaignIssue(n, "all its readings are the same: nothing was measured", "leave it out (--without)", False) for n in still]
 
 
-def _constant(run: Doc) -> bool:
-    y = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
+def _constant(run: Run) -> bool:
+    y = run.columns.readings_mm
     return bool(y.size and (y == y[0]).all())
 
 
-def geometry_issues(machine: Doc, run: Doc) -> list[CampaignIssue]:
+def geometry_issues(machine: Doc, run: Run) -> list[CampaignIssue]:
     """Issues of a run whose points do not lie where its set-up says, or not inside the strokes."""
     what = geometry_mistake(machine, run)
-    return [CampaignIssue(run["run_id"], what.text, what.remedy, what.refuse)] if what else []
+    return [CampaignIssue(run.run_id, what.text, what.remedy, what.refuse)] if what else []
 
 
 def _twice(names: list[str]) -> list[CampaignIssue]:
@@ -100,13 +101,13 @@ def _twice(names: list[str]) -> list[CampaignIssue]:
     return [CampaignIssue(n, "two runs have this run_id", "give each run its own", True) for n in twice]
 
 
-def _other_machine(machine: Doc, run: Doc) -> list[CampaignIssue]:
-    theirs = run.get("machine") or {}
+def _other_machine(machine: Doc, run: Run) -> list[CampaignIssue]:
+    theirs = run.machine
     for key, title in (("name", "name"), ("chain", "chain"), ("stroke_mm", "strokes"), ("pivots_mm", "pivots"), ("tool_mm", "tool")):
         ours, other = machine.get(key), theirs.get(key)
         if ours is not None and other is not None and not _same(ours, other):
             what = f"measured on another machine: {title} {_short(other)}, the campaign's is {_short(ours)}"
-            return [CampaignIssue(run["run_id"], what, "leave it out (--without), or correct its machine object", True)]
+            return [CampaignIssue(run.run_id, what, "leave it out (--without), or correct its machine object", True)]
     return []
 
 
@@ -128,11 +129,9 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, int | float) else repr(value)
 
 
-def _readings(run: Doc) -> list[CampaignIssue]:
+def _readings(run: Run) -> list[CampaignIssue]:
     """Issues of times, size and number of one run's readings."""
-    label, columns = run["run_id"], run["columns"]
-    y, t = (np.asarray(columns[k], dtype=np.float64) for k in ("deviation_mm", "t_s"))
-    valid = np.asarray(columns.get("valid", np.ones(y.size))).astype(bool)
+    label, y, t, valid = run.run_id, run.columns.readings_mm, run.columns.t_s, run.columns.valid
     if not (np.isfinite(y[valid]).all() and np.isfinite(t).all()):
         return [
             CampaignIssue(
@@ -164,16 +163,18 @@ def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> 
     return []
 
 
-def _too_few(run: Doc, count: int) -> list[CampaignIssue]:
+def _too_few(run: Run, count: int) -> list[CampaignIssue]:
     """Flag a ball-bar run with few readings; `abbe.service.runs.observations` refuses fewer than 10."""
-    turns = float(run["setup"].get("turns") or 1.0)
+    if not isinstance(run.setup, BarSetup):
+        return []
+    turns = run.setup.turns or 1.0
     wanted = max(FEWEST_BAR, int(np.ceil(PER_TURN * turns)))
-    if not run["test"].startswith("ballbar") or not 10 <= count < wanted:
+    if not 10 <= count < wanted:
         return []
     what = (
         f"only {count} valid readings on {turns:g} turns: cup, bar length and lost motion take most of what they tell ({wanted} are needed)"
     )
-    return [CampaignIssue(run["run_id"], what, "measure it again with a higher rate", False)]
+    return [CampaignIssue(run.run_id, what, "measure it again with a higher rate", False)]
 
 
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[CampaignIssue]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from abbe.service.campaign_data.provenance import machine_digest, run_digest
 from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.errors import CampaignRefused
 from abbe.service.runs.cases import with_earliest_mounting
@@ -26,7 +27,7 @@ class Campaign:
 
     name: str
     site: Site
-    runs: list[dict[str, Any]]
+    runs: list[Run]
     folder: Path | None
     doc: dict[str, Any] = field(default_factory=dict)
     removed: TableTakenOut | None = None
@@ -39,11 +40,11 @@ class Campaign:
         CampaignRefused
             The campaign has no such run.
         """
-        names = [r["run_id"] for r in self.runs]
+        names = [r.run_id for r in self.runs]
         missing = [n for n in labels if n not in names]
         if missing:
             raise CampaignRefused(f"campaign {self.name} has no run {missing[0]}", f"it has {', '.join(names)}")
-        return Campaign(self.name, self.site, [r for r in self.runs if r["run_id"] not in labels], self.folder, self.doc, self.removed)
+        return replace(self, runs=[r for r in self.runs if r.run_id not in labels])
 
 
 def is_folder(campaign: str) -> bool:
@@ -60,7 +61,7 @@ def from_folder(folder: Path) -> Campaign:
         For the first mistake in any file.
     """
     content = read_folder(folder)
-    return _campaign(content.campaign["campaign"], content.campaign, content.runs, folder)
+    return _campaign(content.campaign["campaign"], content.campaign, content.runs(), folder)
 
 
 def from_store(store: Store, name: str) -> Campaign:
@@ -78,7 +79,7 @@ def from_store(store: Store, name: str) -> Campaign:
     return _campaign(record.name, doc, runs, None)
 
 
-def _campaign(name: str, doc: dict[str, Any], runs: list[dict[str, Any]], folder: Path | None) -> Campaign:
+def _campaign(name: str, doc: dict[str, Any], runs: list[Run], folder: Path | None) -> Campaign:
     machine = doc["machine"]
     site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
     return Campaign(name, site, with_earliest_mounting(runs), folder, doc)
@@ -129,18 +130,18 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
 def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:
     """Refuse unless the stored campaign has the same machine, readings and set-ups: solutions refer to its runs."""
     differs = None
-    there = {r["run_id"]: r for r in with_earliest_mounting([load_run(store, number) for number in ids.values()])}
+    there = {r.run_id: r for r in with_earliest_mounting([load_run(store, number) for number in ids.values()])}
     if machine_digest(machine_from_doc(machine)) != machine_digest(campaign.site.machine):
         differs = "the machine (chain, strokes, pivots or tool)"
     for run in campaign.runs:
-        if differs is None and run["role"] == "identify":
-            stored = there.get(run["run_id"])
+        if differs is None and run.identifies:
+            stored = there.get(run.run_id)
             if stored is None:
-                differs = f"run {run['run_id']} is missing there"
-            elif stored["columns"] != run["columns"]:
-                differs = f"run {run['run_id']}"
-            elif run_digest(stored) != run_digest(run) or stored["role"] != run["role"]:
-                differs = f"test, role or set-up of run {run['run_id']}"
+                differs = f"run {run.run_id} is missing there"
+            elif not stored.columns.equals(run.columns):
+                differs = f"run {run.run_id}"
+            elif run_digest(stored) != run_digest(run) or stored.role != run.role:
+                differs = f"test, role or set-up of run {run.run_id}"
     if differs is not None:
         what = differs if differs.endswith("there") else f"{differs} differs"
         raise CampaignRefused(

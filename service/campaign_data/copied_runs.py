@@ -8,19 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.arrays import F1
 from abbe.service.campaign_data.campaign_issue import CampaignIssue
+from abbe.service.domain.run import Run
 
-Doc = dict[str, Any]
 COPIED_SHARE = 0.98
 """Share of equal readings, positions included, from which a run is a copy: noise differs every time."""
 VISIBLE_STEPS = 2.0
 """Rms second difference of the readings, in sensor steps, above which they show noise: rounding alone gives 0.7."""
 NOTHING_MM = 1e-9
-STATE = ("x_mm", "y_mm", "z_mm", "direction")
 
 
-def copy_issues(runs: Sequence[Doc]) -> list[CampaignIssue]:
+def copy_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
     """Issues of runs whose readings occur in an earlier run, regardless of their labels.
 
     If the readings show noise, equal readings are a copy whatever their times. Repeats with a coarse sensor can be equal without noise:
@@ -31,8 +29,8 @@ def copy_issues(runs: Sequence[Doc]) -> list[CampaignIssue]:
     for k, run in enumerate(runs):
         for j in range(k):
             if _copied(rows[j], rows[k]) and (_shows_noise(run) or _copied(_timed(runs[j], rows[j]), _timed(run, rows[k]))):
-                what = f"its readings are those of run {runs[j]['run_id']}: one measurement would count twice"
-                out.append(CampaignIssue(run["run_id"], what, "leave it out (--without), or export it again", True))
+                what = f"its readings are those of run {runs[j].run_id}: one measurement would count twice"
+                out.append(CampaignIssue(run.run_id, what, "leave it out (--without), or export it again", True))
                 break
     return out
 
@@ -43,24 +41,26 @@ def _copied(one: Counter[Any], other: Counter[Any]) -> bool:
     return shorter > 0 and (one & other).total() >= COPIED_SHARE * shorter
 
 
-def _rows(run: Doc) -> Counter[Any]:
+def _rows(run: Run) -> Counter[Any]:
     """Position and deviation of every reading, in 10 nm and 0.01 nm; empty for a run with constant deviations."""
-    y = _column(run, "deviation_mm")
+    y = run.columns.readings_mm
     if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
         return Counter()
-    steps = ((y, 1e8), *((_column(run, c), 1e5) for c in ("x_mm", "y_mm", "z_mm")))
+    steps = ((y, 1e8), *((along, 1e5) for along in run.columns.q_mm.T))
     return Counter(zip(*(np.rint(v * n).tolist() for v, n in steps), strict=True))
 
 
-def _timed(run: Doc, rows: Counter[Any]) -> Counter[Any]:
+def _timed(run: Run, rows: Counter[Any]) -> Counter[Any]:
     """Time, ms, and deviation of every reading."""
-    return Counter(zip(np.rint(_column(run, "t_s") * 1e3).tolist(), _column(run, "deviation_mm").tolist(), strict=True)) if rows else rows
+    columns = run.columns
+    return Counter(zip(np.rint(columns.t_s * 1e3).tolist(), columns.readings_mm.tolist(), strict=True)) if rows else rows
 
 
-def _shows_noise(run: Doc) -> bool:
+def _shows_noise(run: Run) -> bool:
     """Whether the readings show noise, so that a repeated measurement would differ: places visited again read differently, or, without
     repeated places, the second differences exceed those from rounding."""
-    y, states = _column(run, "deviation_mm"), zip(*(_column(run, c).tolist() for c in STATE), strict=True)
+    y, columns = run.columns.readings_mm, run.columns
+    states = map(tuple, np.column_stack([columns.q_mm, columns.direction]).tolist())
     places: dict[Any, list[float]] = {}
     for state, v in zip(states, y.tolist(), strict=True):
         places.setdefault(state, []).append(v)
@@ -70,7 +70,3 @@ def _shows_noise(run: Doc) -> bool:
     steps = np.diff(np.unique(y))
     steps = steps[steps > NOTHING_MM]
     return bool(y.size > 2 and steps.size and np.sqrt(np.mean(np.diff(y, 2) ** 2)) > VISIBLE_STEPS * steps.min())
-
-
-def _column(run: Doc, name: str) -> F1:
-    return np.asarray(run["columns"][name], dtype=np.float64)

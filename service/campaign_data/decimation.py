@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
+from abbe.models.arrays import F1
 from abbe.service.domain.discovery_file import FoundThinning
+from abbe.service.domain.run import Run
 
 MOST_READINGS = 20000
 """Largest number of ball-bar readings that a search takes unchanged; more are averaged in blocks until about this many remain."""
@@ -48,14 +50,14 @@ def _not_seen(*, each: int, means: bool, interval_s: float, turning: int) -> lis
 REMEDY = f"to see it, search fewer runs (--without RUN): up to {MOST_READINGS} ball-bar readings are searched as they were read"
 
 
-def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> FoundThinning | None:
+def thinning(before: list[Run], after: list[Run]) -> FoundThinning | None:
     """The effect of `thinned` or `picked` on runs, given the same runs in the same order before and after; None if unchanged."""
     pairs = [(b, a) for b, a in zip(before, after, strict=True) if _measured_bar(b)]
-    changed = [(b, a) for b, a in pairs if len(a["columns"]["t_s"]) < len(b["columns"]["t_s"])]
+    changed = [(b, a) for b, a in pairs if len(a.columns) < len(b.columns)]
     if not changed:
         return None
-    readings, kept = (sum(len(r["columns"]["t_s"]) for r in some) for some in zip(*pairs, strict=True))
-    interval = float(np.median(np.concatenate([np.diff(a["columns"]["t_s"]) for _, a in changed])))
+    readings, kept = (sum(len(r.columns) for r in some) for some in zip(*pairs, strict=True))
+    interval = float(np.median(np.concatenate([np.diff(a.columns.t_s) for _, a in changed])))
     means = any(not np.isin(_finite(a), _finite(b)).all() for b, a in changed)
     each = -(-readings // MOST_READINGS) if means else _step(*changed[0])
     turning = sum(_turning(b, each) for b, _ in changed)
@@ -71,30 +73,29 @@ def thinning(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Found
     )
 
 
-def _step(before: dict[str, Any], after: dict[str, Any]) -> int:
+def _step(before: Run, after: Run) -> int:
     """Number of readings from one picked value to the next."""
-    first, second = np.searchsorted(before["columns"]["t_s"], after["columns"]["t_s"][:2])
+    first, second = np.searchsorted(before.columns.t_s, after.columns.t_s[:2])
     return int(second - first)
 
 
-def _finite(run: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _finite(run: Run) -> F1:
     """The finite readings; a flagged one may be NaN."""
-    values = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
+    values = run.columns.readings_mm
     return np.asarray(values[np.isfinite(values)])
 
 
-def _turning(run: dict[str, Any], each: int) -> int:
+def _turning(run: Run, each: int) -> int:
     """Number of blocks of ``each`` readings inside which an axis reverses."""
     inside: set[int] = set()
-    for axis in "xyz":
-        step = np.diff(np.asarray(run["columns"][f"{axis}_mm"], dtype=np.float64))
+    for step in np.diff(run.columns.q_mm, axis=0).T:
         moving = np.flatnonzero(np.abs(step) > STILL_MM)
         turns = np.flatnonzero(np.diff(np.sign(step[moving])) != 0)
         inside |= {int(k) // each for k in moving[turns + 1]}
     return len(inside)
 
 
-def thinned(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def thinned(runs: list[Run]) -> list[Run]:
     """Runs with as many ball-bar readings as a search can process.
 
     Every measured ball-bar run is averaged over the same number of neighbours, so that the noise of a value is the same in all of them.
@@ -102,61 +103,57 @@ def thinned(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
     incomplete block at the end of a run is dropped.
     """
     long = [r for r in runs if _measured_bar(r)]
-    total = sum(len(r["columns"]["t_s"]) for r in long)
+    total = sum(len(r.columns) for r in long)
     block = -(-total // MOST_READINGS)
     return runs if block <= 1 else [_means(r, block) if _measured_bar(r) else r for r in runs]
 
 
-def picked(runs: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
+def picked(runs: list[Run], most: int) -> list[Run]:
     """Runs with about ``most`` measured ball-bar readings: the middle reading of every block, unchanged.
 
     Means have less noise, but a mean over a reversal mixes both sides, and lost motion or friction well above the noise then matches no
     formula. A run shorter than `FEWEST` blocks stays unchanged.
     """
-    total = sum(len(r["columns"]["t_s"]) for r in runs if _measured_bar(r))
+    total = sum(len(r.columns) for r in runs if _measured_bar(r))
     block = -(-total // most)
     return runs if block <= 1 else [_picks(r, block) if _measured_bar(r) else r for r in runs]
 
 
-def _picks(run: dict[str, Any], block: int) -> dict[str, Any]:
-    if len(run["columns"]["t_s"]) < FEWEST * block:
+def _picks(run: Run, block: int) -> Run:
+    if len(run.columns) < FEWEST * block:
         return run
-    return run | {"columns": {k: v if v is None else v[block // 2 :: block] for k, v in run["columns"].items()}}
+    return replace(run, columns=run.columns.rows(slice(block // 2, None, block)))
 
 
-def _measured_bar(run: dict[str, Any]) -> bool:
-    return run["test"].startswith("ballbar") and run["columns"]["deviation_mm"] is not None
+def _measured_bar(run: Run) -> bool:
+    return run.is_bar and not run.is_sealed
 
 
-def _means(run: dict[str, Any], block: int) -> dict[str, Any]:
+def _means(run: Run, block: int) -> Run:
     """One value per block at its middle reading: the mean of the readings minus their nominal values, plus the nominal value there.
 
     Without the nominal values, the mean of points on a sphere would lie inside it. A block with a gap in time is dropped.
     """
-    columns = run["columns"]
-    count = len(columns["t_s"]) // block
+    columns = run.columns
+    count = len(columns) // block
     if count < FEWEST:
         return run
     rows = np.arange(count * block).reshape(count, block)
-    t = np.asarray(columns["t_s"], dtype=np.float64)[rows]
+    t = columns.t_s[rows]
     span = t[:, -1] - t[:, 0]
     rows = rows[span <= GAP * np.median(span)]
     middle = rows[:, block // 2]
-    out = {name: np.asarray(values)[middle].tolist() for name, values in columns.items() if values is not None}
-    valid = np.asarray(columns.get("valid", np.ones(len(columns["t_s"]))), dtype=np.float64)[rows]
+    valid = columns.valid.astype(np.float64)[rows]
     some = valid.sum(axis=1) > 0
     weight = np.where(some[:, None], valid, 1.0)
     nominal = _nominal_mm(run)
-    off = (np.asarray(columns["deviation_mm"], dtype=np.float64) - nominal)[rows]
+    off = (columns.readings_mm - nominal)[rows]
     off = np.where(weight > 0.0, off, 0.0)  # a flagged reading may be NaN
-    out["deviation_mm"] = ((off * weight).sum(axis=1) / weight.sum(axis=1) + nominal[middle]).tolist()
-    if "valid" in columns:
-        out["valid"] = some.astype(int).tolist()
-    return run | {"columns": out}
+    means = (off * weight).sum(axis=1) / weight.sum(axis=1) + nominal[middle]
+    return replace(run, columns=replace(columns.rows(middle), deviation_mm=means, valid=some))
 
 
-def _nominal_mm(run: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _nominal_mm(run: Run) -> F1:
     """Reading of the bar on a perfect machine at the commanded points, mm: a path of chords runs slightly inside its sphere."""
-    q = np.column_stack([np.asarray(run["columns"][f"{c}_mm"], dtype=np.float64) for c in "xyz"])
-    away = np.linalg.norm(q - np.asarray(run["setup"]["centre_mm"], dtype=np.float64), axis=1)
-    return np.asarray(away - float(run["setup"]["radius_mm"]))
+    away = np.linalg.norm(run.columns.q_mm - run.bar.centre_mm, axis=1)
+    return np.asarray(away - run.bar.radius_mm)

@@ -8,55 +8,58 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from abbe.models.arrays import F1
 from abbe.models.machine import Machine
+from abbe.service.domain.run import Run
 
 SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
-AS_MEASURED, LESS = "as_measured", "less"
-"""Keys of a run with changed readings: digest of the measured data, and descriptions of what was subtracted."""
 
 
-def run_digest(run: dict[str, Any]) -> str:
+def run_digest(run: Run) -> str:
     """SHA-256 of test, set-up and the columns that a solution uses; label and campaign do not count."""
-    out = hashlib.sha256(json.dumps([run["test"], run["setup"]], sort_keys=True).encode())
+    out = hashlib.sha256(json.dumps([run.test, run.setup.document], sort_keys=True).encode())
+    columns = run.columns.by_name()
     for name in SETUP_OF_DATA:
-        values = run["columns"].get(name)
+        values = columns.get(name)
         out.update(name.encode())
         out.update(b"-" if values is None else np.asarray(values, dtype="<f8").tobytes())
     return out.hexdigest()
 
 
-def with_changed_columns(run: dict[str, Any], columns: dict[str, Any], removed: str) -> dict[str, Any]:
-    """The run with new columns, the digest of its measured data, and a description of what was subtracted."""
-    return run | {"columns": columns, AS_MEASURED: measured_digest(run), LESS: [*run.get(LESS, ()), removed]}
+def with_changed_readings(run: Run, deviation_mm: F1, removed: str) -> Run:
+    """The run with new readings, the digest of its measured data, and a description of what was subtracted."""
+    changed = run.with_readings(deviation_mm)
+    return replace(changed, measured_digest=measured_digest(run), subtracted=(*run.subtracted, removed))
 
 
-def measured_digest(run: dict[str, Any]) -> str:
+def measured_digest(run: Run) -> str:
     """`run_digest` of the measured data, before any subtraction."""
-    return str(run.get(AS_MEASURED) or run_digest(run))
+    return run.measured_digest or run_digest(run)
 
 
-def removals_of(runs: list[dict[str, Any]]) -> list[str]:
+def removals_of(runs: list[Run]) -> list[str]:
     """Descriptions of everything that was subtracted from the readings, without duplicates."""
-    return sorted({text for run in runs for text in run.get(LESS, ())})
+    return sorted({text for run in runs for text in run.subtracted})
 
 
-def whole_run_digest(run: dict[str, Any]) -> str:
+def whole_run_digest(run: Run) -> str:
     """SHA-256 of everything that a search can use of a run: label, test, role, machine, set-up and all columns.
 
     For changed readings the digest of the measured ones and the descriptions of what was subtracted count, because the subtracted values
     may differ in the last digit between computers.
     """
-    out = hashlib.sha256(json.dumps([run[k] for k in ("run_id", "test", "role", "machine", "setup")], sort_keys=True).encode())
-    if AS_MEASURED in run:
-        out.update(json.dumps([run[AS_MEASURED], run[LESS]]).encode())
-    for name, values in sorted(run["columns"].items()):
-        if values is not None and not (name == "deviation_mm" and AS_MEASURED in run):
+    out = hashlib.sha256(json.dumps([run.run_id, run.test, run.role, run.machine, run.setup.document], sort_keys=True).encode())
+    if run.measured_digest:
+        out.update(json.dumps([run.measured_digest, list(run.subtracted)]).encode())
+    for name, values in sorted(run.columns.by_name().items()):
+        if not (name == "deviation_mm" and run.measured_digest):
             out.update(name.encode() + np.asarray(values, dtype="<f8").tobytes())
     return out.hexdigest()
 

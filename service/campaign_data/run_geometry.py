@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.service.domain.document import Doc
+from abbe.service.domain.run import BarSetup, LaserSetup, Run
 
-Doc = dict[str, Any]
 Distance = Callable[[F2], float]
 
 TOLERANCE_MM = 1.5
@@ -33,20 +33,18 @@ class GeometryMistake:
     refuse: bool = True
 
 
-def geometry_mistake(machine: Doc, run: Doc) -> GeometryMistake | None:
+def geometry_mistake(machine: Doc, run: Run) -> GeometryMistake | None:
     """The first mistake in the geometry of a run; None without one. Missing keys are not checked."""
-    setup, columns = run["setup"], run["columns"]
-    points = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in AXES])
+    points, setup = run.columns.q_mm, run.setup
     if not np.isfinite(points).all():
         return GeometryMistake("a position is not a finite number", "correct x_mm, y_mm, z_mm")
-    check = _bar if run["test"].startswith("ballbar") else _laser
-    found = check(run["test"], setup, points)
+    found = _bar(run.test, setup, points) if isinstance(setup, BarSetup) else _laser(run.test, setup, points)
     return found or _inside(machine, points)
 
 
-def _bar(test: str, setup: Doc, points: F2) -> GeometryMistake | None:
-    centre, radius = np.asarray(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"])
-    plane = str(setup.get("plane") or "").lower() if test == "ballbar_circle" else ""
+def _bar(test: str, setup: BarSetup, points: F2) -> GeometryMistake | None:
+    centre, radius = setup.centre_mm, setup.radius_mm
+    plane = setup.plane.lower() if test == "ballbar_circle" else ""
 
     def off(p: F2, c: F1 = centre, r: float = radius) -> float:
         return float(np.abs(np.linalg.norm(p - c, axis=1) - r).max())
@@ -83,10 +81,10 @@ def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> GeometryMi
     return None
 
 
-def _laser(test: str, setup: Doc, points: F2) -> GeometryMistake | None:
-    if setup.get("start_mm") is None or setup.get("end_mm") is None:
+def _laser(test: str, setup: LaserSetup, points: F2) -> GeometryMistake | None:
+    start, end = setup.start_mm, setup.end_mm
+    if start is None or end is None:
         return None
-    start, end = (np.asarray(setup[k], dtype=np.float64) for k in ("start_mm", "end_mm"))
     mistake = _direction(test, setup, end - start)
     if mistake is not None:
         return mistake
@@ -104,33 +102,33 @@ def _laser(test: str, setup: Doc, points: F2) -> GeometryMistake | None:
     return _sequence(setup, points) if test == "laser_diagonal" else None
 
 
-def _direction(test: str, setup: Doc, span: F1) -> GeometryMistake | None:
+def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None:
     """Check beam, axis, letters of the diagonal and increments against the line from start to end."""
     unit = span / max(float(np.linalg.norm(span)), 1e-9)
-    beam = setup.get("nominal_beam")
+    beam = setup.nominal_beam
     if beam is not None and float(np.dot(beam, unit)) < 0.999 * float(np.linalg.norm(beam)):
         return GeometryMistake("nominal_beam does not point from start_mm to end_mm", "correct the set-up: exchanged or reversed axes")
-    if test == "laser_linear" and abs(unit["XYZ".index(setup["axis"])]) < 0.999:
+    if test == "laser_linear" and abs(unit["XYZ".index(setup.axis)]) < 0.999:
         moved = "XYZ"[int(np.argmax(np.abs(unit)))]
-        return GeometryMistake(f"axis is {setup['axis']}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
-    letters = setup.get("diagonal") if test == "laser_diagonal" else None
+        return GeometryMistake(f"axis is {setup.axis}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
+    letters = setup.diagonal if test == "laser_diagonal" else ""
     if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True) if s):  # a face diagonal leaves one axis alone
         return GeometryMistake(f"diagonal is {letters}, but start_mm and end_mm run otherwise", "correct diagonal, start_mm or end_mm")
-    step, count = setup.get("increment_mm"), setup.get("steps")
-    allowed = TOLERANCE_MM + 2.0 * float(setup.get("overrun_mm") or 0.0)  # the ends are the turning points
-    if isinstance(step, list | tuple) and count and float(np.abs(np.asarray(step) * count - span).max()) > allowed:
+    step, count = setup.increment_mm, setup.steps
+    allowed = TOLERANCE_MM + 2.0 * setup.overrun_mm  # the ends are the turning points
+    if step is not None and step.ndim and count and float(np.abs(step * count - span).max()) > allowed:
         return GeometryMistake(
             f"{count} steps of increment_mm do not lead from start_mm to end_mm", "correct increment_mm, steps or the ends"
         )
     return None
 
 
-def _sequence(setup: Doc, points: F2) -> GeometryMistake | None:
+def _sequence(setup: LaserSetup, points: F2) -> GeometryMistake | None:
     """Check the outward path of a step diagonal: one axis after the other, in the order of the set-up (default X, Y, Z)."""
-    count = int(setup.get("steps") or 0)
-    if count == 0 or len(points) < 3 * count + 1 or (setup.get("order") == "" and len(points) <= 2 * count + 2):
+    count = setup.steps
+    if count == 0 or len(points) < 3 * count + 1 or (setup.order == "" and len(points) <= 2 * count + 2):
         return None
-    order = str(setup.get("order") or "XYZ")
+    order = setup.order or "XYZ"
     moved = np.abs(np.diff(points[: 3 * count + 1], axis=0)) > 1e-3
     wanted = np.tile(np.array([[a == o for a in "XYZ"] for o in order]), (count, 1))
     if (moved.sum(axis=1) == 1).all() and not (moved == wanted).all():

@@ -77,11 +77,10 @@ class BarPlaces:
         options = MeasureOptions(control=self.control, part=True)
         ids = await measure(self.session, self.store, self.site, plan, progress=self.progress, options=options)
         self.run_ids += ids
-        columns = (await asyncio.to_thread(load_run, self.store, ids[0]))["columns"]
-        if not all(columns["valid"]):
+        columns = (await asyncio.to_thread(load_run, self.store, ids[0])).columns
+        if not columns.valid.all():
             raise MeasurementFault("the ball-bar did not read at every place", "check the bar, then begin again")
-        places = np.stack([columns[f"{a}_mm"] for a in "xyz"], axis=1)
-        return PlaceReadings(places, np.asarray(columns["deviation_mm"], dtype=np.float64))
+        return PlaceReadings(columns.q_mm, columns.readings_mm)
 
     def directions(self, readings: PlaceReadings) -> F2:
         """Unit vectors from the cup to the tool, shape (n, 3)."""

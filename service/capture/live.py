@@ -128,7 +128,7 @@ def angles_along(points_mm: Sequence[Point], setup: Mapping[str, Any]) -> tuple[
     if setup.get("plane"):
         across, up = (points[:, "XYZ".index(letter)] for letter in str(setup["plane"]))
         about = np.arctan2(up, across)
-    elif (axis := helix_axis(setup, points)) is not None:
+    elif (axis := helix_axis(str(setup.get("axis") or ""), points)) is not None:
         about = about_axis(points, axis)
     else:
         return np.zeros(0), float(arc[-1])

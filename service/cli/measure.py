@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
     from abbe.service.domain.progress import ProgressSink
+    from abbe.service.domain.run import Run
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.recipes.campaigns import RecipeSource
     from abbe.service.sequences.steps import CampaignPlan
@@ -226,7 +227,7 @@ def correct(
     raise typer.Exit(0 if found.decision.keep else 1)
 
 
-async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[dict[str, Any]]:
+async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[Run]:
     """Return the runs of a verification with the present table: of a campaign in the store, or measured now if none is named."""
     from abbe.service.campaigns.measure import measure as work_measure
     from abbe.service.clock import SystemClock

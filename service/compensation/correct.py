@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from abbe.service.compensation.proposals import (
 from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.domain.progress import Progress
+from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError, TableRefused, TakenBack
 from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import removed_table, subtract_table
@@ -67,9 +67,7 @@ class Correction:
     proposal: int = 0
 
 
-async def correct(
-    context: PushContext, campaign: str | int, before: list[dict[str, Any]], control: LevelStatus | None = None
-) -> Correction:
+async def correct(context: PushContext, campaign: str | int, before: list[Run], control: LevelStatus | None = None) -> Correction:
     """Correct a machine from a measured identification campaign.
 
     Parameters
@@ -100,7 +98,7 @@ async def correct(
     return await _push(context, await admit(context, made.number, control), made, before)
 
 
-async def push(context: PushContext, admission: Admission, before: list[dict[str, Any]]) -> Correction:
+async def push(context: PushContext, admission: Admission, before: list[Run]) -> Correction:
     """Push an admitted proposal (`abbe.service.compensation.gate.admit`), then verify as `correct` does.
 
     ``before``: verification runs measured with the present table, as ``abbe-run/1``.
@@ -121,7 +119,7 @@ async def push(context: PushContext, admission: Admission, before: list[dict[str
     return await _push(context, admission, made, before)
 
 
-async def _push(context: PushContext, admission: Admission, made: StoredProposal, before: list[dict[str, Any]]) -> Correction:
+async def _push(context: PushContext, admission: Admission, made: StoredProposal, before: list[Run]) -> Correction:
     """Push an admitted proposal and verify it. Any interlock ends the push: an unverified table must not wait in force."""
     session, store, proposed, precheck = context.session, context.store, made.proposed, admission.precheck
     site = replace(context.site, watching=replace(context.site.watching, suspending=Suspending()))
@@ -132,7 +130,7 @@ async def _push(context: PushContext, admission: Admission, made: StoredProposal
     check_before_runs(site, precheck.base, before, newest_s, context.clock.utc().timestamp())
     old = figures(before)
     check_before(old)
-    helix = next((r for r in before if r["test"] == "ballbar_helix"), None)
+    helix = next((r for r in before if r.test == "ballbar_helix"), None)
     misfit_mm = None if helix is None else helix_misfit(made.solved, _as_other_runs(helix, made.solved, precheck.base.tables))
     bar = None
     if session.ballbar is not None and session.fixture is not None:
@@ -151,7 +149,7 @@ async def _push(context: PushContext, admission: Admission, made: StoredProposal
     )
 
 
-def _as_other_runs(run: dict[str, Any], solved: Solved, table: NineTables | None) -> dict[str, Any]:
+def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
     """Prepare a run as the solved runs were: remove what the table in force did beyond its smooth corrections."""
     if table is None:
         return run

@@ -27,6 +27,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.run import Run
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
@@ -40,7 +41,6 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, added, read_base, tables_from_image
 from abbe.service.tables.push_journal import JournalView
 
-Runs = list[dict[str, Any]]
 SIGNER = "metrologist"
 MONTH = timedelta(days=30)
 
@@ -62,7 +62,7 @@ class Promise:
     last_s: float
 
 
-def candidate_of(site: Site, promise: Promise, base: Base, runs: Runs, form: TableFormat) -> Candidate:
+def candidate_of(site: Site, promise: Promise, base: Base, runs: list[Run], form: TableFormat) -> Candidate:
     """Make a signed candidate of computed tables; ``runs``: the solved runs, ``abbe-run/1``."""
     columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
     blank = Candidate(site.name, FORMAT_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
@@ -81,9 +81,9 @@ def _plain(values: Any) -> list[float]:
     return [0.0 if abs(v) < 1e-15 else float(v) for v in values]
 
 
-def _evidence(site: Site, promise: Promise, runs: Runs) -> TableEvidence:
-    used = [r for r in runs if r["role"] == "identify"]
-    air = [float(t) for r in used for t in r["columns"].get("temp_air_C", [])]
+def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
+    used = [r for r in runs if r.identifies]
+    air = [float(t) for r in used for t in r.columns.air_c]
     if not air or not np.isfinite(air).all():
         air = [float("nan")]
     p = promise.predicted
@@ -92,13 +92,13 @@ def _evidence(site: Site, promise: Promise, runs: Runs) -> TableEvidence:
     drift = 0.0 if promise.drift_mm is None else promise.drift_mm
     return TableEvidence(
         len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
-        mark_of(boot for r in used for boot in [r.get("table", {}).get("boot_id")]), known,
+        mark_of(r.table.boot_id for r in used), known,
         promise.last_s,
     )  # fmt: skip
 
 
-def _instruments(runs: Runs) -> set[str]:
-    return {"ballbar" if r["test"].startswith("ballbar") else "laser" for r in runs}
+def _instruments(runs: list[Run]) -> set[str]:
+    return {"ballbar" if r.is_bar else "laser" for r in runs}
 
 
 def until_s(day: date) -> float:
@@ -163,7 +163,7 @@ class GatheredCampaign:
 
     campaign: CampaignRecord
     records: list[RunRecord]
-    runs: list[dict[str, Any]]
+    runs: list[Run]
     base: Base
     form: TableFormat
 
@@ -196,7 +196,7 @@ async def gather(controller: TableController, store: Store, site: Site, campaign
     records = [r for r in await asyncio.to_thread(store.runs.all, record.id) if r.visible_status == "complete"]
     runs = await load_runs(store, [r.id for r in records])
     base = await read_base(controller)
-    check_same_table(base, [r for r in runs if r["role"] == "identify"])
+    check_same_table(base, [r for r in runs if r.identifies])
     return GatheredCampaign(record, records, runs, base, await controller.table_format())
 
 
@@ -242,7 +242,7 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
     return min(used, default=0.0), max(used, default=0.0)
 
 
-def propose(site: Site, runs: list[dict[str, Any]], base: Base, lsb_nm: int) -> Proposal:
+def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int) -> Proposal:
     """Absolute tables from runs that were measured while ``base`` was active (`taken_out`)."""
     solved = solve_runs(site, runs)
     change = nine_tables(solved.joint, GRID)
@@ -260,7 +260,7 @@ def _campaign_without_known_effects(store: Store, name: str, table: NineTables |
     return remove_effects(store, from_store(store, name), CampaignTable(table))
 
 
-def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
+def check_same_table(base: Base, runs: list[Run]) -> None:
     """Check that every run was measured with the table that is active now.
 
     Raises
@@ -269,16 +269,16 @@ def check_same_table(base: Base, runs: list[dict[str, Any]]) -> None:
         Names a run that was not, or that does not state its table.
     """
     for run in runs:
-        crc = run.get("table", {}).get("crc")
+        crc = run.table.crc
         if crc != base.crc:
             with_what = "does not say with which table it was measured" if crc is None else f"was measured with table {crc:08X}"
-            raise TableMismatch(f"run {run['run_id']} {with_what}; active is {base.crc:08X}", "measure again with the present table")
-        if base.tables is not None and run["table"].get("acting") is False:
-            why = f"run {run['run_id']} was measured while table {base.crc:08X} did not act: the compensation was switched off"
+            raise TableMismatch(f"run {run.run_id} {with_what}; active is {base.crc:08X}", "measure again with the present table")
+        if base.tables is not None and run.table.acting is False:
+            why = f"run {run.run_id} was measured while table {base.crc:08X} did not act: the compensation was switched off"
             raise TableMismatch(why, "switch it on at the control and measure again")
 
 
-def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
+def check_temperature(site: Site, runs: list[Run]) -> None:
     """Check that every run was measured inside the allowed air temperatures: tables hold only near their own.
 
     Raises
@@ -288,10 +288,10 @@ def check_temperature(site: Site, runs: list[dict[str, Any]]) -> None:
     """
     low, high = site.temperature_c
     for run in runs:
-        for t in run["columns"].get("temp_air_C", []):
+        for t in run.columns.air_c:
             if not low <= t <= high:
                 raise TableRefused(
-                    f"run {run['run_id']} was measured at {t:.1f} °C air, allowed are {low:g} to {high:g} °C",
+                    f"run {run.run_id} was measured at {t:.1f} °C air, allowed are {low:g} to {high:g} °C",
                     "measure again when the shop has settled, or change temperature_c under [limits]; nothing was written",
                 )
 
@@ -323,12 +323,12 @@ def by_whom() -> str:
     return f"{login()}, by the command line"
 
 
-async def load_runs(store: Store, run_ids: list[int]) -> list[dict[str, Any]]:
-    """Load runs as ``abbe-run/1`` objects off the event loop; key ``stored`` holds the end of each."""
-    return await asyncio.to_thread(lambda: [load_run(store, k) | {"stored": {"ended_utc": store.runs.find(k).ended_utc}} for k in run_ids])
+async def load_runs(store: Store, run_ids: list[int]) -> list[Run]:
+    """Load runs off the event loop."""
+    return await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
 
 
-def check_before_runs(site: Site, base: Base, runs: list[dict[str, Any]], since_s: float, now_s: float) -> None:
+def check_before_runs(site: Site, base: Base, runs: list[Run], since_s: float, now_s: float) -> None:
     """Check that verification runs describe this machine as it is now: after identification, and since the control's last start.
 
     ``since_s``, ``now_s``: end of the newest identifying run, and now, seconds UTC.
@@ -340,19 +340,17 @@ def check_before_runs(site: Site, base: Base, runs: list[dict[str, Any]], since_
     """
     low, high = site.temperature_c
     for run in runs:
-        text = (run.get("stored") or {}).get("ended_utc")
-        ended_s = datetime.fromisoformat(text).timestamp() if text else 0.0
-        air = [float(t) for t in run["columns"].get("temp_air_C", [])]
+        ended_s = datetime.fromisoformat(run.ended_utc).timestamp() if run.ended_utc else 0.0
         why = (
-            "is of another machine" if run.get("machine") != site.doc
-            else "is from before the control's last start" if run.get("table", {}).get("boot_id") != base.status.boot_id
+            "is of another machine" if run.machine != site.doc
+            else "is from before the control's last start" if run.table.boot_id != base.status.boot_id
             else "was measured before the machine was identified" if ended_s < since_s
             else f"is older than {site.limits.age_h:g} h" if now_s - ended_s > site.limits.age_h * 3600.0
             else "ends in the future" if ended_s > now_s
-            else f"was measured outside of {low:g} to {high:g} °C" if not all(low <= t <= high for t in air)
+            else f"was measured outside of {low:g} to {high:g} °C" if not all(low <= t <= high for t in run.columns.air_c)
             else ""
         )  # fmt: skip
         if why:
             raise TableRefused(
-                f"nothing can be compared with run {run['run_id']}: it {why}", "measure the verification before anew; nothing was written"
+                f"nothing can be compared with run {run.run_id}: it {why}", "measure the verification before anew; nothing was written"
             )

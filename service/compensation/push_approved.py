@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from abbe.drivers.errors import DriverError
 from abbe.service.campaigns.measure import MeasureOptions, measure
@@ -22,6 +21,7 @@ from abbe.service.compensation.recover import finish_when_safe, recovered_sessio
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.run import Run
 from abbe.service.domain.service_records import AlarmEntryRecord
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
 from abbe.service.sequences.check import paced
@@ -121,7 +121,7 @@ async def _pushed(context: PushContext, order: PushOrder) -> JobOutcome:
     return JobOutcome("kept" if done.decision.keep else "rolled back", f"push {done.pushed.push_id}: {done.decision.text}")
 
 
-async def _verify_before(context: PushContext, order: PushOrder) -> list[dict[str, Any]]:
+async def _verify_before(context: PushContext, order: PushOrder) -> list[Run]:
     site = context.site
     name = f"verify-before proposal {order.proposal} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
     plan = paced(verification(site.machine, rate_hz=context.rate_hz, name=name), site.max_feed_mm_min)

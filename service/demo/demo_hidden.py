@@ -28,6 +28,7 @@ from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.new_measurement import NewMeasurement, validate_on
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.run import Run
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current
 from abbe.service.errors import NotObservable, TableRefused
@@ -98,7 +99,7 @@ async def run_hidden_demo(
     return result
 
 
-def few(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def few(runs: list[Run]) -> list[Run]:
     """Runs with about `MOST` ball-bar readings."""
     return picked(runs, MOST)
 
@@ -120,7 +121,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
         return
     try:
         await commission(session, store, site, progress=progress)
-        before = [run for run in await load_runs(store, ids) if run["run_id"] != BACK]  # the runs of the verification
+        before = [run for run in await load_runs(store, ids) if run.run_id != BACK]  # the runs of the verification
         result.correction = await correct(PushContext(session, store, site, progress, rate_hz=rate), CAMPAIGN, before)
     except (TableRefused, NotObservable) as error:
         result.refused = str(error)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 from abbe.models.compensation.tables import smooth_of
 from abbe.models.discovery.changed.comparison import Change, Changed, changed_since
@@ -20,6 +19,7 @@ from abbe.service.campaign_data.provenance import machine_digest
 from abbe.service.discovery.changed_text import proved
 from abbe.service.domain.finding import ChangedSince, ChangeRival, EffectFound, GapUm, MotionChange
 from abbe.service.domain.results import SolutionRecord
+from abbe.service.domain.run import RunTable
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.effects.model_book import LASTING, applies, version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
@@ -31,7 +31,6 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of
 from abbe.service.tables.nine_tables import tables_from_image
 
-Doc = dict[str, Any]
 LOST_MOTION = "backlash"
 
 
@@ -100,23 +99,23 @@ def _before_of(store: Store, record: SolutionRecord) -> _Before:
     return _Before(record.id, known, crc, book.version, frozenset(book.taken_out))
 
 
-def _tables_of(store: Store, record: SolutionRecord) -> list[Doc]:
-    """Table document of each run of a solution; those of the solution itself if its runs have none."""
+def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
+    """Table of each run of a solution; those of the solution itself if its runs have none."""
     used = set(record.run_ids)
     starts = [r.start_doc for r in store.runs.all(record.campaign_id) if r.id in used]
     tables = [start.get("imported", start).get("table") or {} for start in starts]
-    return tables if any(tables) else tables_of(record.doc)
+    return [RunTable.from_document(table) for table in (tables if any(tables) else tables_of(record.doc))]
 
 
-def _acting(tables: Sequence[Doc]) -> int | None:
-    """CRC of the table that acted in all runs, given the table document of each; None if none acted in any.
+def _acting(tables: Sequence[RunTable]) -> int | None:
+    """CRC of the table that acted in all runs, given the table of each; None if none acted in any.
 
     Raises
     ------
     TableMismatch
         The runs were measured with different tables.
     """
-    found = {None if one.get("crc") is None or one.get("acting") is False else int(one["crc"]) for one in tables}
+    found = {one.acting_crc for one in tables}
     if len(found) > 1:
         raise TableMismatch("these runs were not all measured with one table")
     return next(iter(found), None)
@@ -130,7 +129,7 @@ def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Remove
     TableMismatch
         One of two different tables is unknown, or a campaign used more than one.
     """
-    now = _acting([r.get("table") or {} for r in campaign.runs if r["role"] == "identify"])
+    now = _acting([r.table for r in campaign.runs if r.identifies])
     return None if now == before.crc else RemovedTable(_applied(store, now), _applied(store, before.crc))
 
 
@@ -164,7 +163,7 @@ def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence
         same = [e for e in book if e.label in before.taken and applies(e, campaign.name)]
         left = subtract_effects(left, same, f"model version {before.version}")
     left = subtract_effects(left, [e for e in found if e.family not in LASTING], "found in these runs")
-    used, out = [r for r in left.runs if r["role"] == "identify"], _tables_between(store, campaign, before)
+    used, out = [r for r in left.runs if r.identifies], _tables_between(store, campaign, before)
     changed = changed_since(before.known, tuple(run_data(r) for r in (used if out is None else subtract_table(used, out))))
     # The comparison fits the lost motion of the drives; the old solution's motions may have absorbed any other lasting effect.
     beside = [e.words for e in found if e.family in LASTING and e.name != LOST_MOTION]

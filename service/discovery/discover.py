@@ -10,9 +10,6 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
-
-import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Discovery
@@ -31,6 +28,7 @@ from abbe.service.domain.discovery_file import FoundThinning
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.model_book import ModelBook, ModelVersion
 from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.run import Run
 from abbe.service.effects.axis_test import SLOW_DRIFT
 from abbe.service.effects.model_book import applies, extended_book, readings_of, without
 from abbe.service.errors import NotObservable
@@ -41,7 +39,7 @@ from abbe.service.runs.observations import run_data
 
 Search = Callable[[Case, tuple[Effect, ...], ProgressSink], Discovery]
 """The computation: case, catalogue, progress sink."""
-Thin = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
+Thin = Callable[[list[Run]], list[Run]]
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class DiscoveryJob:
     """
 
     campaign: Campaign
-    runs: list[dict[str, Any]]
+    runs: list[Run]
     case: Case
     effects: tuple[Effect, ...]
     base: ModelVersion | None
@@ -73,7 +71,7 @@ class DiscoveryJob:
     @property
     def source(self) -> FindingSource:
         """Origin of a finding: campaign, digests of runs and machine, program versions."""
-        runs = {r["run_id"]: run_digest(r) for r in self.campaign.runs}
+        runs = {r.run_id: run_digest(r) for r in self.campaign.runs}
         digest = machine_digest(self.case.machine)
         return FindingSource(campaign=self.campaign.name, machine_digest=digest, runs=runs, versions=versions())
 
@@ -138,18 +136,18 @@ def prepare(
     )
 
 
-def _difference_mm(measured: list[dict[str, Any]], corrected: list[dict[str, Any]]) -> dict[str, F1]:
+def _difference_mm(measured: list[Run], corrected: list[Run]) -> dict[str, F1]:
     """Measured minus corrected readings of each run, mm."""
-    pairs = [(a, a["columns"]["deviation_mm"], b["columns"]["deviation_mm"]) for a, b in zip(measured, corrected, strict=True)]
-    return {run["run_id"]: np.subtract(before, after, dtype=np.float64) for run, before, after in pairs if before is not None}
+    pairs = [(before, after) for before, after in zip(measured, corrected, strict=True) if not before.is_sealed]
+    return {before.run_id: before.columns.readings_mm - after.columns.readings_mm for before, after in pairs}
 
 
 def _checked(campaign: Campaign) -> list[str]:
-    used = [r for r in campaign.runs if r["role"] == "identify"]
+    used = [r for r in campaign.runs if r.identifies]
     if not used:
         raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
     flags = check_files(campaign.site.doc, used)
-    flags += copy_issues([*used, *(r for r in campaign.runs if r["role"] == "holdout")])
+    flags += copy_issues([*used, *(r for r in campaign.runs if r.role == "holdout")])
     refuse(flags)
     # Wrong units, signs and axes are refused. A run that merely does not fit the others is no flag here: the search looks for the reason.
     refuse(check_readings(campaign.site.machine, [run_data(r, blocks=ALL_READINGS) for r in used]))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
 
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.campaigns.measure import measure, start_campaign
@@ -18,6 +17,7 @@ from abbe.service.discovery.discover import DiscoveryJob, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
 from abbe.service.domain.measured import RUNNING, CampaignRecord
 from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import version
 from abbe.service.errors import CampaignRefused, UnsafeToMove
 from abbe.service.identification.table_removal import campaign_table
@@ -131,7 +131,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
     if "ctrl0_us" not in old or old.get("boot_id") != comp.boot_id or old["ctrl0_us"] > status.ctrl_us:
         raise CampaignRefused(f"campaign {campaign.name} has not the clock that the machine has now", NO_CLOCK)
     now = comp.bank_crc[comp.active_bank]
-    tables = {run.get("table", {}).get("crc") for run in campaign.runs} - {None, now}
+    tables = {run.table.crc for run in campaign.runs} - {None, now}
     if tables:
         raise CampaignRefused(f"campaign {campaign.name} was measured with another compensation table", "measure it again")
     wait_s: float = what.after_s - (1e-6 * (status.ctrl_us - old["ctrl0_us"]) - _last_s(campaign))
@@ -150,7 +150,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
 
 def _last_s(campaign: Campaign) -> float:
     """Time of a campaign's last reading, s of its clock."""
-    return max((float(run["columns"]["t_s"][-1]) for run in campaign.runs), default=0.0)
+    return max((float(run.columns.t_s[-1]) for run in campaign.runs), default=0.0)
 
 
 def next_search(store: Store, job: DiscoveryJob, journal: StoredJournal, name: str) -> tuple[DiscoveryJob, StoredJournal]:
@@ -175,7 +175,6 @@ def joined(old: Campaign, new: Campaign) -> Campaign:
     return replace(new, runs=runs, doc=doc)
 
 
-def _later(run: dict[str, Any], by_s: float) -> dict[str, Any]:
-    setup = run["setup"] | {"t_set_s": float(run["setup"]["t_set_s"]) + by_s}
-    columns = run["columns"] | {"t_s": [t + by_s for t in run["columns"]["t_s"]]}
-    return run | {"setup": setup, "columns": columns}
+def _later(run: Run, by_s: float) -> Run:
+    later = replace(run, columns=replace(run.columns, t_s=run.columns.t_s + by_s))
+    return later if run.setup.t_set_s is None else later.mounted(run.setup.t_set_s + by_s)

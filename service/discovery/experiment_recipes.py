@@ -13,6 +13,7 @@ from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.unseen import LATE_S
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS
+from abbe.service.domain.run import Run
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run_campaign, paced
 from abbe.service.sequences.recipes.approach import as_point
@@ -54,7 +55,7 @@ class NextPlan:
 def next_plan(
     adds: Sequence[str],
     machine: Machine,
-    runs: list[dict[str, Any]],
+    runs: list[Run],
     *,
     name: tuple[str, str],
     max_feed_mm_min: float,
@@ -64,7 +65,7 @@ def next_plan(
 
     Parameters
     ----------
-    runs : list of dict
+    runs : list of Run
         The measured runs. A second feed or a late repeat uses the path of their first helix.
     name : tuple of str
         Name of the new campaign, and the prefix of its labels and set-ups, which keeps them distinct from the old ones.
@@ -85,7 +86,7 @@ def next_plan(
 
 
 def _tests(
-    add: str, machine: Machine, runs: list[dict[str, Any]], name: str, max_feed_mm_min: float, about: Localization | None
+    add: str, machine: Machine, runs: list[Run], name: str, max_feed_mm_min: float, about: Localization | None
 ) -> tuple[TestPlan, ...] | str:
     """The tests of one addition, or the text for the person who has to do it."""
     make = MAKERS.get(add)
@@ -124,14 +125,14 @@ def _within(
     return f"{add} ({why})"
 
 
-def _is_helix(runs: list[dict[str, Any]], about: Localization) -> bool:
+def _is_helix(runs: list[Run], about: Localization) -> bool:
     """Whether the run to repeat is a helix."""
-    return "ballbar_helix" in [r["test"] for r in runs if r.get("run_id") in about.runs]
+    return "ballbar_helix" in [r.test for r in runs if r.run_id in about.runs]
 
 
-def _repeats_first(runs: list[dict[str, Any]], about: Localization) -> list[dict[str, Any]]:
+def _repeats_first(runs: list[Run], about: Localization) -> list[Run]:
     """All runs, those to repeat first."""
-    return sorted(runs, key=lambda run: run.get("run_id") not in about.runs)
+    return sorted(runs, key=lambda run: run.run_id not in about.runs)
 
 
 def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None) -> Helix:
@@ -165,28 +166,28 @@ def _repeats(like: Helix, name: str) -> list[Recipe]:
     ]
 
 
-def _first_helix(machine: Machine, runs: list[dict[str, Any]]) -> Helix | None:
+def _first_helix(machine: Machine, runs: list[Run]) -> Helix | None:
     """The first helix of the campaign as a recipe, None if it cannot be repeated; without any helix, the one that verifies tables."""
     for run in runs:
-        if run["test"] == "ballbar_helix":
+        if run.test == "ballbar_helix":
             return _recipe_of(machine, run)
     return replace(verification_helix(machine), role="identify")
 
 
-def _recipe_of(machine: Machine, run: dict[str, Any]) -> Helix | None:
+def _recipe_of(machine: Machine, run: Run) -> Helix | None:
     """A stored helix as a recipe; None if its set-up is incomplete or this machine cannot repeat it."""
-    setup, columns = run["setup"], run["columns"]
-    if any(setup.get(key) is None for key in KNOWN) or setup["turns"] < MIN_TURNS:
+    setup, bar = run.setup.document, run.bar
+    if any(setup.get(key) is None for key in KNOWN) or bar.turns is None or bar.u_length_mm is None or bar.turns < MIN_TURNS:
         return None
-    if setup.get("tool_mm") is not None and not np.allclose(setup["tool_mm"], machine.tool_mm):
+    if bar.tool_mm is not None and not np.allclose(bar.tool_mm, machine.tool_mm):
         return None
-    x, y, z = (float(v) for v in setup["centre_mm"])
+    columns = run.columns
     return Helix(
-        "", "", "identify", (x, y, z), float(setup["radius_mm"]),
-        turns=float(setup["turns"]), law=setup["law"], axis=AXES.index(setup["axis"]), feed_mm_min=float(columns["feed_mm_min"][0]),
-        direction=1 if columns["direction"][0] > 0 else -1, rate_hz=int(setup["rate_hz"]), chord_mm=float(setup["chord_mm"]),
-        opens=1 if setup["opens"] > 0 else -1, length_calibrated=bool(setup["length_calibrated"]),
-        u_length_mm=float(setup["u_length_mm"]), even=bool(setup["even"]),
+        "", "", "identify", as_point(bar.centre_mm), bar.radius_mm,
+        turns=bar.turns, law=setup["law"], axis=AXES.index(bar.axis), feed_mm_min=float(columns.feed_mm_min[0]),
+        direction=1 if columns.direction[0] > 0 else -1, rate_hz=int(setup["rate_hz"]), chord_mm=float(setup["chord_mm"]),
+        opens=1 if setup["opens"] > 0 else -1, length_calibrated=bool(bar.length_calibrated),
+        u_length_mm=bar.u_length_mm, even=bool(setup["even"]),
     )  # fmt: skip
 
 

@@ -45,12 +45,12 @@ def validate_on(
     CampaignRefused
         The data of a new run contradict its description, or it is a copy of an old one.
     """
-    fresh = replace(new, runs=[run | {"role": "holdout"} for run in new.runs])
+    fresh = replace(new, runs=[replace(run, role="holdout") for run in new.runs])
     both = replace(joined(old, fresh), name=old.name)  # under the old name: thermal and instrument effects of that session still apply
     plain = simulate(prepare(both, effects, thin=thin))
     known = plain if model is None else simulate(prepare(both, effects, model, thin=thin))
-    labels = [run["run_id"] for run in new.runs]
-    kinds = {run["run_id"]: "laser" if run["test"].startswith("laser") else "bar" for run in new.runs}
+    labels = [run.run_id for run in new.runs]
+    kinds = {run.run_id: "bar" if run.is_bar else "laser" for run in new.runs}
     runs = {label: _gap([label], plain, known, kinds) for label in labels}
     return NewMeasurement(_gap(labels, plain, known, kinds), runs)
 

@@ -32,7 +32,7 @@ SETUP_KEYS: dict[str, tuple[str, ...]] = {
 """What ``setup`` must hold besides ``setup_id`` and ``t_set_s``."""
 
 
-class Setup(FileObject):
+class SetupObject(FileObject):
     """Mounting of the instrument. The test determines which keys are needed."""
 
     setup_id: str
@@ -54,7 +54,7 @@ class Setup(FileObject):
     order: str | None = None
 
 
-class Columns(FileObject):
+class ColumnsObject(FileObject):
     """Readings, one list a column, all of one length. Further columns carry their unit in the name."""
 
     model_config = ConfigDict(
@@ -87,8 +87,8 @@ class RunFile(FileObject):
     test: Test
     role: Role
     machine: MachineObject
-    setup: Setup
-    columns: Columns
+    setup: SetupObject
+    columns: ColumnsObject
 
     @model_validator(mode="after")
     def _test_decides(self) -> Self:

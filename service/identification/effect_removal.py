@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
+from abbe.models.arrays import F1
 from abbe.models.effects.effect import Effect
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.campaign_data.provenance import machine_digest, with_changed_columns
+from abbe.service.campaign_data.provenance import machine_digest, with_changed_readings
 from abbe.service.domain.finding import EffectSize
+from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import TableTakenOut
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import applies, current, no_table_lines, readings_of
@@ -92,13 +92,8 @@ def subtract_effects(campaign: Campaign, entries: Sequence[EffectSize], origin: 
     case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
     known_mm = readings_of(entries, effects or catalogue(), case)
     removed = f"{origin}: {', '.join(e.label for e in entries)}"
-    return replace(campaign, runs=[_subtracted(run, known_mm[run["run_id"]], removed) for run in campaign.runs])
+    return replace(campaign, runs=[_subtracted(run, known_mm[run.run_id], removed) for run in campaign.runs])
 
 
-def _subtracted(run: dict[str, Any], known_mm: np.ndarray[Any, np.dtype[np.float64]], removed: str) -> dict[str, Any]:
-    reading = run["columns"]["deviation_mm"]
-    if reading is None:
-        return run
-    return with_changed_columns(
-        run, run["columns"] | {"deviation_mm": (np.asarray(reading, dtype=np.float64) - known_mm).tolist()}, removed
-    )
+def _subtracted(run: Run, known_mm: F1, removed: str) -> Run:
+    return run if run.is_sealed else with_changed_readings(run, run.columns.readings_mm - known_mm, removed)

@@ -21,6 +21,7 @@ from abbe.service.campaign_data.campaign_checks import check_files, check_readin
 from abbe.service.campaign_data.campaign_issue import CampaignIssue
 from abbe.service.campaign_data.copied_runs import copy_issues
 from abbe.service.campaign_data.provenance import measured_digest, removals_of
+from abbe.service.domain.run import Run
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
@@ -73,8 +74,8 @@ class Solved:
     removed: tuple[str, ...] = ()
 
 
-def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model | None = "rigid21", progress: ProgressText | None = None) -> Solved:
-    """Solve ``abbe-run/1`` objects of the role ``identify`` together, after checking each for consistency.
+def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", progress: ProgressText | None = None) -> Solved:
+    """Solve runs of the role ``identify`` together, after checking each for consistency.
 
     ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it.
 
@@ -88,43 +89,40 @@ def solve_runs(site: Site, runs: list[dict[str, Any]], *, model: Model | None = 
         The readings imply an impossible error of a bar, cup or mirror.
     """
     progress = progress or _silent
-    used = [r for r in runs if r["role"] == "identify"]
+    used = [r for r in runs if r.identifies]
     if not used:
         raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
     progress(f"{len(used)} runs: units, axes, copies, machine")
     model, smaller = (model, []) if model is not None else _affordable([run_data(r, blocks=ALL_READINGS) for r in used])
-    flags = smaller + check_campaign(site, used, [r for r in runs if r["role"] == "holdout"], model)
-    bars = [r for r in used if r["test"].startswith("ballbar")]
+    flags = smaller + check_campaign(site, used, [r for r in runs if r.role == "holdout"], model)
+    bars = [r for r in used if r.is_bar]
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
     joint = solve_joint(site.machine, data, model=model, progress=progress)
     flags += check_instruments(joint, data)
-    spatial = {r["run_id"] for r in used if r["test"] == "ballbar_helix"}  # a circle does not determine ten parameters
+    spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
-    digests, tables = (
-        {r["run_id"]: measured_digest(r) for r in used},
-        {r["run_id"]: r["table"] for r in used if "crc" in r.get("table", {})},
-    )
+    digests = {r.run_id: measured_digest(r) for r in used}
+    tables = {r.run_id: r.table.document for r in used if r.table.crc is not None}
     return Solved(
         joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(removals_of(used))
     )
 
 
-def value_rows(runs: list[dict[str, Any]], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
+def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
     """First and last row of the run's file, from 1, that each value was made of, by run label, shape (values, 2).
 
     Long runs are averaged in blocks. A row belongs to the value with the nearest mean time; invalid rows belong to none.
     """
     out = {}
     for run, values in zip(runs, data, strict=True):
-        t = np.asarray(run["columns"]["t_s"], dtype=np.float64)
-        rows = np.flatnonzero(np.asarray(run["columns"].get("valid", np.ones(t.size))).astype(bool))
+        t, rows = run.columns.t_s, np.flatnonzero(run.columns.valid)
         if rows.size == values.t_s.size:
-            out[run["run_id"]] = np.stack([rows, rows], axis=1) + 1
+            out[run.run_id] = np.stack([rows, rows], axis=1) + 1
             continue
         edges = np.searchsorted(t[rows], 0.5 * (values.t_s[1:] + values.t_s[:-1]))
         first, last = np.concatenate([[0], edges]), np.concatenate([edges, [rows.size]]) - 1
-        out[run["run_id"]] = np.stack([rows[np.minimum(first, rows.size - 1)], rows[np.maximum(last, first)]], axis=1) + 1
+        out[run.run_id] = np.stack([rows[np.minimum(first, rows.size - 1)], rows[np.maximum(last, first)]], axis=1) + 1
     return out
 
 
@@ -132,7 +130,7 @@ def _silent(_: str) -> None:
     return None
 
 
-def check_campaign(site: Site, used: list[dict[str, Any]], others: list[dict[str, Any]], model: Model) -> list[CampaignIssue]:
+def check_campaign(site: Site, used: list[Run], others: list[Run], model: Model) -> list[CampaignIssue]:
     """Flags of the runs to solve; ``others`` are only checked for copies.
 
     Raises
@@ -221,36 +219,37 @@ def _longest_contained(names: list[str], unknown: str) -> str | None:
     return max(found, key=len) if found else None
 
 
-def step_diagonals(runs: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+def step_diagonals(runs: list[Run]) -> dict[str, dict[str, float]]:
     """The papers' step-diagonal results by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
 
     End errors of the nine curves (um), largest closure (um, with the u of one closure), squareness contrasts (urad).
     """
     out = {}
     for order in ("XYZ", "ZYX"):
-        found = {r["setup"]["diagonal"]: r for r in runs if r["test"] == "laser_diagonal" and r["setup"].get("order", "") == order}
+        found = {r.laser.diagonal: r for r in runs if r.test == "laser_diagonal" and r.laser.order == order}
         if set(found) != set(ORDER) or not all(_whole_way_out(r, order) for r in found.values()):
             continue
         out[order] = _step_figures(found, order)
     return out
 
 
-def _whole_way_out(run: dict[str, Any], order: str) -> bool:
+def _whole_way_out(run: Run, order: str) -> bool:
     """Whether the first 3 n + 1 rows are valid and at the ends of the steps in this order; otherwise later rows belong to other steps."""
-    setup, columns = run["setup"], run["columns"]
-    n = int(setup["steps"])
-    points = np.column_stack([np.asarray(columns[f"{a}_mm"], dtype=np.float64)[: 3 * n + 1] for a in "xyz"])
-    if len(points) < 3 * n + 1 or not np.all(np.asarray(columns.get("valid", np.ones(len(points))))[: 3 * n + 1]):
+    setup, n = run.laser, run.laser.steps
+    first = run.columns.rows(slice(3 * n + 1))
+    points = first.q_mm
+    if setup.increment_mm is None or len(points) < 3 * n + 1 or not first.valid.all():
         return False
-    span = n * np.abs(np.asarray(setup["increment_mm"], dtype=np.float64)) * DIAGONALS[setup["diagonal"]]
+    span = n * np.abs(setup.increment_mm) * DIAGONALS[setup.diagonal]
     nominal = step_diagonal(points[0], points[0] + span, n, order, back=False)
     return float(np.abs(points - nominal).max()) < STEP_PLACE_MM
 
 
-def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, float]:
-    n = int(found["ppp"]["setup"]["steps"])
-    out_only = {k: np.asarray(r["columns"]["deviation_mm"][: 3 * n + 1]) for k, r in found.items()}
-    inc = np.abs(np.asarray(found["ppp"]["setup"]["increment_mm"]))
+def _step_figures(found: dict[str, Run], order: str) -> dict[str, float]:
+    setup = found[ORDER[0]].laser
+    assert setup.increment_mm is not None  # `_whole_way_out` needed it
+    n, inc = setup.steps, np.abs(setup.increment_mm)
+    out_only = {k: r.columns.readings_mm[: 3 * n + 1] for k, r in found.items()}
     q = increments(out_only, order)
     curves, u = wang_four(q, inc), u_wang_four(inc, n, LASER_SIGMA_MM, U_WAVELENGTH)
     figures: dict[str, float] = {}
@@ -266,7 +265,7 @@ def _step_figures(found: dict[str, dict[str, Any]], order: str) -> dict[str, flo
     return figures
 
 
-def helix_misfit(solved: Solved, run: dict[str, Any]) -> float:
+def helix_misfit(solved: Solved, run: Run) -> float:
     """Rms residual of a held-out ball-bar run after refitting cup and length, mm."""
     data = run_data(run)
     n = bar_normals(data)

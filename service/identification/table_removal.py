@@ -8,7 +8,6 @@ reverse by command and not while they are commanded to rest.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -18,16 +17,16 @@ from abbe.models.solvers.in_force import AppliedTables
 from abbe.models.solvers.joint import solve_joint
 from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.campaign_data.provenance import with_changed_columns
+from abbe.service.campaign_data.provenance import with_changed_readings
+from abbe.service.domain.run import BarSetup, Run
 from abbe.service.domain.solution_file import LostMotion, TableTakenOut
 from abbe.service.errors import TableMismatch
-from abbe.service.runs.observations import beam_of, run_data
+from abbe.service.runs.observations import run_data
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import images_of
 from abbe.service.tables.nine_tables import tables_from_image
 
-Runs = list[dict[str, Any]]
 NOTHING = AppliedTables(np.zeros_like)
 NOT_REMOVED = "what it did beyond smooth corrections, with the lost motion above all, is still in the readings"
 
@@ -53,16 +52,16 @@ NO_TABLE = CampaignTable()
 
 def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
     """The table of this database with which all identify runs of a campaign were measured."""
-    documents = [r.get("table") or {} for r in campaign.runs if r["role"] == "identify"]
-    acted = [one for one in documents if one.get("crc") is not None and one.get("acting") is not False]
-    if not acted:
+    stated = [r.table for r in campaign.runs if r.identifies]
+    acted = [one for one in stated if one.acting_crc is not None]
+    crc = acted[0].acting_crc if acted else None
+    if crc is None:
         return NO_TABLE
-    crc = int(acted[0]["crc"])
-    if len(acted) < len(documents) or any(int(one["crc"]) != crc for one in acted):
+    if len(acted) < len(stated) or any(one.crc != crc for one in acted):
         return CampaignTable(None, f"these runs were not all measured with one table: {NOT_REMOVED}")
     image = images_of(store)(crc)
     if image is None:
-        sure = any(one.get("acting") for one in acted)  # runs of older versions do not state whether a table acted
+        sure = any(one.acting for one in acted)  # runs of older versions do not state whether a table acted
         return CampaignTable(None, f"measured with table {crc:08X}, which this database does not know: {NOT_REMOVED}" if sure else "")
     try:
         return CampaignTable(tables_from_image(image))
@@ -81,21 +80,20 @@ def remove_table(campaign: Campaign, table: NineTables | None) -> Campaign:
     CampaignRefused
         The data of a run contradict its description.
     """
-    used = [r for r in campaign.runs if r["role"] == "identify"]
+    used = [r for r in campaign.runs if r.identifies]
     if table is None or not used:
         return campaign
     refuse(check_files(campaign.site.doc, used))  # refuse an inconsistent run here with one line instead of failing in the solver
     lost = _lost_motion(campaign.site, used, table)
-    crc = (used[0].get("table") or {}).get("crc")
+    crc = used[0].table.crc
     removed = TableTakenOut(crc=crc, lost_motion_mm={axis: LostMotion(value=v, u=u) for axis, (v, u) in lost.items()})
     out = removed_table(table, np.array([v for v, _ in lost.values()]))
     runs = [_subtracted(run, out) if _had_table(run, crc) else run for run in campaign.runs]
     return replace(campaign, runs=runs, removed=removed)
 
 
-def _had_table(run: dict[str, Any], crc: int | None) -> bool:
-    table = run.get("table") or {}
-    return table.get("crc") == crc and table.get("acting") is not False
+def _had_table(run: Run, crc: int | None) -> bool:
+    return run.table.crc == crc and run.table.acting is not False
 
 
 def table_line(removed: TableTakenOut) -> str:
@@ -114,32 +112,26 @@ def removed_table(table: NineTables, lost_mm: F1) -> RemovedTable:
     return RemovedTable(AppliedTables(table.correction_at, lost_mm), AppliedTables(smooth_of(table) or table.correction_at))
 
 
-def subtract_table(runs: Runs, out: RemovedTable) -> Runs:
+def subtract_table(runs: list[Run], out: RemovedTable) -> list[Run]:
     """Runs after subtracting a table's effect; a run without readings stays unchanged."""
     return [_subtracted(run, out) for run in runs]
 
 
-def _lost_motion(site: Site, used: Runs, table: NineTables) -> dict[str, tuple[float, float]]:
+def _lost_motion(site: Site, used: list[Run], table: NineTables) -> dict[str, tuple[float, float]]:
     """Lost motion and its u by axis, mm, from runs without the whole effect of the table, whose interpolation would look like reversals."""
-    runs = subtract_table(
-        [r for r in used if not r["setup"].get("order")] or used, RemovedTable(AppliedTables(table.correction_at), NOTHING)
-    )
+    plain = [r for r in used if r.is_bar or not r.laser.order]
+    runs = subtract_table(plain or used, RemovedTable(AppliedTables(table.correction_at), NOTHING))
     return solve_joint(site.machine, tuple(run_data(r) for r in runs)).backlash_mm()
 
 
-def _subtracted(run: dict[str, Any], out: RemovedTable) -> dict[str, Any]:
-    if run["columns"]["deviation_mm"] is None:
+def _subtracted(run: Run, out: RemovedTable) -> Run:
+    if run.is_sealed:
         return run
-    axes = np.column_stack([np.asarray(run["columns"][f"{c}_mm"], dtype=np.float64) for c in "xyz"])
-    reading = np.array(run["columns"]["deviation_mm"], dtype=np.float64)
+    axes, reading = run.columns.q_mm, run.columns.readings_mm.copy()
     known = np.isfinite(axes).all(axis=1)
     reading[known] -= _added_mm(run, axes[known], out.force) - _added_mm(run, axes[known], out.stays)
-    crc = (run.get("table") or {}).get("crc")
-    return with_changed_columns(run, run["columns"] | {"deviation_mm": reading.tolist()}, "table" if crc is None else f"table {crc:08X}")
+    return with_changed_readings(run, reading, "table" if run.table.crc is None else f"table {run.table.crc:08X}")
 
 
-def _added_mm(run: dict[str, Any], axes_mm: F2, force: AppliedTables) -> F1:
-    setup = run["setup"]
-    if run["test"].startswith("laser"):
-        return force.laser_mm(axes_mm, beam_of(setup, run["run_id"]))
-    return force.bar_mm(axes_mm, np.asarray(setup["centre_mm"], dtype=np.float64))
+def _added_mm(run: Run, axes_mm: F2, force: AppliedTables) -> F1:
+    return force.bar_mm(axes_mm, run.setup.centre_mm) if isinstance(run.setup, BarSetup) else force.laser_mm(axes_mm, run.beam)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from typing import Any
 
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.plausibility import INSTRUMENTS, ended_certificates
@@ -15,6 +14,7 @@ from abbe.service.compensation.recover import recovered_session
 from abbe.service.config_schema import MachineFile
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.run import Run
 from abbe.service.domain.verification import CheckResult
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
@@ -63,7 +63,7 @@ async def run_check(
     return judged(config, runs, plan.name, started, clock.monotonic_s() - start_s)
 
 
-def judged(config: MachineFile, runs: list[dict[str, Any]], campaign: str, started: datetime, duration_s: float) -> CheckResult:
+def judged(config: MachineFile, runs: list[Run], campaign: str, started: datetime, duration_s: float) -> CheckResult:
     """Judge the runs of a check's recipe.
 
     Raises
@@ -84,7 +84,7 @@ def judged(config: MachineFile, runs: list[dict[str, Any]], campaign: str, start
         {k: v for k, (v, _) in rows.items()},
         {k: COVERAGE * u for k, (_, u) in rows.items()},
         {k: v for k, v in limits.items() if k in rows},
-        [r["run_id"] for r in runs],
+        [r.run_id for r in runs],
         campaign,
         started,
         duration_s,
@@ -104,14 +104,14 @@ def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list
     return [f"the certificate of the {INSTRUMENTS[role]} ended on {day}" for role, day in ended.items()]
 
 
-def _air(runs: list[dict[str, Any]], window: tuple[float, float]) -> list[str]:
+def _air(runs: list[Run], window: tuple[float, float]) -> list[str]:
     outside, (low, high) = _outside(runs, window), window
     return [] if outside is None else [f"air temperature {outside:.1f} C is outside of {low:g}..{high:g} C"]
 
 
-def _outside(runs: list[dict[str, Any]], window: tuple[float, float]) -> float | None:
+def _outside(runs: list[Run], window: tuple[float, float]) -> float | None:
     """Return the air temperature farthest outside the window; None if all are inside or none was measured."""
     low, high = window
-    temperatures = [float(t) for r in runs for t in r["columns"].get("temp_air_C", [])]
+    temperatures = [float(t) for r in runs for t in r.columns.air_c]
     worst = max(temperatures, key=lambda t: max(low - t, t - high), default=None)
     return worst if worst is not None and not low <= worst <= high else None

@@ -13,7 +13,7 @@ from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, Chu
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.queries.reader import Reader, as_stored, finite, of_row, read_as, storable
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, pack_bar
-from abbe.service.runs.columns import IMPORTED_CHANNEL, load_run
+from abbe.service.runs.columns import IMPORTED_CHANNEL, run_document, whole_run
 from abbe.service.storage.repositories.pages import visible_status
 from abbe.service.storage.store import Store
 
@@ -241,7 +241,8 @@ def columns(reader: Reader, run: int, first: int, limit: int) -> RunColumns:
     """
     reader.row("runs", run, "run")
     with as_stored():
-        found = load_run(reader.store, run)["columns"]
+        record = reader.store.runs.find(run)
+        found = run_document(whole_run(reader.store, record), record, reader.store.chunks.of_run(run))["columns"]
     total = max((len(values) for values in found.values() if values is not None), default=0)
     part = {name: None if values is None else finite(values[first : first + limit]) for name, values in found.items()}
     return RunColumns(run=run, first=first, count=max(0, min(limit, total - first)), total=total, columns=part)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
 
+from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Document
 from abbe.service.storage.store import Store
 from abbe.service.verification.verified_by import VerifiedBy, verified_by
@@ -14,10 +14,10 @@ from abbe.service.verification.verified_by import VerifiedBy, verified_by
 NOT_JUDGED = "Not judged"
 
 
-def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[dict[str, Any]]) -> Document:
+def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[Run]) -> Document:
     """Return the report with a note if its table is not in force now, in the headline if nothing has measured the machine since.
 
-    ``begun_utc``: time of the measurement, or end of the push. ``runs``: ``abbe-run/1`` objects of the report; empty: only the time counts.
+    ``begun_utc``: time of the measurement, or end of the push. ``runs``: of the report; empty: only the time counts.
     """
     known = verified_by(store, machine)
     if document.verdict is None or _same(known, begun_utc, runs):
@@ -33,11 +33,11 @@ def with_later_changes(document: Document, store: Store, machine: str, begun_utc
     return replace(document, verdict=verdict, remarks=[remark, *document.remarks])
 
 
-def _same(known: VerifiedBy, begun_utc: str, runs: Sequence[dict[str, Any]]) -> bool:
+def _same(known: VerifiedBy, begun_utc: str, runs: Sequence[Run]) -> bool:
     """Whether the report was measured with the table in force now."""
     if known.why in ("changed", "open", "journal"):
         return False
-    tables = {int(r["table"]["crc"]) for r in runs if (r.get("table") or {}).get("crc") is not None}
+    tables = {r.table.crc for r in runs if r.table.crc is not None}
     if known.why == "push" and tables == {known.crc}:  # measured during the push, before it was kept
         return True
     if known.since is not None and datetime.fromisoformat(begun_utc) < known.since:

@@ -60,10 +60,10 @@ def stored_report(store: Store, record: RunRecord | CampaignRecord, rules: Rules
     if isinstance(record, CampaignRecord):
         return _with_later_changes(store, _measured(store, record.name), record.created_utc, rules)
     campaign = from_store(store, record.campaign)
-    if all(r["run_id"] != record.label for r in campaign.runs):  # an incomplete run is reported as such
+    if all(r.run_id != record.label for r in campaign.runs):  # an incomplete run is reported as such
         campaign = Campaign(campaign.name, campaign.site, [*campaign.runs, load_run(store, record.id)], None, campaign.doc)
     facts = {"Started": record.started_utc, "Ended": record.ended_utc or "not ended"}
-    runs = [r for r in campaign.runs if r["run_id"] == record.label]
+    runs = [r for r in campaign.runs if r.run_id == record.label]
     table = table_remarks(store, campaign.site.name, runs)
     document = run_report(Measured(campaign, facts, [_state(record)], table=table), record.label, rules)
     return with_later_changes(document, store, campaign.site.name, record.started_utc, runs)
@@ -79,7 +79,7 @@ def solution_report(store: Store | None, campaign: Campaign, solution: SolutionR
     if store is None or campaign.folder is not None:
         return campaign_report(Measured(campaign, solved, solution=solution), rules)
     found = _measured(store, campaign.name)
-    left_out = {r["run_id"] for r in found.campaign.runs} - {r["run_id"] for r in campaign.runs}
+    left_out = {r.run_id for r in found.campaign.runs} - {r.run_id for r in campaign.runs}
     states = [s for s in found.states if s[0] not in left_out]
     found = replace(found, campaign=campaign, facts=found.facts | solved, states=states, solution=solution)
     return _with_later_changes(store, found, store.campaigns.find(campaign.name).created_utc, rules)

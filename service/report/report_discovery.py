@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from abbe.service.discovery.discovery_text import (
     where_lines,
 )
 from abbe.service.domain.finding import EffectFound, Finding
+from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import StoreError
 from abbe.service.rendering.document import Block, Document, Facts, Lines, Picture, ReportFigure, Section, Sign, TextTable
@@ -59,14 +59,14 @@ class _Found:
 
     finding: Finding
     campaign: Campaign
-    runs: Sequence[dict[str, Any]]
+    runs: Sequence[Run]
     flags: Sequence[str]
     states: Sequence[tuple[str, str]]
 
     @property
-    def measured(self) -> dict[str, dict[str, Any]]:
+    def measured(self) -> dict[str, Run]:
         """Runs with readings (not sealed), by name."""
-        return {r["run_id"]: r for r in self.runs if r["columns"]["deviation_mm"] is not None}
+        return {r.run_id: r for r in self.runs if not r.is_sealed}
 
 
 def discovery_report(store: Store, number: int, rules: Rules) -> Document:
@@ -278,16 +278,15 @@ def _traces(found: _Found) -> list[Trace]:
     finding, label = found.finding, telling_run(found.finding)
     if label is None:
         return []
-    columns, series = found.measured[label]["columns"], finding.series[label]
+    columns, series = found.measured[label].columns, finding.series[label]
     if series.before is None or series.after is None:
         return []
     before, after = series.before.values_mm * 1e3, series.after.values_mm * 1e3
     noise, why = finding.runs[label].floor_um, "the gap shows most here"
-    t = np.asarray(columns["t_s"], dtype=np.float64)
-    out = [Trace(label, "time of the session in s", t, before, after, noise, why)]
+    out = [Trace(label, "time of the session in s", columns.t_s, before, after, noise, why)]
     key = finding.effects[0].key if finding.effects else "".join(finding.where.axes[:1])
     if key[-1:] in AXES and key:
-        x = np.asarray(columns[f"{key[-1].lower()}_mm"], dtype=np.float64)
+        x = columns.q_mm[:, AXES.index(key[-1])]
         if float(np.ptp(x)) > 0.0:
             out.append(Trace(label, f"position of {key[-1]} in mm", x, before, after, noise, why))
     return out
@@ -317,11 +316,11 @@ def _points(found: _Found) -> tuple[F1, F1]:
     """Positions of all judged readings, shape (n, 3), and their gap over the noise, shape (n,)."""
     places, ratios = [np.zeros((0, 3))], [np.zeros(0)]
     for label, run in found.measured.items():
-        columns, before = run["columns"], found.finding.series[label].before
+        before = found.finding.series[label].before
         if before is None:
             continue
         gap = before.values_mm * 1e3 / found.finding.runs[label].floor_um
         keep = np.isfinite(gap)
-        places.append(np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])[keep])
+        places.append(run.columns.q_mm[keep])
         ratios.append(gap[keep])
     return np.concatenate(places), np.concatenate(ratios)

@@ -12,6 +12,7 @@ from abbe.models.machine import AXES
 from abbe.models.solvers.observations import nominal_reading
 from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment
 from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
@@ -96,15 +97,15 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
 
 def run_report(found: Measured, label: str, rules: Rules) -> Document:
     """Report of one run: figures by ISO 230, and its readings."""
-    run = next(r for r in found.campaign.runs if r["run_id"] == label)
+    run = next(r for r in found.campaign.runs if r.run_id == label)
     evaluated = evaluate([run], found.campaign.doc.get("instruments"))
     condition, remarks = parts.conditions([run], rules)
     own, why = _own(run), not_judged(run)
-    setup = [(k, _value_text(v)) for k, v in sorted(run["setup"].items())]
+    setup = [(k, _value_text(v)) for k, v in sorted(run.setup.document.items())]
     return Document(
         kind="run",
         title=f"Run {found.campaign.name}/{label}",
-        about=parts.machine_facts(run["machine"]) | {"Campaign": found.campaign.name, "Run": label, "Test": run["test"]} | found.facts,
+        about=parts.machine_facts(run.machine) | {"Campaign": found.campaign.name, "Run": label, "Test": run.test} | found.facts,
         verdict=found.table.verdict(("open", "Not judged", f"{why}." if why else NOT_JUDGED)),
         figures=[*own.figures, *evaluated.figures],
         instruments=parts.instruments([run], found.campaign.doc, rules),
@@ -120,10 +121,10 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
     )
 
 
-def _verification(runs: Sequence[Doc], rules: Rules) -> tuple[list[ReportFigure], Verdict | None]:
+def _verification(runs: Sequence[Run], rules: Rules) -> tuple[list[ReportFigure], Verdict | None]:
     """Figures of a verification and their verdict, if these runs hold the four body diagonals, once out and back."""
-    known = [r for r in runs if r["columns"].get("deviation_mm") is not None and r["setup"].get("cycles", 1) == 1 and not not_judged(r)]
-    body = {r["setup"].get("diagonal") for r in known if r["test"] == "laser_diagonal" and not r["setup"].get("order")}
+    known = [r for r in runs if not r.is_sealed and (r.is_bar or r.laser.cycles == 1) and not not_judged(r)]
+    body = {r.laser.diagonal for r in known if r.test == "laser_diagonal" and not r.laser.order}
     if not body >= DIAGONALS:
         return [], None
     try:
@@ -211,20 +212,20 @@ def _budget(solution: SolutionResult | None) -> list[Section]:
 
 def _run_table(found: Measured) -> TextTable:
     head = ("Run", "Test", "Role", "State", "Readings", "SHA-256 (first 16)")
-    whole = {r["run_id"]: r for r in found.campaign.runs}
-    states = found.states or [(r["run_id"], r["test"], r["role"], "complete", "") for r in found.campaign.runs]
+    whole = {r.run_id: r for r in found.campaign.runs}
+    states = found.states or [(r.run_id, r.test, r.role, "complete", "") for r in found.campaign.runs]
     rows = []
     for label, test, role, state, _ in states:
         run = whole.get(label)
-        readings = "" if run is None else str(len(run["columns"]["t_s"]))
+        readings = "" if run is None else str(len(run.columns))
         rows.append((label, test, role, state, readings, "" if run is None else parts.data_digest([run])[:16]))
     return TextTable(head, rows)
 
 
-def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[str]:
+def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Run]) -> list[str]:
     """Remarks about runs that no figure uses; for a resumed run, the run that holds its readings."""
-    whole = {piece["run"]: r["run_id"] for r in runs for piece in (r.get("timing") or {}).get("pieces", [])}
-    short = {r["run_id"]: why for r in runs if (why := not_judged(r))}
+    whole = {piece.run: r.run_id for r in runs for piece in r.timing.pieces}
+    short = {r.run_id: why for r in runs if (why := not_judged(r))}
     out = []
     for label, _, _, state, why in states:
         reason = f": {why}" if why else ""
@@ -237,18 +238,17 @@ def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Doc]) -> list[st
     return [*out, *(f"run {label} is {why}, it is not in the figures" for label, why in short.items())]
 
 
-def _own(run: Doc) -> Evaluated:
+def _own(run: Run) -> Evaluated:
     """Figures and pictures of any run: its readings and their range; for a helix also its rms."""
-    if run["columns"].get("deviation_mm") is None:
+    if run.is_sealed:
         return Evaluated(not_observable=["its readings: the run is sealed"])
     try:
         data = run_data(run)
     except AbbeError as error:
         return Evaluated(not_observable=[f"figures of this run: {error.detail}"])
     above = (data.deviation_mm - nominal_reading(data)) * 1e3
-    valid = int(np.sum(np.asarray(run["columns"].get("valid", np.ones(len(run["columns"]["t_s"]))), dtype=bool)))
-    group = "Readings"
-    rows = [ReportFigure(group, "n", f"valid readings of {len(run['columns']['t_s'])}", float(valid), None, "", "count")]
+    group, columns = "Readings", run.columns
+    rows = [ReportFigure(group, "n", f"valid readings of {len(columns)}", float(columns.valid.sum()), None, "", "count")]
     series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
     pictures = [
         Picture(f"Run {data.label}: deviation against time, as read.", [residual_plot(series, noise_um=None, key="readings")], "wide")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
+from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy
 from abbe.service.verification.verify import Verdict, judge, overall
@@ -56,9 +57,9 @@ def machine_facts(machine: Doc) -> dict[str, str]:
     return out if not tool else out | {"Tool": ", ".join(tidy(float(v)) for v in tool) + " mm"}
 
 
-def instruments(runs: Sequence[Doc], campaign: Doc, rules: Rules) -> list[Instrument]:
+def instruments(runs: Sequence[Run], campaign: Doc, rules: Rules) -> list[Instrument]:
     """Instruments used in these runs."""
-    kinds = {"ballbar" if r["test"].startswith("ballbar") else "laser" for r in runs}
+    kinds = {"ballbar" if r.is_bar else "laser" for r in runs}
     return [Instrument(NAMES[k], _certificate(k, rules), _known(k, runs, campaign)) for k in NAMES if k in kinds]
 
 
@@ -69,26 +70,27 @@ def _certificate(kind: str, rules: Rules) -> str:
     return "none stated in the machine file" if day is None else f"valid to {day.isoformat()}"
 
 
-def _known(kind: str, runs: Sequence[Doc], campaign: Doc) -> str:
+def _known(kind: str, runs: Sequence[Run], campaign: Doc) -> str:
     facts = []
     resolution = ((campaign.get("instruments") or {}).get(kind) or {}).get("resolution_mm")
     if resolution is not None:
         facts.append(f"resolution {plain(float(resolution) * 1e3, 2)} µm")
     if kind == "ballbar":
-        bars = {(r["setup"].get("length_calibrated"), r["setup"].get("u_length_mm")) for r in runs if r["test"].startswith("ballbar")}
+        bars = {(r.bar.length_calibrated, r.bar.u_length_mm) for r in runs if r.is_bar}
         for calibrated, u in sorted(bars, key=repr):
             if calibrated:
-                facts.append("length calibrated" + ("" if u is None else f", standard uncertainty {plain(float(u) * 1e3, 2)} µm"))
+                facts.append("length calibrated" + ("" if u is None else f", standard uncertainty {plain(u * 1e3, 2)} µm"))
             else:
                 facts.append("length not calibrated")
     return "; ".join(facts) or "nothing stated"
 
 
-def conditions(runs: Sequence[Doc], rules: Rules) -> tuple[dict[str, str], list[str]]:
+def conditions(runs: Sequence[Run], rules: Rules) -> tuple[dict[str, str], list[str]]:
     """Conditions as text, and remarks about them."""
     out, remarks = {}, []
+    further = [r.columns.further for r in runs]
     for column, name, unit in SENSORS:
-        read = [float(v) for r in runs for v in r["columns"].get(column) or [] if v is not None and np.isfinite(v)]
+        read = [float(v) for columns in further for v in columns.get(column, ()) if np.isfinite(v)]
         if read:
             out[name[0].upper() + name[1:]] = f"{min(read):.2f} to {max(read):.2f} {unit}"
             if column == "temp_air_C" and rules.temperature_c is not None:
@@ -96,23 +98,23 @@ def conditions(runs: Sequence[Doc], rules: Rules) -> tuple[dict[str, str], list[
                 out["Allowed"] = f"{low:g} to {high:g} °C"
                 if min(read) < low or max(read) > high:
                     remarks.append(f"the air was outside of the allowed {low:g} to {high:g} °C: the figures cannot be judged")
-    if not any(name.startswith("temp") and r["columns"].get(name) for r in runs for name in r["columns"]):
+    if not any(name.startswith("temp") and values.size for columns in further for name, values in columns.items()):
         remarks.append("no temperature is on record")
-    feeds = [float(v) for r in runs for v in r["columns"].get("feed_mm_min") or [] if v is not None]
+    feeds = [float(v) for r in runs for v in r.columns.feed_mm_min]
     if feeds:
         out["Feed"] = f"{min(feeds):.0f} to {max(feeds):.0f} mm/min" if min(feeds) != max(feeds) else f"{feeds[0]:.0f} mm/min"
-    spans = [float(r["columns"]["t_s"][-1]) - float(r["columns"]["t_s"][0]) for r in runs if r["columns"].get("t_s")]
+    spans = [float(r.columns.t_s[-1] - r.columns.t_s[0]) for r in runs if len(r.columns)]
     if spans:
         out["Time in the runs"] = f"{sum(spans) / 60.0:.1f} min in {len(spans)} runs"
-    tables = sorted({f"bank {t['bank']}, CRC {t['crc']:08X}" for r in runs if (t := r.get("table")) and "crc" in t and "bank" in t})
+    tables = sorted({f"bank {t.bank}, CRC {t.crc:08X}" for r in runs if (t := r.table).crc is not None and t.bank is not None})
     if tables:
         out["Compensation table in force"] = "; ".join(tables)
     return out, remarks
 
 
-def data_digest(runs: Sequence[Doc]) -> str:
+def data_digest(runs: Sequence[Run]) -> str:
     """SHA-256 over the runs' digests, sorted by name; it changes with any reading."""
-    lines = sorted(f"{r['run_id']} {run_digest(r)}" for r in runs)
+    lines = sorted(f"{r.run_id} {run_digest(r)}" for r in runs)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from abbe.service.domain.run import Run, RunTable
 from abbe.service.rendering.document import Sign
-from abbe.service.report.report_parts import Doc
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, Images, images_of
 from abbe.service.tables.table_gate import STRANGE
@@ -33,9 +33,9 @@ class TableRemarks:
 NO_TABLE_REMARKS = TableRemarks()
 
 
-def table_remarks(store: Store, machine: str, runs: Sequence[Doc]) -> TableRemarks:
+def table_remarks(store: Store, machine: str, runs: Sequence[Run]) -> TableRemarks:
     """Compare the tables that runs of a machine were measured with to the current journals of this database."""
-    used = {int(t["crc"]): t for r in runs if (t := r.get("table")) and t.get("crc") is not None}
+    used = {r.table.crc: r.table for r in runs if r.table.crc is not None}
     if not used:
         return TableRemarks()
     known, images, chain = known_tables(store), images_of(store), store.pushes.chain(machine)
@@ -48,10 +48,10 @@ def table_remarks(store: Store, machine: str, runs: Sequence[Doc]) -> TableRemar
     return TableRemarks("; ".join(unverified), (*unverified, *filter(None, remarks)))
 
 
-def _corrects(crc: int, table: Doc, images: Images) -> bool:
+def _corrects(crc: int, table: RunTable, images: Images) -> bool:
     """Whether a table corrects anything: by its image, else by the statement of the control."""
     image = images(crc)
-    return bool(table.get("acting")) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
+    return bool(table.acting) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
 
 
 def _remark(crc: int, known: KnownTables, chain: str) -> str:

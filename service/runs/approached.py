@@ -6,12 +6,11 @@ the place and came back between the rows.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import REST_MM
+from abbe.service.domain.run import Run
 
 BEYOND_MM = 5.0
 """Assumed overrun beyond a place: more than any lost motion."""
@@ -21,13 +20,13 @@ FEWEST = 3
 """Places approached from both sides that are needed to estimate their difference."""
 
 
-def with_reversals(run: dict[str, Any], q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+def with_reversals(run: Run, q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dtype[np.intp]]]:
     """Insert the reversals that the rows of a ``laser_linear`` run omit; other tests are returned unchanged.
 
     Parameters
     ----------
-    run : dict
-        ``abbe-run/1`` object.
+    run : Run
+        As measured.
     q_mm : array, shape (n, 3)
         Its positions.
 
@@ -36,11 +35,11 @@ def with_reversals(run: dict[str, Any], q_mm: F2) -> tuple[F2, np.ndarray[tuple[
     path, rows
         Positions with the reversals, shape (m, 3), and the index in it of every row, shape (n,).
     """
-    rows, direction = np.arange(len(q_mm)), run["columns"].get("direction")
-    if run["test"] != "laser_linear" or direction is None or not np.isfinite(q_mm).all() or run["setup"].get("end_mm") is None:
+    rows = np.arange(len(q_mm))
+    if run.test != "laser_linear" or not np.isfinite(q_mm).all() or run.laser.end_mm is None:
         return q_mm, rows
     moved = np.abs(np.diff(q_mm, axis=0)).max(axis=1, initial=0.0) > REST_MM
-    way = np.sign(np.asarray(direction, dtype=np.float64))
+    way = np.sign(run.columns.direction)
     turned = np.flatnonzero(~moved & (way[1:] * way[:-1] < 0)) + 1
     if not turned.size:
         return q_mm, rows
@@ -52,18 +51,18 @@ def with_reversals(run: dict[str, Any], q_mm: F2) -> tuple[F2, np.ndarray[tuple[
     return np.insert(q_mm, turned, beyond, axis=0), rows + np.searchsorted(turned, rows, side="right")
 
 
-def _along(run: dict[str, Any]) -> F1:
+def _along(run: Run) -> F1:
     """Unit vector from start to end of a test."""
-    way = np.subtract(run["setup"]["end_mm"], run["setup"]["start_mm"]).astype(np.float64)
+    way = run.laser.span_mm
     return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
 
-def _went_beyond(run: dict[str, Any], q_mm: F2, way: F1, turned: np.ndarray[tuple[int], np.dtype[np.intp]]) -> bool:
+def _went_beyond(run: Run, q_mm: F2, way: F1, turned: np.ndarray[tuple[int], np.dtype[np.intp]]) -> bool:
     """Whether the two readings at a reversal differ like readings from opposite sides at the other places, rather than like repeats."""
-    if run["columns"]["deviation_mm"] is None:
+    if run.is_sealed:
         return False
-    y = np.asarray(run["columns"]["deviation_mm"], dtype=np.float64)
-    good = np.isfinite(y) & np.asarray(run["columns"].get("valid", np.ones(len(y)))).astype(bool)
+    y = run.columns.readings_mm
+    good = np.isfinite(y) & run.columns.valid
     pairs = turned[good[turned] & good[turned - 1]]
     good[np.concatenate([turned, turned - 1])] = False
     place = np.round(q_mm @ _along(run) / NEAR_MM)

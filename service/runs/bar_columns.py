@@ -14,6 +14,7 @@ import numpy.typing as npt
 from abbe.drivers.api import BarSample
 from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.service.domain.document import Doc
+from abbe.service.domain.run import Columns
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.clocks import Edges
 
@@ -39,7 +40,7 @@ def starts_in_stream(samples: Sequence[BarSample]) -> bool:
     return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
 
 
-def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, complete: bool = True, rate: float = 1.0) -> Doc:
+def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, complete: bool = True, rate: float = 1.0) -> Columns:
     """Turn the samples of one path into columns.
 
     Parameters
@@ -57,8 +58,8 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
 
     Returns
     -------
-    dict
-        Columns of ``abbe-run/1`` and ``device_seq``, ``device_us``, ``status``.
+    Columns
+        With ``device_seq``, ``device_us``, ``status``.
 
     Raises
     ------
@@ -75,19 +76,20 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     along_s = _time_along_path(samples, along, device_us, end if complete else None, (rate_hz, rate))
     counts = _counts(points, path.get("measured"), feed_mm_s * along_s)
     along, device_us, along_s = [s for s, yes in zip(along, counts, strict=True) if yes], device_us[counts], along_s[counts]
-    position = _position(points, feed_mm_s * along_s)
-    times = {"t_s": (_start_s(start, end) + along_s).tolist()}
-    places = {f"{axis}_mm": position[:, index].tolist() for index, axis in enumerate("xyz")}
     count = len(along)
-    constant = {"feed_mm_min": [float(path["feed_mm_min"])] * count, "direction": [int(path["direction"])] * count}
-    readings = {
-        "deviation_mm": [sample.reading_nm * 1e-6 for sample in along],
-        "valid": [1 if bar_is_valid(sample.status) else 0 for sample in along],
-        "device_seq": [sample.seq for sample in along],
-        "device_us": device_us.tolist(),
-        "status": [sample.status for sample in along],
-    }
-    return times | places | constant | readings
+    return Columns(
+        t_s=_start_s(start, end) + along_s,
+        q_mm=_position(points, feed_mm_s * along_s),
+        feed_mm_min=np.full(count, float(path["feed_mm_min"])),
+        direction=np.full(count, float(path["direction"])),
+        deviation_mm=np.array([sample.reading_nm * 1e-6 for sample in along], dtype=np.float64),
+        valid=np.array([bar_is_valid(sample.status) for sample in along], dtype=np.bool_),
+        further={
+            "device_seq": np.array([sample.seq for sample in along], dtype=np.int64),
+            "device_us": device_us,
+            "status": np.array([sample.status for sample in along], dtype=np.int64),
+        },
+    )
 
 
 def _start_s(start: Doc, end: Doc | None) -> float:

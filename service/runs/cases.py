@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,12 +12,12 @@ from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, driven, since_reversal, standing
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
-from abbe.service.domain.run_file import ASSUMED_MODEL
+from abbe.service.domain.run import LaserSetup, Run
+from abbe.service.domain.run_file import ASSUMED_MODEL, Role
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.approached import with_reversals
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
-SENSORS = ("x", "y", "z", "spindle", "air")
 AXES = "XYZ"
 FEED_SHARE = 0.1
 """Largest relative difference between the actual and the stated feed; chords are shorter than arcs by 2 % at most."""
@@ -25,8 +25,8 @@ CLOCKS_S = 60.0
 """Tolerance of the mounting time, which people do not note to the second."""
 
 
-def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any]]) -> Case:
-    """Turn an ``abbe-campaign/1`` object and its ``abbe-run/1`` objects into a case.
+def case_of(campaign: dict[str, Any], machine: Machine, runs: list[Run]) -> Case:
+    """Turn an ``abbe-campaign/1`` object and its runs into a case.
 
     Raises
     ------
@@ -45,70 +45,68 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[dict[str, Any
     return Case(str(campaign["campaign"]), machine, frozenset(includes), found, resolution)
 
 
-def with_earliest_mounting(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def with_earliest_mounting(runs: list[Run]) -> list[Run]:
     """Give all runs of a set-up its earliest ``t_set_s``: the set-up was mounted once, and later values are only starts of runs.
 
     Call this with all runs of a campaign before leaving any out, because an omitted run may hold the only mounting time.
     """
     earliest: dict[str, float] = {}
     for run in runs:
-        setup = run["setup"]
-        if setup.get("t_set_s") is not None:
-            earliest[setup["setup_id"]] = min(float(setup["t_set_s"]), earliest.get(setup["setup_id"], np.inf))
-    times = [earliest.get(run["setup"]["setup_id"]) for run in runs]
-    return [run if t is None else run | {"setup": run["setup"] | {"t_set_s": t}} for run, t in zip(runs, times, strict=True)]
+        setup = run.setup
+        if setup.t_set_s is not None:
+            earliest[setup.setup_id] = min(setup.t_set_s, earliest.get(setup.setup_id, np.inf))
+    times = [earliest.get(run.setup.setup_id) for run in runs]
+    return [run if t is None else run.mounted(t) for run, t in zip(runs, times, strict=True)]
 
 
-def _run(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: float) -> CaseRun:
-    columns, setup = run["columns"], run["setup"]
-    deviation = columns["deviation_mm"]
-    reading = None if deviation is None else np.asarray(deviation, dtype=np.float64)
-    valid = np.asarray(columns.get("valid", np.ones(len(columns["t_s"])))).astype(bool)
-    return CaseRun(
-        path_of(run, machine, vertical, dead_path_mm), run["role"], reading, valid, setup.get("u_length_mm"), setup.get("length_calibrated")
-    )
+def _run(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> CaseRun:
+    path, columns, setup = path_of(run, machine, vertical, dead_path_mm), run.columns, run.setup
+    found = CaseRun(path, cast(Role, run.role), columns.deviation_mm, columns.valid)
+    if isinstance(setup, LaserSetup):
+        return found
+    return replace(found, u_length_mm=setup.u_length_mm, length_calibrated=setup.length_calibrated)
 
 
-def path_of(run: dict[str, Any], machine: Machine, vertical: int, dead_path_mm: float) -> Path:
-    """The path of one ``abbe-run/1`` object, without its readings."""
-    columns, setup, laser = run["columns"], run["setup"], run["test"].startswith("laser")
-    t_s, feed = (np.asarray(columns[name], dtype=np.float64) for name in ("t_s", "feed_mm_min"))
-    q = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
-    feed = feed if laser else _driven_feed(q, t_s, feed)
-    temp = {s: np.asarray(columns[f"temp_{s}_C"], dtype=np.float64) for s in SENSORS if f"temp_{s}_C" in columns}
+def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Path:
+    """The path of a run, without its readings."""
+    setup, t_s, q = run.setup, run.columns.t_s, run.columns.q_mm
+    temp = run.columns.temperatures_c
     first = {s: v[:1] for s, v in temp.items()}
-    at = driven(q, t_s, feed, dwelling=laser, temp_c=temp)
-    if laser:
+    at = driven(q, t_s, _feed(run), dwelling=not run.is_bar, temp_c=temp)
+    t_set = float(t_s[0]) if setup.t_set_s is None else setup.t_set_s
+    if t_s[0] < t_set - CLOCKS_S:
+        raise MeasurementFault(
+            f"run {run.run_id}: its first reading is {t_set - t_s[0]:.0f} s before its set-up was mounted (t_set_s)",
+            "write t_s and t_set_s in s of one clock for the whole campaign: what drifts is judged by them",
+        )
+    common: dict[str, Any] = {
+        "label": run.run_id,
+        "setup": setup.setup_id,
+        "test": run.test,
+        "machine": machine if setup.tool_mm is None else replace(machine, tool_mm=setup.tool_mm),
+        "vertical": vertical,
+        "feed_mm_min": _feed(run),
+        "direction": run.columns.direction,
+        "t_set_s": t_set,
+    }
+    if isinstance(setup, LaserSetup):
         path, rows = with_reversals(run, q)
         sign = travel_sign(path)
         at = replace(at, sign=sign[rows], since_mm=since_reversal(path, sign)[rows])
-    t_set = float(setup.get("t_set_s", t_s[0]))
-    if t_s[0] < t_set - CLOCKS_S:
-        raise MeasurementFault(
-            f"run {run['run_id']}: its first reading is {t_set - t_s[0]:.0f} s before its set-up was mounted (t_set_s)",
-            "write t_s and t_set_s in s of one clock for the whole campaign: what drifts is judged by them",
-        )
-    if setup.get("tool_mm") is not None:
-        machine = replace(machine, tool_mm=np.asarray(setup["tool_mm"], dtype=np.float64))
-    common: dict[str, Any] = {
-        "label": run["run_id"],
-        "setup": setup["setup_id"],
-        "test": run["test"],
-        "machine": machine,
-        "vertical": vertical,
-        "at": at,
-        "feed_mm_min": feed,
-        "direction": np.asarray(columns["direction"], dtype=np.float64),
-        "t_set_s": t_set,
-    }
-    if laser:
-        beam = _beam(setup, run["run_id"])
-        look = np.broadcast_to(beam, q.shape)
-        along: dict[str, Any] = {"reference": _first(at), "look": look, "travel_mm": (q - q[0]) @ beam, "dead_path_mm": dead_path_mm}
-        return Path(**common, **along, kind="laser", radius_mm=0.0, centre_mm=np.zeros(3))
-    centre, radius = np.asarray(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"])
-    cup: dict[str, Any] = {"reference": standing(centre, t_set, first), "look": _away(q, centre, run["run_id"])}
-    return Path(**common, **cup, kind="bar", travel_mm=np.zeros(len(q)), dead_path_mm=0.0, radius_mm=radius, centre_mm=centre)
+        look = np.broadcast_to(run.beam, q.shape)
+        along: dict[str, Any] = {"reference": _first(at), "look": look, "travel_mm": (q - q[0]) @ run.beam, "dead_path_mm": dead_path_mm}
+        return Path(**common, **along, at=at, kind="laser", radius_mm=0.0, centre_mm=np.zeros(3))
+    centre = setup.centre_mm
+    cup: dict[str, Any] = {"reference": standing(centre, t_set, first), "look": _away(q, centre, run.run_id)}
+    return Path(
+        **common, **cup, at=at, kind="bar", travel_mm=np.zeros(len(q)), dead_path_mm=0.0, radius_mm=setup.radius_mm, centre_mm=centre
+    )
+
+
+def _feed(run: Run) -> F1:
+    """The feed of every reading, mm/min."""
+    columns = run.columns
+    return _driven_feed(columns.q_mm, columns.t_s, columns.feed_mm_min) if run.is_bar else columns.feed_mm_min
 
 
 def _driven_feed(q_mm: F2, t_s: F1, feed_mm_min: F1) -> F1:
@@ -135,15 +133,3 @@ def _first(at: Places) -> Places:
     return Places(
         at.q_mm[:1], at.sign[:1], at.since_mm[:1], at.v_mm_s[:1], at.a_mm_s2[:1], at.t_s[:1], {s: v[:1] for s, v in at.temp_c.items()}
     )
-
-
-def _beam(setup: dict[str, Any], label: str) -> F1:
-    """Nominal beam as a unit vector: as stated, else along the test."""
-    beam = setup.get("nominal_beam")
-    along = np.asarray(beam if beam is not None else np.subtract(setup["end_mm"], setup["start_mm"]), dtype=np.float64)
-    if setup.get("axis") is not None and beam is None:
-        along = np.atleast_1d(along) * np.eye(3)[AXES.index(setup["axis"])]
-    length = float(np.linalg.norm(along))
-    if along.shape != (3,) or not (np.isfinite(length) and length > 0.0):
-        raise MeasurementFault(f"run {label}: a laser run needs a beam: nominal_beam, or start and end apart")
-    return np.asarray(along / length)

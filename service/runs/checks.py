@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ValidationError
 
 from abbe.service.domain.document import Doc
-from abbe.service.domain.run_file import Columns, RunFile, Setup
+from abbe.service.domain.run_file import ColumnsObject, RunFile, SetupObject
 from abbe.service.errors import FileFormatError
 from abbe.service.explain import expected, location_text, short_repr
 from abbe.service.files import NotPlainError, read_plain
@@ -74,7 +74,7 @@ def check_run(path: Path, document: Doc) -> None:
     FileFormatError
         The document has a mistake; the first one is reported.
     """
-    for part, model in (("setup", Setup), ("columns", Columns)):
+    for part, model in (("setup", SetupObject), ("columns", ColumnsObject)):
         keys = document.get(part)
         for key in keys if isinstance(keys, dict) else ():
             _check_unit(path, f"{part}.{key}", key, model, units_needed=part == "columns")

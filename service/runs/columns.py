@@ -1,4 +1,4 @@
-"""Convert a stored run to an ``abbe-run/1`` document: the only place where raw samples become columns.
+"""Read stored runs: the only place where raw samples become columns.
 
 Start document:
 
@@ -25,6 +25,7 @@ End document:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,17 +33,18 @@ import numpy as np
 from abbe.drivers.flags import bar_is_valid
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord, RunRecord
+from abbe.service.domain.run import Columns, Run, RunTable, RunTiming, parsed_setup
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
 from abbe.service.runs.bar_columns import bar_columns, starts_in_stream, sync_edges
 from abbe.service.runs.clocks import RunClock, run_clock
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.laser_columns import laser_columns
-from abbe.service.runs.pieces import ReadProgress, counted_columns, joined, pieces_of, progress_of
+from abbe.service.runs.pieces import ReadProgress, counted_columns, pieces_of, progress_of
 from abbe.service.storage.store import Store
 
 
-def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
+def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
     """Convert the records of a point-by-point ball-bar test to columns: one row per point, the mean of its samples.
 
     Parameters
@@ -55,22 +57,23 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
 
     Returns
     -------
-    dict
-        Columns of ``abbe-run/1`` and ``reading_u_mm`` (standard uncertainty of each mean), ``samples_count``, ``device_us`` of the first
+    Columns
+        With ``reading_u_mm`` (standard uncertainty of each mean), ``samples_count``, ``device_us`` of the first
         sample.
     """
-    means = [np.mean(one["reading_nm"]) * 1e-6 for one in records]
-    return {
-        "t_s": [(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records],
-        **{f"{axis}_mm": [float(one["target_mm"][index]) for one in records] for index, axis in enumerate("xyz")},
-        "feed_mm_min": [float(one["feed_mm_min"]) for one in records],
-        "direction": [int(one["direction"]) for one in records],
-        "deviation_mm": [float(m) for m in means],
-        "valid": [1 if all(bar_is_valid(s) for s in one["status"]) else 0 for one in records],
-        "reading_u_mm": [_u_mm(one["reading_nm"]) for one in records],
-        "samples_count": [len(one["reading_nm"]) for one in records],
-        "device_us": [int(one["device_us"][0]) for one in records],
-    }
+    return Columns(
+        t_s=np.array([(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records], dtype=np.float64),
+        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
+        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
+        direction=np.array([one["direction"] for one in records], dtype=np.float64),
+        deviation_mm=np.array([np.mean(one["reading_nm"]) * 1e-6 for one in records], dtype=np.float64),
+        valid=np.array([all(bar_is_valid(s) for s in one["status"]) for one in records], dtype=np.bool_),
+        further={
+            "reading_u_mm": np.array([_u_mm(one["reading_nm"]) for one in records], dtype=np.float64),
+            "samples_count": np.array([len(one["reading_nm"]) for one in records], dtype=np.int64),
+            "device_us": np.array([one["device_us"][0] for one in records], dtype=np.int64),
+        },
+    )
 
 
 def _u_mm(reading_nm: Sequence[int]) -> float:
@@ -78,14 +81,13 @@ def _u_mm(reading_nm: Sequence[int]) -> float:
     return float(np.std(reading_nm, ddof=1) * 1e-6 / np.sqrt(n)) if n > 1 else 0.0
 
 
-FORMAT = "abbe-run/1"
 BAR_CHANNEL = "bar"
 LASER_CHANNEL = "laser"
 IMPORTED_CHANNEL = "columns"
 
 
-def load_run(store: Store, id_or_label: int | str) -> Doc:
-    """Read a run from the store as an ``abbe-run/1`` document.
+def load_run(store: Store, id_or_label: int | str) -> Run:
+    """Read a run with its pieces from the store; an incomplete one has a ``state`` (`abbe.service.runs.coverage`).
 
     Raises
     ------
@@ -94,31 +96,33 @@ def load_run(store: Store, id_or_label: int | str) -> Doc:
     MeasurementFault
         Its samples contradict its path.
     """
-    return whole_document(store, store.runs.find(id_or_label))
+    return whole_run(store, store.runs.find(id_or_label))
 
 
-def whole_document(store: Store, record: RunRecord) -> Doc:
-    """A run with its pieces as an ``abbe-run/1`` document; raises like `load_run`.
-
-    An incomplete run has the key ``state`` (`abbe.service.runs.coverage`).
-    """
-    document = run_document(record, store.chunks.of_run(record.id))
+def whole_run(store: Store, record: RunRecord) -> Run:
+    """A run with its pieces; raises like `load_run`."""
+    run = single_run(record, store.chunks.of_run(record.id))
     pieces = pieces_of(record.start_doc)
     if not pieces:
-        return with_state(document, record)
+        return with_state(run, record)
     broken = [(store.runs.find(p.run), p.to_mm) for p in pieces]
-    pieces_doc = [run_document(run, store.chunks.of_run(run.id)) for run, _ in broken]
-    parts = [counted_columns(run, one["columns"], to_mm) for (run, to_mm), one in zip(broken, pieces_doc, strict=True)]
-    named = [{"run": run.label, "readings": len(part["t_s"])} for (run, _), part in zip(broken, parts, strict=True)]
-    timing = document.get("timing", {}) | {"pieces": named}
-    troubles = [f"in {run.label}: {text}" for (run, _), one in zip(broken, pieces_doc, strict=True) if (text := _trouble(one))]
-    if troubles and "trouble" not in timing:
+    earlier = [single_run(one, store.chunks.of_run(one.id)) for one, _ in broken]
+    parts = [counted_columns(record, one.columns, to_mm) for (record, to_mm), one in zip(broken, earlier, strict=True)]
+    named = [{"run": one.label, "readings": len(part)} for (one, _), part in zip(broken, parts, strict=True)]
+    timing = run.timing.document | {"pieces": named}
+    troubles = [f"in {one.run_id}: {one.timing.trouble}" for one in earlier if one.timing.trouble]
+    if troubles and not run.timing.trouble:
         timing["trouble"] = troubles[0]
-    return with_state(document | {"columns": joined([*parts, document["columns"]]), "timing": timing}, record, broken[0][0].start_doc)
+    columns = Columns.concatenated([*parts, run.columns])
+    return with_state(replace(run, columns=columns, timing=RunTiming.from_document(timing)), record, broken[0][0].start_doc)
 
 
-def _trouble(document: Doc) -> str:
-    return str(document.get("timing", {}).get("trouble", ""))
+def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
+    """A run as an ``abbe-run/1`` document. An imported run is as it was, including unknown keys."""
+    imported = _imported(record, chunks)
+    if imported is None:
+        return run.to_document()
+    return imported | ({} if run.state is None else {"state": run.state.to_document()})
 
 
 def path_progress(store: Store, run: int) -> ReadProgress | None:
@@ -128,9 +132,9 @@ def path_progress(store: Store, run: int) -> ReadProgress | None:
         return None  # either of the two readings of the stretch may be wrong
     try:
         chunks = store.chunks.of_run(run)
-        document = run_document(record, chunks)
+        one = single_run(record, chunks)
         samples = [sample for chunk in _of(chunks, BAR_CHANNEL, BAR_CODEC) for sample in decode_bar(chunk.payload)]
-        found = progress_of(record, document["columns"]) if starts_in_stream(samples) and not _trouble(document) else None
+        found = progress_of(record, one.columns) if starts_in_stream(samples) and not one.timing.trouble else None
     except (StoreError, MeasurementFault):
         found = None  # an unreadable run does not count
     if found is not None:
@@ -139,10 +143,8 @@ def path_progress(store: Store, run: int) -> ReadProgress | None:
     return path_progress(store, earlier[-1].run) if earlier else None
 
 
-def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
-    """Convert a run and all its chunks, in order of seq within a channel, to an ``abbe-run/1`` document.
-
-    Columns are plain lists of Python numbers. An imported run is returned exactly as it was, including unknown keys.
+def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
+    """A run without its pieces, from all its chunks in order of seq within a channel.
 
     Raises
     ------
@@ -151,20 +153,34 @@ def run_document(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
     MeasurementFault
         The samples contradict the path.
     """
-    imported = record.start_doc.get("imported")
+    imported = _imported(record, chunks)
     if imported is not None:
-        return dict(imported) | {"columns": unpack_columns(chunks)}  # "imported" has the key too, which keeps its place
-    document: Doc = {"format": FORMAT, "campaign": record.campaign, "run_id": record.label, "test": record.test, "role": record.role}
+        return replace(Run.from_document(imported), ended_utc=record.ended_utc or "")
+    start = record.start_doc
     try:
         columns, timing = _measured(record, chunks)
-        document |= {"machine": record.start_doc["machine"], "setup": _setup(record.start_doc, record.end_doc), "columns": columns}
+        return Run(
+            campaign=record.campaign,
+            run_id=record.label,
+            test=record.test,
+            role=record.role,
+            machine=start["machine"],
+            setup=parsed_setup(record.test, _setup(start, record.end_doc)),
+            columns=columns,
+            table=RunTable.from_document(start.get("table")),  # a solution is meaningful only together with the active table
+            timing=RunTiming.from_document(timing),
+            ended_utc=record.ended_utc or "",
+        )
     except (KeyError, TypeError) as err:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
         ) from None
-    # A solution is meaningful only together with the active compensation table, so the run carries it.
-    document |= {"table": record.start_doc["table"]} if "table" in record.start_doc else {}
-    return document | ({"timing": timing} if timing else {})
+
+
+def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:
+    """An imported run exactly as it was; None for a measured one."""
+    imported = record.start_doc.get("imported")
+    return None if imported is None else dict(imported) | {"columns": unpack_columns(chunks)}  # the key keeps its place
 
 
 def _setup(start: Doc, end: Doc | None) -> Doc:
@@ -186,7 +202,7 @@ def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
     return {record["name"]: record["values"] for record in records}
 
 
-def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> tuple[Doc, Doc]:
+def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> tuple[Columns, Doc]:
     """The columns and the ``timing`` document."""
     if record.test.startswith("ballbar") and "samples" not in record.start_doc.get("setup", {}):
         bar_chunks = _of(chunks, BAR_CHANNEL, BAR_CODEC)

@@ -6,23 +6,21 @@ complete run with a few counted gaps is judged. A run that was measured in piece
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.run import BarSetup, Run, RunState
 from abbe.service.errors import AbbeError, MeasurementFault
-from abbe.service.runs.helix_axis import about_axis, helix_axis
+from abbe.service.runs.helix_axis import about_axis, circle_axis, helix_axis
 from abbe.service.runs.pieces import arc_of
 
 LEAST = 0.9
 """Least share of the commanded path for a judgement: the missing part may contain the largest deviation."""
 COMPLETE = "complete"
-KEY = "state"
-"""Key of an incomplete ``abbe-run/1`` object: ``status`` and, if known, ``covered`` (share of the path)."""
 GAP_MM, GAP_SAMPLES = 5.0, 10.0
 """Two valid readings farther apart than both limits leave the path between them unread."""
 LEAST_A_TURN = 8
@@ -32,32 +30,29 @@ GAP_STEPS, GAP_SHARE = 3.0, 0.15
 or of a turn, leave the path between them unread."""
 
 
-def with_state(document: Doc, record: RunRecord, begun: Doc | None = None) -> Doc:
-    """Add the key ``state`` to a stored run that is incomplete or has not read enough of its path.
+def with_state(run: Run, record: RunRecord, begun: Doc | None = None) -> Run:
+    """Add the ``state`` of a stored run that is incomplete or has not read enough of its path.
 
     ``begun``: start document of the run that began the path, if this one resumed it.
     """
-    share = _of_path(document, begun or record.start_doc)
+    share = _of_path(run, begun or record.start_doc)
     status = record.visible_status
     if status == COMPLETE and (share is None or share >= LEAST):
-        return document
-    return document | {KEY: {"status": status} | ({} if share is None else {"covered": round(share, 4)})}
+        return run
+    return replace(run, state=RunState(status=status, covered=None if share is None else round(share, 4)))
 
 
-def covered_share(run: Mapping[str, Any]) -> float | None:
+def covered_share(run: Run) -> float | None:
     """Share of its commanded path that a run has read, 0 to 1.
 
     None if neither the store nor the set-up states a path; NaN for a helix that is too short to determine its axis.
     """
-    if KEY in run:
-        share = run[KEY].get("covered")
-        return None if share is None else float(share)
-    return _of_setup(run)
+    return _of_setup(run) if run.state is None else run.state.covered
 
 
-def not_judged(run: Mapping[str, Any]) -> str:
-    """Why an ``abbe-run/1`` object gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
-    status = str((run.get(KEY) or {}).get("status", COMPLETE))
+def not_judged(run: Run) -> str:
+    """Why a run gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
+    status = COMPLETE if run.state is None else run.state.status
     share = covered_share(run)
     if status == COMPLETE and (share is None or share >= LEAST):
         return ""
@@ -66,7 +61,7 @@ def not_judged(run: Mapping[str, Any]) -> str:
     return f"{state}: {part}not judged"
 
 
-def check_judged(run: Mapping[str, Any]) -> None:
+def check_judged(run: Run) -> None:
     """Refuse a run that gives no result.
 
     Raises
@@ -76,53 +71,47 @@ def check_judged(run: Mapping[str, Any]) -> None:
     """
     why = not_judged(run)
     if why:
-        raise MeasurementFault(f"run {run['run_id']}: {why}", "measure it again, or go on with it: abbe measure MACHINE.toml --resume")
+        raise MeasurementFault(f"run {run.run_id}: {why}", "measure it again, or go on with it: abbe measure MACHINE.toml --resume")
 
 
-def _of_path(document: Doc, start: Doc) -> float | None:
+def _of_path(run: Run, start: Doc) -> float | None:
     """Share of the commanded path length, or of the planned standstills."""
-    columns = document["columns"]
-    if columns.get("deviation_mm") is None:
+    if run.is_sealed:
         return None
-    valid = _valid(columns)
-    path = start.get("path")
+    valid, path = run.columns.valid, start.get("path")
     if path:
         points = path["points_mm"]
         last = path["measured"][1] if path.get("measured") else len(points) - 1
         first = path["measured"][0] if path.get("measured") else 0
         arc = arc_of(points)
         whole = float(path.get("offset_mm", 0.0)) + float(arc[last] - arc[first])
-        return _share(_read_mm(_positions(columns)[valid], path["feed_mm_min"] / 60.0 / float(start.get("rate_hz", 1.0))), whole)
+        return _share(_read_mm(run.columns.q_mm[valid], path["feed_mm_min"] / 60.0 / float(start.get("rate_hz", 1.0))), whole)
     planned = start.get("standstills")
     return None if not planned else _share(float(valid.sum()), float(planned))
 
 
-def _of_setup(run: Mapping[str, Any]) -> float | None:
+def _of_setup(run: Run) -> float | None:
     """Share according to the set-up of a run from a file: turns of a helix, angle of a circle, outward path of a laser run."""
-    columns, setup = run["columns"], run["setup"]
-    if columns.get("deviation_mm") is None:
+    if run.is_sealed:
         return None
-    at = _positions(columns)[_valid(columns)]
+    at, setup = run.columns.q_mm[run.columns.valid], run.setup
     if len(at) < 3 or not np.isfinite(at).all():
         return None
     try:
-        if run["test"].startswith("ballbar"):
-            return _turned(run, at - np.asarray(setup["centre_mm"], dtype=np.float64))
-        way = np.subtract(setup["end_mm"], setup["start_mm"]).astype(np.float64)
-        along = at @ way
-        return _share(_read(np.sort(along), GAP_SHARE * float(way @ way)), float(way @ way))
-    except (AbbeError, KeyError, TypeError, ValueError):
+        if isinstance(setup, BarSetup):
+            return _turned(setup, at - setup.centre_mm, circle=run.test == "ballbar_circle")
+        along = at @ setup.span_mm
+        whole = float(setup.span_mm @ setup.span_mm)
+        return _share(_read(np.sort(along), GAP_SHARE * whole), whole)
+    except (AbbeError, ValueError):
         return None
 
 
-def _turned(run: Mapping[str, Any], at: F2) -> float | None:
-    setup = run["setup"]
-    if run["test"] == "ballbar_circle":
-        axis: int | None = 3 - sum("XYZ".index(c) for c in str(setup["plane"]))
-        whole = float(setup.get("span_deg") or 360.0) / 360.0
-    else:
-        axis, whole = helix_axis(setup, at), float(setup["turns"])
-    if not whole > 0.0:
+def _turned(setup: BarSetup, at: F2, *, circle: bool) -> float | None:
+    """Share of the turns about the axis of a ball-bar path."""
+    axis = circle_axis(setup.plane) if circle else helix_axis(setup.axis, at)
+    whole = setup.span_deg / 360.0 if circle else setup.turns
+    if whole is None or not whole > 0.0:
         return None
     if axis is None:
         return np.nan
@@ -147,11 +136,3 @@ def _read_mm(at: F2, step_mm: float) -> float:
     """Path length between consecutive valid readings, without gaps, mm."""
     steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
     return float(steps[steps <= max(GAP_MM, GAP_SAMPLES * step_mm)].sum()) + step_mm
-
-
-def _positions(columns: Mapping[str, Any]) -> F2:
-    return np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
-
-
-def _valid(columns: Mapping[str, Any]) -> Any:
-    return np.asarray(columns.get("valid", np.ones(len(columns["t_s"])))).astype(bool)

@@ -11,11 +11,12 @@ from pathlib import Path
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import CampaignRecord, ImportedRun, RunRecord
+from abbe.service.domain.run import Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
 from abbe.service.errors import FileFormatError
 from abbe.service.runs.checks import check, check_run, read_json
 from abbe.service.runs.codec import JSON_CODEC, encode_json
-from abbe.service.runs.columns import pack_columns, run_document, whole_document
+from abbe.service.runs.columns import pack_columns, run_document, single_run, whole_run
 from abbe.service.runs.pieces import pieces_of
 from abbe.service.storage.store import Store
 
@@ -29,8 +30,12 @@ class Folder:
     """Content of a checked campaign folder: ``campaign.json``, its run files in order, and the errors file of its ``current_model``."""
 
     campaign: Doc
-    runs: list[Doc]
+    run_files: list[Doc]
     errors: Doc | None
+
+    def runs(self) -> list[Run]:
+        """The runs, parsed."""
+        return [Run.from_document(run) for run in self.run_files]
 
 
 def read_folder(folder: Path) -> Folder:
@@ -81,7 +86,7 @@ def import_folder(store: Store, folder: Path) -> int:
     """
     content = read_folder(folder)
     campaign, machine = content.campaign, content.campaign["machine"]
-    imported = [_imported(entry, run) for entry, run in zip(campaign["runs"], content.runs, strict=True)]
+    imported = [_imported(entry, run) for entry, run in zip(campaign["runs"], content.run_files, strict=True)]
     doc = {"imported": campaign, "errors": content.errors}
     return store.runs.import_campaign((machine.get("name") or campaign["campaign"], machine), (campaign["campaign"], doc), imported)
 
@@ -124,7 +129,8 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
     for run in runs:
         if run.id in joined:
             continue  # its readings are part of the resumed run: a measurement must not count twice
-        document = whole_document(store, run) if run.status == COMPLETE else run_document(run, store.chunks.of_run(run.id))
+        chunks = store.chunks.of_run(run.id)
+        document = run_document(whole_run(store, run) if run.status == COMPLETE else single_run(run, chunks), run, chunks)
         entry = run.start_doc.get("entry") or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
         setup = document["setup"]

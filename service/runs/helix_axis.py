@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
+from abbe.service.domain.run import Run
 from abbe.service.errors import MeasurementFault
 
 STRAIGHT = 0.8
@@ -17,20 +15,20 @@ ROUND = 0.5
 """Across its axis a helix goes round: largest ratio of net to total travel. Less than a turn is no helix."""
 
 
-def helix_axis(setup: Mapping[str, Any], at_mm: F2) -> int | None:
+def helix_axis(stated: str, at_mm: F2) -> int | None:
     """Axis of a helix, 0 to 2: as the set-up states it, else the axis along which the commanded path advances.
 
     None if the set-up states no axis, and the path advances along none or along several.
 
     Parameters
     ----------
-    setup : mapping
-        Set-up of an ``abbe-run/1`` object.
+    stated : str
+        Letter of the axis in the set-up, or empty.
     at_mm : array, shape (n, 3)
         Commanded positions in chronological order, mm.
     """
-    if setup.get("axis"):
-        return AXES.index(str(setup["axis"]))
+    if stated:
+        return AXES.index(stated)
     if len(at_mm) < 3:
         return None
     way = np.abs(np.diff(at_mm, axis=0)).sum(axis=0)
@@ -47,7 +45,12 @@ def about_axis(at_mm: F2, axis: int) -> F1:
     return np.asarray(np.arctan2(at_mm[:, b], at_mm[:, a]), dtype=np.float64)
 
 
-def path_axis(run: Mapping[str, Any], at_mm: F2) -> int:
+def circle_axis(plane: str) -> int:
+    """Axis normal to a plane given by two letters, 0 to 2."""
+    return 3 - sum(AXES.index(letter) for letter in plane)
+
+
+def path_axis(run: Run, at_mm: F2) -> int:
     """Axis of a ball-bar run: the normal of a circle's plane, or `helix_axis`.
 
     Raises
@@ -55,13 +58,12 @@ def path_axis(run: Mapping[str, Any], at_mm: F2) -> int:
     MeasurementFault
         Neither set-up nor path determines the axis of a helix.
     """
-    setup = run["setup"]
-    if run["test"] == "ballbar_circle":
-        return 3 - sum(AXES.index(c) for c in str(setup["plane"]))
-    found = helix_axis(setup, at_mm)
+    if run.test == "ballbar_circle":
+        return circle_axis(run.bar.plane)
+    found = helix_axis(run.bar.axis, at_mm)
     if found is None:
         raise MeasurementFault(
-            f"run {run['run_id']}: its set-up states no axis of the helix, and its path advances along none",
+            f"run {run.run_id}: its set-up states no axis of the helix, and its path advances along none",
             'state it in the set-up: "axis": "X", "Y" or "Z"',
         )
     return found

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from abbe.drivers.flags import beam_is_gone
 from abbe.service.domain.document import Doc
+from abbe.service.domain.run import Columns
 
 MM_PER_COUNT = 1e-7
 """The displacement counts tenths of a nanometre."""
 
 
-def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
+def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
     """Convert laser records to columns.
 
     Parameters
@@ -25,25 +28,27 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Doc:
 
     Returns
     -------
-    dict
-        Columns of ``abbe-run/1`` and ``status``, ``signal_permille``. Deviations count from the first record, or from the laser's zero if
+    Columns
+        With ``status``, ``signal_permille``. Deviations count from the first record, or from the laser's zero if
         that record is missing. A missing reading is a row with the commanded position, deviation 0 and ``valid`` 0, so that later rows keep
         their places.
     """
     first = records[0] if records else {}
     beam = start["setup"]["nominal_beam"]
-    return {
-        "t_s": [(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records],
-        **{f"{axis}_mm": [float(one["target_mm"][index]) for one in records] for index, axis in enumerate("xyz")},
-        "feed_mm_min": [float(one["feed_mm_min"]) for one in records],
-        "direction": [int(one["direction"]) for one in records],
-        "deviation_mm": [_deviation_mm(one, first, beam) for one in records],
-        "temp_air_C": [float(one["air_temp_c"]) for one in records],
-        "pressure_air_Pa": [float(one["air_pressure_pa"]) for one in records],
-        "valid": [0 if one.get("missing") or beam_is_gone(one["status"]) else 1 for one in records],
-        "status": [int(one["status"]) for one in records],
-        "signal_permille": [int(one["signal_permille"]) for one in records],
-    }
+    return Columns(
+        t_s=np.array([(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records], dtype=np.float64),
+        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
+        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
+        direction=np.array([one["direction"] for one in records], dtype=np.float64),
+        deviation_mm=np.array([_deviation_mm(one, first, beam) for one in records], dtype=np.float64),
+        valid=np.array([not (one.get("missing") or beam_is_gone(one["status"])) for one in records], dtype=np.bool_),
+        further={
+            "temp_air_C": np.array([one["air_temp_c"] for one in records], dtype=np.float64),
+            "pressure_air_Pa": np.array([one["air_pressure_pa"] for one in records], dtype=np.float64),
+            "status": np.array([one["status"] for one in records], dtype=np.int64),
+            "signal_permille": np.array([one["signal_permille"] for one in records], dtype=np.int64),
+        },
+    )
 
 
 def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[float]) -> float:

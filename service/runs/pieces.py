@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.run import Columns
 
 STRETCH_S, STRETCH_MM = 0.5, 5.0
 """Duration, and least length, of the stretch that is read twice."""
@@ -52,7 +52,7 @@ def pieces_of(start: Doc) -> tuple[RunPiece, ...]:
     return tuple(RunPiece(int(one["run"]), float(one["to_mm"])) for one in (start.get("path") or {}).get("pieces", []))
 
 
-def progress_of(record: RunRecord, columns: Doc) -> ReadProgress | None:
+def progress_of(record: RunRecord, columns: Columns) -> ReadProgress | None:
     """Progress of an interrupted run with these columns; None if the path cannot be resumed from it."""
     path, end = record.start_doc.get("path"), record.end_doc or {}
     if not path or "good_us" not in end or "box_boot_id" not in end:
@@ -61,9 +61,8 @@ def progress_of(record: RunRecord, columns: Doc) -> ReadProgress | None:
     good_mm = (end["good_us"] - end["path_start_us"]) * 1e-6 * feed_mm_s
     arc = arc_of(path["points_mm"])
     counted_mm = float(arc[path["measured"][0]]) if path.get("measured") else 0.0
-    valid = np.asarray(columns["valid"], dtype=bool)
-    at_mm = along_mm(record.start_doc, end, columns)[valid]
-    seq = np.asarray(columns["device_seq"], dtype=np.int64)
+    at_mm = along_mm(record.start_doc, end, columns)[columns.valid]
+    seq = columns.further["device_seq"]
     lost = int(seq[-1] - seq[0]) % 2**32 + 1 - seq.size if seq.size else 0
     if lost > max(1.0, MOST_LOST * seq.size):
         return None  # such a loss ends a run (abbe.service.capture), so pieces must not have it either
@@ -72,23 +71,17 @@ def progress_of(record: RunRecord, columns: Doc) -> ReadProgress | None:
     if good_mm - counted_mm < max(STRETCH_MM, STRETCH_S * feed_mm_s) or int(known.sum()) < LEAST_READINGS:
         return None
     pieces = (*pieces_of(record.start_doc), RunPiece(record.id, offset + good_mm))
-    deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)[valid]
+    deviation = columns.readings_mm[columns.valid]
     return ReadProgress(pieces, offset + counted_mm, offset + at_mm[known], deviation[known], int(end["box_boot_id"]))
 
 
-def along_mm(start: Doc, end: Doc, columns: Doc) -> Any:
+def along_mm(start: Doc, end: Doc, columns: Columns) -> F1:
     """Position of each reading of an interrupted run along its own path, mm from the first point, shape (n,)."""
-    since_s = np.asarray(columns["t_s"], dtype=np.float64) - (end["path_start_us"] - start["ctrl0_us"]) * 1e-6
-    return since_s * start["path"]["feed_mm_min"] / 60.0
+    since_s = columns.t_s - (end["path_start_us"] - start["ctrl0_us"]) * 1e-6
+    return np.asarray(since_s * float(start["path"]["feed_mm_min"]) / 60.0)
 
 
-def counted_columns(record: RunRecord, columns: Doc, to_mm: float) -> Doc:
+def counted_columns(record: RunRecord, columns: Columns, to_mm: float) -> Columns:
     """The columns of an interrupted run before ``to_mm`` on the whole path."""
     offset = float(record.start_doc["path"].get("offset_mm", 0.0))
-    counts = offset + along_mm(record.start_doc, record.end_doc or {}, columns) < to_mm
-    return {name: [v for v, yes in zip(values, counts, strict=True) if yes] for name, values in columns.items()}
-
-
-def joined(parts: list[Doc]) -> Doc:
-    """Concatenate the columns of several parts."""
-    return {name: [v for part in parts for v in part[name]] for name in parts[-1]}
+    return columns.rows(offset + along_mm(record.start_doc, record.end_doc or {}, columns) < to_mm)

@@ -15,6 +15,7 @@ from abbe.models.machine import AXES
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import U_WAVELENGTH
 from abbe.models.verification import U_REPEAT_MM, helix_figure
+from abbe.service.domain.run import Run
 from abbe.service.rendering.document import ReportFigure
 from abbe.service.rendering.numbers import COVERAGE, finite
 from abbe.service.runs.coverage import not_judged
@@ -27,18 +28,18 @@ SAME_PLACE_MM = 0.5
 SAME_FEED = 0.01
 """Feeds that differ by less than this share count as equal."""
 KIND = ("plane", "axis", "diagonal", "face", "order")
-"""Keys of a set-up that must agree for two runs to be comparable."""
+"""Fields of a set-up that must agree for two runs to be comparable."""
 PLACE = ("centre_mm", "radius_mm", "start_mm", "end_mm")
 UM = 1e3
 
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A run to compare: name of its machine, ``abbe-run/1`` object, readings and figures."""
+    """A run to compare: name of its machine, readings for the solvers, and figures."""
 
     label: str
     machine: str
-    run: dict[str, Any]
+    run: Run
     data: RunData
     figures: Sequence[ReportFigure]
 
@@ -95,8 +96,8 @@ def incomparable_reason(first: LoadedRun, other: LoadedRun) -> str:
     if first.machine != other.machine:
         names = f"{other.label} was measured on machine {other.machine}, {first.label} on {first.machine}"
         return f"{names}: runs of two machines have no difference"
-    if first.run["test"] != other.run["test"]:
-        return f"{other.label} is {other.run['test']}, {first.label} is {first.run['test']}: only runs of one test can be compared"
+    if first.run.test != other.run.test:
+        return f"{other.label} is {other.run.test}, {first.label} is {first.run.test}: only runs of one test can be compared"
     for key in KIND:
         a, b = (_kind(r, key) for r in (first, other))
         if a != b:
@@ -107,13 +108,12 @@ def incomparable_reason(first: LoadedRun, other: LoadedRun) -> str:
     return ""
 
 
-def _kind(one: LoadedRun, key: str) -> Any:
-    """Value of a set-up's key; the axis of a helix is also derived from its path."""
-    setup = one.run["setup"]
-    if key == "axis" and one.run["test"] == "ballbar_helix":
-        axis = helix_axis(setup, one.data.axes_mm)
+def _kind(one: LoadedRun, key: str) -> str:
+    """Text of a set-up's field; the axis of a helix is also derived from its path."""
+    if key == "axis" and one.run.test == "ballbar_helix":
+        axis = helix_axis(one.run.setup.axis, one.data.axes_mm)
         return "" if axis is None else AXES[axis]
-    return setup.get(key) or ""
+    return getattr(one.run.setup, key, None) or ""
 
 
 def _feed(mm_min: float) -> str:
@@ -125,25 +125,20 @@ def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -
     out = []
     first = loaded[0]
     for other in loaded[1:]:
-        apart = [key for key in PLACE if not _same(first.run["setup"].get(key), other.run["setup"].get(key))]
+        apart = [key for key in PLACE if not _same(getattr(first.run.setup, key, None), getattr(other.run.setup, key, None))]
         if apart:
             out.append(f"{other.label} was measured elsewhere than {first.label} ({', '.join(apart)}): the difference holds that too")
-        tables = [(r.run.get("table") or {}).get("crc") for r in (first, other)]
+        tables = [r.run.table.crc for r in (first, other)]
         if tables[0] != tables[1]:
             out.append(f"{other.label} was measured with another compensation table in force than {first.label}")
-        ways = [set(_column(r, "direction")) for r in (first, other)]
-        if all(ways) and ways[0] != ways[1]:
+        ways = [set(r.run.columns.direction.tolist()) for r in (first, other)]
+        if ways[0] != ways[1]:
             out.append(f"{other.label} was driven in another direction than {first.label}: reversal errors are in the difference")
-        feeds = [float(np.median(f)) if (f := _column(r, "feed_mm_min")) else float("nan") for r in (first, other)]
+        feeds = [float(np.median(r.run.columns.feed_mm_min)) for r in (first, other)]
         if abs(feeds[1] - feeds[0]) > SAME_FEED * abs(feeds[0]):
             feeds_text = f"{feed(feeds[1])}, {first.label} with {feed(feeds[0])}"
             out.append(f"{other.label} was driven with {feeds_text}: what depends on feed is in the difference")
     return out
-
-
-def _column(one: LoadedRun, name: str) -> list[float]:
-    """Values of a column of a run; empty without the column."""
-    return [float(v) for v in (one.run.get("columns") or {}).get(name) or () if v is not None]
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -13,14 +12,13 @@ from abbe.models.evaluation.iso230_2 import Approaches
 from abbe.models.evaluation.iso230_4 import CircularTest
 from abbe.models.machine import AXES
 from abbe.models.solvers.observations import nominal_reading
+from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.runs.observations import run_data
 
 NEAR_MM = 0.05
 """Positions closer than this count as one position (as for discoveries: `abbe.service.effects.axis_test`)."""
 ALL = 10**9
-
-Run = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,7 @@ def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
     """Positioning tests of single axes: runs of one axis in one set-up are one test. Appends unusable runs, with reason, to ``refused``."""
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in _open(runs, "laser_linear"):
-        groups.setdefault((_axis(run), str(run["setup"]["setup_id"])), []).append(run)
+        groups.setdefault((_axis(run), run.setup.setup_id), []).append(run)
     return [t for (name, setup), group in groups.items() if (t := _test(name, setup, group, refused)) is not None]
 
 
@@ -59,13 +57,10 @@ def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[Ax
     """Plain diagonals by group: ``body`` or a plane. Step diagonals are no test of ISO 230-6."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in _open(runs, "laser_diagonal"):
-        setup = run["setup"]
-        if not setup.get("order"):
-            face = setup.get("face")
-            name = str(setup["diagonal"])
-            if face:
-                name = "".join(name["XYZ".index(a)] for a in face)
-            groups.setdefault((str(face or "body"), name, str(setup["setup_id"])), []).append(run)
+        setup = run.laser
+        if not setup.order:
+            name = "".join(setup.diagonal["XYZ".index(a)] for a in setup.face) if setup.face else setup.diagonal
+            groups.setdefault((setup.face or "body", name, setup.setup_id), []).append(run)
     out: dict[str, list[AxisTest]] = {}
     for (plane, name, setup_id), group in groups.items():
         test = _test(name, setup_id, group, refused)
@@ -81,12 +76,12 @@ def circle_tests(runs: Sequence[Run], refused: list[str]) -> list[CircleTest]:
         try:
             out.append(_circle(run))
         except (AbbeError, ValueError) as error:
-            refused.append(f"circle {run['run_id']}: {_message(error)}")
+            refused.append(f"circle {run.run_id}: {_message(error)}")
     return out
 
 
 def _circle(run: Run) -> CircleTest:
-    plane = str(run["setup"]["plane"])
+    setup, plane = run.bar, run.bar.plane
     data = run_data(run, blocks=ALL)
     assert data.centre_mm is not None
     a, b = ("XYZ".index(c) for c in plane)
@@ -94,8 +89,8 @@ def _circle(run: Run) -> CircleTest:
     angle = np.unwrap(np.arctan2(at[:, b], at[:, a]))
     path = CircularTest(angle, data.deviation_mm - nominal_reading(data))
     sense = 1 if angle[-1] >= angle[0] else -1
-    u = run["setup"].get("u_length_mm") if run["setup"].get("length_calibrated") else None
-    return CircleTest(run["run_id"], plane, data.setup, float(run["setup"]["radius_mm"]), sense, path, u)
+    u = setup.u_length_mm if setup.length_calibrated else None
+    return CircleTest(run.run_id, plane, data.setup, setup.radius_mm, sense, path, u)
 
 
 def _message(error: Exception) -> str:
@@ -104,21 +99,16 @@ def _message(error: Exception) -> str:
 
 def _open(runs: Sequence[Run], test: str) -> list[Run]:
     """Runs of one test that have readings (not sealed)."""
-    return [r for r in runs if r["test"] == test and r["columns"].get("deviation_mm") is not None]
+    return [r for r in runs if r.test == test and not r.is_sealed]
 
 
 def _axis(run: Run) -> str:
-    named = run["setup"].get("axis")
-    return str(named) if named else AXES[int(np.argmax(np.abs(_way(run))))]
-
-
-def _way(run: Run) -> F1:
-    return np.asarray(np.subtract(run["setup"]["end_mm"], run["setup"]["start_mm"]), dtype=np.float64)
+    return run.laser.axis or AXES[int(np.argmax(np.abs(run.laser.span_mm)))]
 
 
 def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTest | None:
     """Test from readings by position, side and cycle; None if they are no bidirectional test, with the reason in ``refused``."""
-    runs = tuple(r["run_id"] for r in group)
+    runs = tuple(r.run_id for r in group)
     try:
         readings = _approaches(name, group)
     except (AbbeError, ValueError) as error:
@@ -142,18 +132,15 @@ def _approaches(name: str, group: list[Run]) -> Approaches:
 
 def _readings(run: Run, name: str) -> tuple[F1, F1, F1]:
     """Position, direction and deviation of the valid readings along the positive sense of the axis, mm."""
-    columns = run["columns"]
-    axes = np.column_stack([np.asarray(columns[f"{c}_mm"], dtype=np.float64) for c in "xyz"])
-    keep = np.asarray(columns.get("valid", np.ones(len(axes)))).astype(bool)
+    axes, keep, deviation = run.columns.q_mm, run.columns.valid, run.columns.readings_mm
+    way, start = run.laser.span_mm, run.laser.ends_mm[0]
     if len(name) == 1:
-        along, turned = axes[:, "XYZ".index(name)], float(np.sign(_way(run)["XYZ".index(name)]))
+        along, turned = axes[:, "XYZ".index(name)], float(np.sign(way["XYZ".index(name)]))
     else:
-        way = _way(run)
-        along, turned = (axes - np.asarray(run["setup"]["start_mm"])) @ (way / np.linalg.norm(way)), 1.0
-    deviation = np.asarray(columns["deviation_mm"], dtype=np.float64)
+        along, turned = (axes - start) @ (way / np.linalg.norm(way)), 1.0
     if turned == 0.0 or not np.isfinite(deviation[keep]).all():
-        raise MeasurementFault(f"run {run['run_id']}: it is no test along {name}, or a deviation is no number", "leave it out")
-    sign = np.asarray(columns["direction"], dtype=np.float64) * turned
+        raise MeasurementFault(f"run {run.run_id}: it is no test along {name}, or a deviation is no number", "leave it out")
+    sign = run.columns.direction * turned
     return _place(along)[keep], sign[keep], (deviation * turned)[keep]
 
 
@@ -163,19 +150,18 @@ def _place(along: F1) -> F1:
 
 def _turning_points(run: Run, name: str) -> list[float]:
     """Turning points of recipes with an overrun: they are read but are no target positions."""
-    setup = run["setup"]
-    if not setup.get("overrun_mm"):
+    setup = run.laser
+    if not setup.overrun_mm:
         return []
-    ends = np.array([setup["start_mm"], setup["end_mm"]], dtype=np.float64)
     if len(name) == 1:
-        return [float(v) for v in _place(ends[:, "XYZ".index(name)])]
-    return [0.0, float(_place(np.array([np.linalg.norm(ends[1] - ends[0])]))[0])]
+        return [float(v) for v in _place(np.array(setup.ends_mm)[:, "XYZ".index(name)])]
+    return [0.0, float(_place(np.array([np.linalg.norm(setup.span_mm)]))[0])]
 
 
 def _notes(group: list[Run]) -> list[str]:
     out = []
-    if not any(r["setup"].get("overrun_mm") for r in group):
+    if not any(r.laser.overrun_mm for r in group):
         out.append("the end positions have no overrun on record: there the two sides may be one approach read twice, and B shows nothing")
-    if len(group) > 1 and all(r["columns"]["deviation_mm"][0] == 0.0 for r in group):
+    if len(group) > 1 and all(r.columns.readings_mm[0] == 0.0 for r in group):
         out.append("every run was zeroed at its first reading: what that reading scatters is in R and A of all other positions")
     return out

@@ -14,6 +14,7 @@ from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circula
 from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
+from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Picture, ReportFigure
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.numbers import plain
@@ -47,19 +48,19 @@ class Evaluated:
     statements: list[str] = field(default_factory=list)
 
 
-def evaluate(runs: Sequence[dict[str, Any]], instruments: dict[str, Any] | None = None) -> Evaluated:
+def evaluate(runs: Sequence[Run], instruments: dict[str, Any] | None = None) -> Evaluated:
     """Evaluate every run that is a test of ISO 230-2, 230-4 or 230-6.
 
     Parameters
     ----------
-    runs : sequence of dict
-        ``abbe-run/1`` objects.
+    runs : sequence of Run
+        As measured.
     instruments : dict, optional
         ``instruments`` of the campaign (run-format.md 4): resolutions.
     """
     out = Evaluated()
     budget = scale_budget(instruments or {})
-    refused = [f"run {run['run_id']}: {why}" for run in runs if (why := not_judged(run))]
+    refused = [f"run {run.run_id}: {why}" for run in runs if (why := not_judged(run))]
     runs = [run for run in runs if not not_judged(run)]
     linear, along, circles = linear_tests(runs, refused), diagonal_tests(runs, refused), circle_tests(runs, refused)
     out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]

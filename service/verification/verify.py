@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure
+from abbe.service.domain.run import Run
 from abbe.service.errors import MeasurementFault, TableRefused
 from abbe.service.runs.coverage import check_judged
 from abbe.service.runs.observations import run_data
@@ -51,8 +52,8 @@ class VerificationFigures:
         return max(self.diagonals.values(), key=lambda f: f.value_mm)
 
 
-def figures(runs: list[dict[str, Any]]) -> VerificationFigures:
-    """Figures of a verification's runs (``abbe-run/1`` objects): plain body diagonals and at most one helix.
+def figures(runs: list[Run]) -> VerificationFigures:
+    """Figures of a verification's runs: plain body diagonals and at most one helix.
 
     Raises
     ------
@@ -61,13 +62,13 @@ def figures(runs: list[dict[str, Any]]) -> VerificationFigures:
     """
     diagonals, helix = {}, None
     for run in runs:
-        if run["test"] == "laser_diagonal" and not run["setup"].get("order") and not run["setup"].get("face"):
+        if run.test == "laser_diagonal" and not run.laser.order and not run.laser.face:
             check_judged(run)
             try:
-                diagonals[str(run["setup"]["diagonal"])] = diagonal_figure(run_data(run))
+                diagonals[run.laser.diagonal] = diagonal_figure(run_data(run))
             except ValueError as error:
                 raise MeasurementFault(str(error), "measure it again") from None
-        elif run["test"] == "ballbar_helix":
+        elif run.test == "ballbar_helix":
             check_judged(run)
             helix = helix_figure(run_data(run))
     if set(diagonals) != DIAGONALS:
@@ -75,11 +76,11 @@ def figures(runs: list[dict[str, Any]]) -> VerificationFigures:
         raise MeasurementFault(
             f"these runs are no verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
-    return VerificationFigures(diagonals, helix, _air_c(runs), frozenset(run.get("table", {}).get("crc") for run in runs))
+    return VerificationFigures(diagonals, helix, _air_c(runs), frozenset(run.table.crc for run in runs))
 
 
-def _air_c(runs: list[dict[str, Any]]) -> tuple[float, float] | None:
-    air = [float(t) for run in runs for t in run["columns"].get("temp_air_C", []) if t is not None and np.isfinite(t)]
+def _air_c(runs: list[Run]) -> tuple[float, float] | None:
+    air = [float(t) for run in runs for t in run.columns.air_c if np.isfinite(t)]
     return (min(air), max(air)) if air else None
 
 

@@ -16,6 +16,7 @@ from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.run import Run
 from abbe.service.errors import Interlock
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import export_folder, import_folder
@@ -101,13 +102,11 @@ def runs(store: Store) -> list[RunRecord]:
     return store.runs.all(store.campaigns.all()[-1].id)
 
 
-def about_centre(document: dict) -> tuple[np.ndarray, np.ndarray]:
+def about_centre(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """Arc-ordered positions, and readings without cup and length: what is left is the machine."""
-    columns = document["columns"]
-    at = np.stack([columns[f"{a}_mm"] for a in "xyz"], axis=1)
-    out = at - np.array(document["setup"]["centre_mm"])
+    at, deviation = run.columns.q_mm, run.columns.readings_mm
+    out = at - run.bar.centre_mm
     known = np.column_stack([out / np.linalg.norm(out, axis=1)[:, None], np.ones(len(out))])
-    deviation = np.array(columns["deviation_mm"])
     return at, deviation - known @ np.linalg.lstsq(known, deviation, rcond=None)[0]
 
 
@@ -121,7 +120,7 @@ async def test_broken_twice_it_reads_what_it_reads_in_one_go(place):
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}
     pieces = load_run(store, runs(store)[-1].id)
-    assert [p["run"] for p in pieces["timing"]["pieces"]] == ["test", "test-2"]
+    assert [p.run for p in pieces.timing.pieces] == ["test", "test-2"]
     whole_plan = replace(plan, name="whole")
     (whole_id,) = await measure(b.session, store, b.site, whole_plan)
     whole = load_run(store, whole_id)
@@ -137,7 +136,7 @@ async def test_broken_twice_it_reads_what_it_reads_in_one_go(place):
     noise = np.std(np.diff(machine_whole)) / np.sqrt(2.0)
     assert np.abs(machine_whole).max() > 5e-3  # there is something to be read
     assert np.abs(tenths).max() < 5.0 * noise * np.sqrt(2.0 / (len(off) / 10))
-    assert (np.diff(pieces["columns"]["t_s"]) > 0.0).all()
+    assert (np.diff(pieces.columns.t_s) > 0.0).all()
 
 
 async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
@@ -149,8 +148,7 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
         )
     b.sim.world.ballbar.push(out=False)
     assert "test goes on at" in await resumed_item(b, store, plan)
-    columns = load_run(store, runs(store)[-1].id)["columns"]
-    assert all(columns["valid"])
+    assert load_run(store, runs(store)[-1].id).columns.valid.all()
 
 
 async def test_going_on_costs_a_stretch_and_not_the_path(place):
@@ -228,11 +226,11 @@ async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_pa
         again = import_folder(other, folder)
         (record,) = other.runs.all(again)
         ours, theirs = load_run(store, runs(store)[-1].id), load_run(other, record.id)
-    assert theirs["columns"]["deviation_mm"] == ours["columns"]["deviation_mm"]
-    assert theirs["timing"]["pieces"] == ours["timing"]["pieces"]
+    assert theirs.columns.equals(ours.columns)
+    assert theirs.timing == ours.timing
     assert not time_issues([theirs])  # a pause of any length is no wrong clock
-    later = [t + (3600.0 if k >= ours["timing"]["pieces"][0]["readings"] else 0.0) for k, t in enumerate(ours["columns"]["t_s"])]
-    assert not time_issues([ours | {"columns": ours["columns"] | {"t_s": later}}])
+    later = ours.columns.t_s + 3600.0 * (np.arange(len(ours.columns)) >= ours.timing.pieces[0].readings)
+    assert not time_issues([replace(ours, columns=replace(ours.columns, t_s=later))])
 
 
 async def test_a_box_that_was_restarted_begins_again(place):

@@ -87,7 +87,7 @@ def test_tables_take_the_error_out(solution: abbe.Solution):
 
 
 def test_a_flag_forbids_tables(campaign: abbe.Campaign):
-    few = replace(campaign, runs=[r for r in campaign.runs if r["run_id"].startswith("line")])
+    few = replace(campaign, runs=[r for r in campaign.runs if r.run_id.startswith("line")])
     solution = abbe.solve(few)
     with pytest.raises(abbe.AbbeError, match="no tables"):
         solution.tables((5, 5, 5))
@@ -104,14 +104,14 @@ def test_pictures_and_reports_are_pages(solution: abbe.Solution, tmp_path: Path)
 
 def test_equal_seeds_draw_equal_campaigns_and_other_seeds_others():
     first, again, other = (abbe.simulate(MACHINE, abbe.verification(MACHINE), ERRORS, seed=s) for s in (3, 3, 4))
-    readings = [c.runs[0]["columns"]["deviation_mm"] for c in (first, again, other)]
+    readings = [c.runs[0].columns.readings_mm.tolist() for c in (first, again, other)]
     assert readings[0] == readings[1] != readings[2]
 
 
 def test_recipes_may_stand_in_for_a_plan():
     helix = abbe.Helix("h", "A", "identify", (300.0, 250.0, 100.0), 100.0, turns=4.0)
     found = abbe.simulate(MACHINE, [helix], ERRORS)
-    assert [r["run_id"] for r in found.runs] == ["h"]
+    assert [r.run_id for r in found.runs] == ["h"]
 
 
 def test_nothing_is_missing_where_nothing_was_added_and_an_added_effect_is_named(campaign: abbe.Campaign, tmp_path: Path):
@@ -146,7 +146,7 @@ def test_a_strength_that_is_a_root_is_simulated_as_stated():
     feeds = [abbe.Helix(f"h{v:g}", "A", "identify", (300.0, 250.0, 100.0), 100.0, turns=4.0, feed_mm_min=v) for v in (1000.0, 4000.0)]
     quiet = abbe.SimulatedInstruments(bar_noise_mm=1e-6, laser_noise_mm=1e-6)
     slow, fast = (
-        np.array(run["columns"]["deviation_mm"])
+        run.columns.readings_mm
         for run in abbe.simulate(MACHINE, feeds, abbe.ErrorMotions(), effects={"contour_lag": 20.0}, instruments=quiet).runs
     )
     v2 = (4000.0**2 - 1000.0**2) / 3600.0

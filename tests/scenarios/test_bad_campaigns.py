@@ -12,6 +12,7 @@ from abbe.service.errors import AbbeError, CampaignRefused
 from abbe.service.identification.solve import check_campaign
 from tests.experiments.campaigns import population
 from tests.experiments.campaigns.population import CAMPAIGNS
+from tests.run_documents import run_of, runs_of
 from tests.scenarios.campaign_files import machine_of, measured
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
@@ -32,7 +33,7 @@ def exchanged(run, first, second):
 
 def refusal(seed, runs, kind="joint", model="rigid21"):
     with pytest.raises(AbbeError) as told:
-        check_campaign(machine_of(seed, kind), runs, [], model)
+        check_campaign(machine_of(seed, kind), runs_of(runs), [], model)
     assert "\n" not in str(told.value)
     assert told.value.remedy
     return str(told.value)
@@ -94,10 +95,10 @@ def test_exchanged_columns_that_geometry_does_not_show(seed):
             if key in run["setup"]:
                 run["setup"][key][1] += shift
     moved = moved_site(site, doc, shift)
-    assert not [f for f in check_campaign(moved, runs, [], "rigid21") if f.refuse]
+    assert not [f for f in check_campaign(moved, runs_of(runs), [], "rigid21") if f.refuse]
     exchanged(bad, "x_mm", "y_mm")
     with pytest.raises(CampaignRefused, match=r"run helix0t0: .*x_mm and y_mm exchanged"):
-        check_campaign(moved, runs, [], "rigid21")
+        check_campaign(moved, runs_of(runs), [], "rigid21")
 
 
 def moved_site(site, doc, shift):
@@ -127,7 +128,7 @@ def test_a_cropped_copy_among_the_held_out_runs():
     copy = again[0]
     copy |= {"run_id": "r99", "role": "holdout", "columns": {k: v[100:400] for k, v in copy["columns"].items()}}
     with pytest.raises(CampaignRefused, match=r"r99.*those of run helix0t0"):
-        check_campaign(site, runs, [copy], "rigid21")
+        check_campaign(site, runs_of(runs), [run_of(copy)], "rigid21")
 
 
 @pytest.mark.parametrize("key", ["name", "chain", "stroke_mm", "pivots_mm"])
@@ -148,7 +149,7 @@ def test_a_run_of_another_machine_of_the_same_make(seed, test):
     bad = picked(seed, runs, test)
     bad["columns"]["deviation_mm"] = twin_readings(seed, bad["run_id"])
     try:
-        lines = [f.line for f in check_campaign(site, runs, [], "rigid21")]
+        lines = [f.line for f in check_campaign(site, runs_of(runs), [], "rigid21")]
     except CampaignRefused as told:
         lines = [str(told)]
     assert lines
@@ -180,7 +181,7 @@ def test_a_run_with_too_few_points_is_named(seed):
     site, runs = measured(seed)
     bad = picked(seed, runs, "ballbar_helix")
     bad["columns"] = {k: v[::35] for k, v in bad["columns"].items()}
-    flags = check_campaign(site, runs, [], "rigid21")
+    flags = check_campaign(site, runs_of(runs), [], "rigid21")
     assert flags[0].line.startswith(f"run {bad['run_id']}: only 15 valid readings on 5 turns")
     bad["columns"] = {k: v[:8] for k, v in bad["columns"].items()}
     assert refusal(seed, runs).startswith(f"run {bad['run_id']}: only 8 valid readings")
@@ -194,7 +195,7 @@ def test_a_campaign_with_too_few_points_for_the_model():
     line = refusal(3, few, "laser_only")
     assert f"run {few[0]['run_id']} has the fewest" in line
     assert "--model rigid6" in line
-    assert check_campaign(site, few, [], "rigid6") == []
+    assert check_campaign(site, runs_of(few), [], "rigid6") == []
 
 
 @pytest.mark.parametrize(("column", "value", "word"), [("deviation_mm", float("nan"), "finite"), ("t_s", -1.0, "runs back")])
@@ -212,7 +213,7 @@ def test_good_campaigns_are_not_refused():
     for kind in CAMPAIGNS:
         for seed in seeds:
             site, runs = measured(seed, kind)
-            found = check_campaign(site, runs, [], "rigid21")
+            found = check_campaign(site, runs_of(runs), [], "rigid21")
             assert not [f for f in found if f.refuse]
             flagged += [f"{kind} {seed}: {f.line}" for f in found[:1]]
     assert len(flagged) <= len(seeds) * len(CAMPAIGNS) // 20, flagged
@@ -228,8 +229,8 @@ def coarse(name, later_s):
 
 def test_repeats_of_a_coarse_sensor_are_no_copies():
     """Alike to the last digit, at other times: the sensor shows no noise. With the same times it is one measurement."""
-    assert copy_issues([coarse("a", 0.0), coarse("b", 300.0), coarse("c", 600.0)]) == []
-    twice = copy_issues([coarse("a", 0.0), coarse("b", 0.0)])
+    assert copy_issues(runs_of([coarse("a", 0.0), coarse("b", 300.0), coarse("c", 600.0)])) == []
+    twice = copy_issues(runs_of([coarse("a", 0.0), coarse("b", 0.0)]))
     assert [f.run for f in twice] == ["b"]
     assert "its readings are those of run a" in twice[0].line
 
@@ -239,7 +240,7 @@ def test_visits_at_one_place_are_no_copy_of_the_line_that_passes_it():
     line, visits = coarse("line", 0.0), coarse("visits", 500.0)
     visits["columns"] |= {"x_mm": [20.0] * 12, "direction": [1, -1] * 6}
     visits["columns"]["deviation_mm"] = [line["columns"]["deviation_mm"][k] for k in (2, 9)] * 6
-    assert copy_issues([line, visits]) == []
+    assert copy_issues(runs_of([line, visits])) == []
 
 
 def test_noise_alone_makes_no_two_runs_alike():
@@ -250,4 +251,4 @@ def test_noise_alone_makes_no_two_runs_alike():
     for run in twice:
         y = np.array(run["columns"]["deviation_mm"]) + rng.normal(0, 2.5e-4, 500)
         run["columns"]["deviation_mm"] = np.round(y, 4).tolist()
-    assert copy_issues(twice) == []
+    assert copy_issues(runs_of(twice)) == []

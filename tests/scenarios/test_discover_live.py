@@ -108,9 +108,9 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
     _, first_s, set_s = search.seen[0]["n1-feed-2"]
     with Store.open(url) as store:
         again = load_run(store, "n1-feed-2")
-        assert again["setup"]["setup_id"] == "n1-feed-2"  # mounted anew: another cup
+        assert again.setup.setup_id == "n1-feed-2"  # mounted anew: another cup
         broken_off = next(r for r in store.runs.all(store.campaigns.all()[1].id) if r.label == "n1-feed")
-        assert broken_off.start_doc["setup"]["t_set_s"] < again["setup"]["t_set_s"] < again["columns"]["t_s"][0]
+        assert broken_off.start_doc["setup"]["t_set_s"] < again.setup.t_set_s < again.columns.t_s[0]
         assert set_s < first_s
         assert [c.name.split()[0] for c in store.campaigns.all()] == ["june", "next1"]
         assert [[s.state for s in store.discoveries.steps(d.id)][-1] for d in store.discoveries.all()] == ["UNEXPLAINED"] * 2

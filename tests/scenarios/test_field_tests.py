@@ -31,7 +31,7 @@ def test_every_kind_of_test_is_measured_and_solved(abbe, start_sims, tmp_path):
     assert not solved.get("findings", [])
     run(abbe, "export", "field", "out", "--db", db)
     folder = next((tmp_path / "out").rglob("campaign.json")).parent
-    found = {r["run_id"]: r for r in read_folder(folder).runs}  # and the exchange format takes it back
+    found = {r["run_id"]: r for r in read_folder(folder).run_files}  # and the exchange format takes it back
     if os.environ.get("ABBE_TEST_LONG") == "1":
         discovered = json.loads(run(abbe, "discover", str(folder), "--json", "-"))
         assert discovered["verdict"] in {"none", "named", "unknown"}

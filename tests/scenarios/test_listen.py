@@ -72,8 +72,8 @@ def test_a_program_that_the_operator_starts_gives_the_same_readings(abbe, start_
     assert listening.returncode == 0, listening.stderr.read()
     assert any("d1: standstill 4 of 13 (at" in text and "is missing" in text for text in said)
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        driven = {r.label: load_run(store, r.id) for r in store.runs.all("driven")}
-        heard = {r.label: load_run(store, r.id) for r in store.runs.all("heard")}
+        driven = {r.label: load_run(store, r.id).to_document() for r in store.runs.all("driven")}
+        heard = {r.label: load_run(store, r.id).to_document() for r in store.runs.all("heard")}
         end = {r.label: r.end_doc for r in store.runs.all("heard")}
     for label, missing in (("l1", []), ("d1", [3])):
         keep = np.setdiff1d(np.arange(len(driven[label]["columns"]["t_s"])), missing)

@@ -189,8 +189,8 @@ async def test_every_entry_acts_on_its_own_axis_with_its_own_sign(start_sims, tm
         async def measured(name: str) -> np.ndarray:
             ids = await measure(session, store, site, CampaignPlan(name, tuple(plan)), progress=ignore_progress)
             runs = [load_run(store, k) for k in ids]
-            assert {r["table"]["acting"] for r in runs} == {name != "base"}  # what files for another control must not be made of
-            return np.array([np.asarray(r["columns"]["deviation_mm"])[4] for r in runs])  # at the far end, going out
+            assert {r.table.acting for r in runs} == {name != "base"}  # what files for another control must not be made of
+            return np.array([r.columns.readings_mm[4] for r in runs])  # at the far end, going out
 
         base = await measured("base")
         length = site.machine.length_mm - 20.0

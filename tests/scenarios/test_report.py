@@ -120,7 +120,7 @@ def verified(folder: Path) -> None:
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
         campaign = store.campaigns.find("small")
         runs = [
-            r for r in (load_run(store, one.id) for one in store.runs.all(campaign.id)) if r["test"] in {"laser_diagonal", "ballbar_helix"}
+            r for r in (load_run(store, one.id) for one in store.runs.all(campaign.id)) if r.test in {"laser_diagonal", "ballbar_helix"}
         ]
         rows = {k: {"value": v, "u": u} for k, (v, u) in figure_rows(figures(runs)).items()}
         store.verifications.add(campaign.machine_id, campaign.id, "pass", {"text": "better than before", "push": 1, "figures": rows})

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from abbe.drivers.errors import DriverError
@@ -30,23 +31,23 @@ def shop(tmp_path_factory) -> Iterator[Shop]:
 
 def scattered(runs: Runs) -> None:
     """Every second reading is off by 0.4 mm: what a loose reflector does."""
-    for run in runs:
-        if run["test"] == "laser_diagonal":
-            run["columns"]["deviation_mm"] = [d + 0.4 * (k % 2) for k, d in enumerate(run["columns"]["deviation_mm"])]
+    for k, run in enumerate(runs):
+        if run.test == "laser_diagonal":
+            runs[k] = run.with_readings(run.columns.readings_mm + 0.4 * (np.arange(len(run.columns)) % 2))
 
 
 def not_numbers(runs: Runs) -> None:
-    columns = next(r for r in runs if r["test"] == "laser_diagonal")["columns"]
-    columns["deviation_mm"] = [float("nan")] * len(columns["deviation_mm"])
+    k = next(k for k, r in enumerate(runs) if r.test == "laser_diagonal")
+    runs[k] = runs[k].with_readings(np.full(len(runs[k].columns), np.nan))
 
 
 def of_the_old_table(runs: Runs) -> None:
-    runs[-1]["table"]["crc"] = 42
+    runs[-1] = replace(runs[-1], table=replace(runs[-1].table, crc=42))
 
 
 def empty(runs: Runs) -> None:
-    columns = next(r for r in runs if r["test"] == "ballbar_helix")["columns"]
-    columns["valid"] = [0] * len(columns["deviation_mm"])
+    k = next(k for k, r in enumerate(runs) if r.test == "ballbar_helix")
+    runs[k] = replace(runs[k], columns=replace(runs[k].columns, valid=np.zeros(len(runs[k].columns), dtype=bool)))
 
 
 WAYS = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import copy
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from abbe.service.compensation.correct import load_runs
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ignore_progress
+from abbe.service.domain.run import Run
 from abbe.service.push.journal import check_chain
 from abbe.service.push.operations import Verdict
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix
@@ -35,7 +35,7 @@ from tests.scenarios.test_push import linear_tables, site_of
 LIMIT_S = 5.0
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 DIAGONALS = ("ppp", "npp", "pnp", "ppn")
-Runs = list[dict[str, Any]]
+Runs = list[Run]
 
 
 def plan_of(site: Site, name: str, *, diagonals: tuple[str, ...] = DIAGONALS, helix: bool = True) -> CampaignPlan:
@@ -129,7 +129,7 @@ class Push:
         self.shop.number += 1
         plan = replace(self.plan or plan_of(self.shop.site, ""), name=f"after {self.shop.number}")
         ids = await measure(self.session, self.store, self.shop.site, plan, progress=self._watch)
-        runs = copy.deepcopy(await load_runs(self.store, ids))
+        runs = await load_runs(self.store, ids)
         self.alter(runs)
         decision = decide(self.shop.before, figures(runs), self.pushing.crc)
         return Verdict(decision.keep, decision.text)

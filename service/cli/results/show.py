@@ -46,7 +46,7 @@ def show(
     from abbe.service.domain.measured import RunRecord
     from abbe.service.queries.measured import run_summary
     from abbe.service.queries.reader import json_value
-    from abbe.service.runs.columns import run_document, whole_document
+    from abbe.service.runs.columns import run_document, single_run, whole_run
     from abbe.service.runs.coverage import not_judged, with_state
 
     with open_store(database_url(db, machine)) as store:
@@ -56,16 +56,15 @@ def show(
             return
         chunks = store.chunks.of_run(record.id)
         facts = json_value(run_summary(record, store.machines.get(store.campaigns.find(record.campaign_id).machine_id).name))
-        document = (
-            whole_document(store, record) if record.visible_status == "complete" else with_state(run_document(record, chunks), record)
-        )
+        found = whole_run(store, record) if record.visible_status == "complete" else with_state(single_run(record, chunks), record)
+        document = run_document(found, record, chunks)
     if as_json:
         print_json(document)
         return
-    pieces = (document.get("timing") or {}).get("pieces", [])
-    extra = {"pieces": ", ".join(f"{one['readings']} of {one['run']}" for one in pieces) + " and its own"} if pieces else {}
-    extra |= {"judged": why} if (why := not_judged(document)) else {}
-    setup = {f"setup.{key}": value for key, value in document["setup"].items()}
+    pieces = found.timing.pieces
+    extra = {"pieces": ", ".join(f"{one.readings} of {one.run}" for one in pieces) + " and its own"} if pieces else {}
+    extra |= {"judged": why} if (why := not_judged(found)) else {}
+    setup = {f"setup.{key}": value for key, value in found.setup.document.items()}
     print_table(
         ("key", "value"),
         [(key, "" if value is None else str(value)) for key, value in (facts | extra | setup | _samples(record, chunks)).items()],

@@ -8,6 +8,7 @@ from typing import Any
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.devices.urls import DeviceUrls
 from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError
 from abbe.service.queries.measured import RunSummary, campaigns, runs_by_state
 from abbe.service.queries.reader import Reader
@@ -69,8 +70,8 @@ def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
         return RunScreen(record, None, f"{type(error).__name__}: {error}")
 
 
-def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[dict[str, Any], Document]:
-    """A run as an ``abbe-run/1`` object, and its report."""
+def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[Run, Document]:
+    """A run and its report."""
     owner = store.campaigns.find(record.campaign_id)
     machine: dict[str, Any] = store.machines.get(owner.machine_id).doc
     run = with_earliest_mounting([load_run(store, record.id)])[0]

@@ -27,6 +27,7 @@ from abbe.service.site import machine_from_doc
 from abbe.simulators.hidden.draws import KINDS
 from abbe.simulators.hidden.suite import campaign, make_suite, run_file, sealed
 from tests.experiments.campaigns.discovery_judge import label
+from tests.run_documents import runs_of
 
 Doc = dict[str, Any]
 Documents = tuple[Doc, list[Doc]]
@@ -107,8 +108,8 @@ def answered(files: Documents, *, checked: bool) -> Discovery | str:
     machine = machine_from_doc(doc["machine"])
     try:
         if checked:
-            refuse(check_files(doc["machine"], [r for r in runs if r["role"] == "identify"]))
-        return discover(case_of(doc, machine, runs), CATALOGUE)
+            refuse(check_files(doc["machine"], runs_of(r for r in runs if r["role"] == "identify")))
+        return discover(case_of(doc, machine, runs_of(runs)), CATALOGUE)
     except AbbeError as error:
         return str(error)
 

@@ -25,6 +25,7 @@ from abbe.service.site import machine_from_doc
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import campaign, run_file
 from tests.models.discovery.discovery_frames import later, renamed, turned_machine, turned_run
+from tests.run_documents import runs_of
 
 Doc = dict[str, Any]
 CASES = (("single", 9238, "servo_mismatch:Y"), ("single", 9223, "spindle_thermal_drift:Z"), ("null", 9425, ""))
@@ -54,7 +55,7 @@ def read(kind: str, seed: int) -> tuple[Doc, list[Doc]]:
 
 def answer(doc: Doc, runs: list[Doc]) -> Discovery:
     """What is found in these files."""
-    return discover(case_of(doc, machine_from_doc(doc["machine"]), runs), CATALOGUE)
+    return discover(case_of(doc, machine_from_doc(doc["machine"]), runs_of(runs)), CATALOGUE)
 
 
 @cache
@@ -145,7 +146,7 @@ def paths(turn: bool) -> tuple[Path, ...]:
     doc, runs = read("null", 9101)
     runs = [r for r in runs if r["test"].startswith("laser")] + [r for r in runs if r["test"].startswith("ballbar")][:2]
     machine = turned_machine(doc["machine"]) if turn else doc["machine"]
-    case = case_of(doc | {"machine": machine}, machine_from_doc(machine), [turned_run(r) if turn else r for r in runs])
+    case = case_of(doc | {"machine": machine}, machine_from_doc(machine), runs_of(turned_run(r) if turn else r for r in runs))
     return tuple(r.path for r in case.runs)
 
 

@@ -1,6 +1,7 @@
 """Set-ups that no fit has seen: their runs share one cup and one length of the bar, and one instant at which they were mounted."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from abbe.models.effects.instruments.bar_thermal import relaxing
 from abbe.models.paths.helix import Law, even_helix_points, helix_points
 from abbe.service.runs.cases import case_of
 from tests.models.discovery.discovery_paths import MACHINE, campaign
+from tests.run_documents import runs_of
 
 PATHS = [p for p in campaign() if p.setup == "B"]
 LASER = next(p for p in campaign() if p.kind == "laser")
@@ -57,7 +59,7 @@ def test_a_laser_run_keeps_its_own_zero() -> None:
     assert rms(left_together([run], NOTHING, set())) < 1e-12
 
 
-def bar_run(label: str, setup: str, t_set_s: float, start_s: float) -> dict[str, object]:
+def bar_run(label: str, setup: str, t_set_s: float, start_s: float) -> dict[str, Any]:
     points = helix_points(np.array([300.0, 250.0, 135.0]), 147.0, turns=4, n=40, law="area", axis=2)
     n = len(points)
     columns = {"t_s": (start_s + np.arange(n)).tolist(), **{f"{c}_mm": points[:, k].tolist() for k, c in enumerate("xyz")}}
@@ -69,10 +71,10 @@ def bar_run(label: str, setup: str, t_set_s: float, start_s: float) -> dict[str,
 def test_all_runs_of_a_set_up_begin_when_it_was_mounted() -> None:
     """Runs that were stored while every run said when it began itself."""
     runs = [bar_run("r1", "A", 100.0, 120.0), bar_run("r2", "A", 300.0, 320.0), bar_run("r3", "B", 500.0, 520.0)]
-    case = case_of({"campaign": "c", "machine": {}}, MACHINE, runs[::-1])
+    case = case_of({"campaign": "c", "machine": {}}, MACHINE, runs_of(runs[::-1]))
     assert {r.path.label: r.path.t_set_s for r in case.runs} == {"r1": 100.0, "r2": 100.0, "r3": 500.0}
     assert {r.path.label: float(r.path.reference.t_s[0]) for r in case.runs} == {"r1": 100.0, "r2": 100.0, "r3": 500.0}
-    assert runs[1]["setup"]["t_set_s"] == 300.0  # type: ignore[index]
+    assert runs[1]["setup"]["t_set_s"] == 300.0
 
 
 @pytest.mark.parametrize("law", ["area", "angle"])

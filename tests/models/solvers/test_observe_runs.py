@@ -16,6 +16,7 @@ from abbe.models.solvers.observe import bar_normals, predict, setup_unknowns
 from abbe.models.solvers.priors import Priors
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.observations import BLOCKS, bar_noise_mm, run_data
+from tests.run_documents import run_of
 
 CENTRE = np.array([300.0, 250.0, 100.0])
 NOISE_MM = 5e-4
@@ -115,7 +116,7 @@ def test_every_test_of_the_format_becomes_a_run():
         ),
         "linear": stored("laser_linear", line, np.zeros(16), axis="Y", start_mm=list(line[0]), end_mm=list(line[7])),
     }
-    runs = {name: run_data(run) for name, run in made.items()}
+    runs = {name: run_data(run_of(run)) for name, run in made.items()}
     assert {name: (r.kind, r.test) for name, r in runs.items()} == {
         "helix": ("bar", "helix"),
         "circle": ("bar", "circle"),
@@ -131,7 +132,7 @@ def test_every_test_of_the_format_becomes_a_run():
 
 def test_a_run_of_the_shared_campaigns(shared):
     run = json.loads((shared / "data" / "axis-tests" / "week42-y" / "r01.json").read_text())
-    data = run_data(run)
+    data = run_data(run_of(run))
     assert (data.kind, data.test, data.setup) == ("laser", "linear", "L")
     assert data.beam.tolist() == [0.0, 1.0, 0.0]
     assert data.deviation_mm.size == 10
@@ -152,17 +153,17 @@ def test_a_dropped_first_record_does_not_shift_the_others():
     reading = predict(machine, terms, whole, setup, theta)
     run = stored("laser_diagonal", path, reading, diagonal="ppp", nominal_beam=list(beam))
     run["columns"]["valid"] = [0, *[1] * (len(path) - 1)]
-    late = run_data(run)
+    late = run_data(run_of(run))
     assert late.deviation_mm[0] == 0.0
     assert predict(machine, terms, late, setup, theta) == pytest.approx(late.deviation_mm, abs=1e-12)
-    assert run_data(stored("laser_diagonal", path, reading, nominal_beam=list(beam))).deviation_mm == pytest.approx(reading)
+    assert run_data(run_of(stored("laser_diagonal", path, reading, nominal_beam=list(beam)))).deviation_mm == pytest.approx(reading)
 
 
 def test_long_runs_are_averaged_and_what_was_left_out_is_counted():
     clean = helix()
     spiked = clean.deviation_mm.copy()
     spiked[1234] += 20e-3
-    run = run_data(stored("ballbar_helix", clean.axes_mm, spiked, centre_mm=list(CENTRE), radius_mm=150, turns=5))
+    run = run_data(run_of(stored("ballbar_helix", clean.axes_mm, spiked, centre_mm=list(CENTRE), radius_mm=150, turns=5)))
     assert BLOCKS <= run.deviation_mm.size <= BLOCKS + 40
     assert run.rejected == 1
     assert np.abs(run.deviation_mm - nominal_reading(run)).max() < 25e-3
@@ -171,13 +172,13 @@ def test_long_runs_are_averaged_and_what_was_left_out_is_counted():
 def test_what_cannot_be_solved_says_so():
     path = straight_line(BOX[:, 0], BOX[:, 1], 8)
     with pytest.raises(MeasurementFault, match="run r1: it is sealed"):
-        run_data(stored("laser_diagonal", path, None, nominal_beam=[1, 0, 0]))
+        run_data(run_of(stored("laser_diagonal", path, None, nominal_beam=[1, 0, 0])))
     with pytest.raises(MeasurementFault, match="run r1: test 'gauge_block' is not one"):
-        run_data(stored("gauge_block", path, np.zeros(16)))
+        run_data(run_of(stored("gauge_block", path, np.zeros(16))))
     few = stored("laser_diagonal", path, np.zeros(16), nominal_beam=[1, 0, 0])
     few["columns"]["valid"] = [1] * 9 + [0] * 7
     with pytest.raises(MeasurementFault, match="run r1: only 9 valid readings of 16"):
-        run_data(few)
+        run_data(run_of(few))
 
 
 def test_an_invalid_row_may_hold_nothing_at_all():
@@ -189,10 +190,10 @@ def test_an_invalid_row_may_hold_nothing_at_all():
     holed["columns"]["valid"] = [int(k != 3) for k in range(50)]
     for name in ("x_mm", "y_mm", "z_mm", "deviation_mm"):
         holed["columns"][name][3] = None
-    found, left = run_data(holed), np.delete(np.arange(50), 3)
-    assert np.array_equal(found.sign, run_data(whole).sign[left])
-    assert bar_noise_mm(holed) == reading_noise_mm(reading[left])
-    assert bar_noise_mm(whole) == reading_noise_mm(reading)
+    found, left = run_data(run_of(holed)), np.delete(np.arange(50), 3)
+    assert np.array_equal(found.sign, run_data(run_of(whole)).sign[left])
+    assert bar_noise_mm(run_of(holed)) == reading_noise_mm(reading[left])
+    assert bar_noise_mm(run_of(whole)) == reading_noise_mm(reading)
 
 
 @pytest.mark.parametrize(
@@ -206,7 +207,7 @@ def test_an_invalid_row_may_hold_nothing_at_all():
 def test_a_set_up_without_length_or_direction_is_named(test, setup, said):
     path = helix_points(CENTRE, 150.0, turns=3, n=50)
     with pytest.raises(MeasurementFault, match=f"run r1: {said}"):
-        run_data(stored(test, path, np.zeros(50), **setup))
+        run_data(run_of(stored(test, path, np.zeros(50), **setup)))
 
 
 def test_a_beam_that_is_no_direction_is_refused():

@@ -13,6 +13,7 @@ from abbe.models.solvers.priors import Priors
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.observations import run_data
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
+from tests.run_documents import run_of
 
 LONG = np.array([0.0, 0.0, -240.0])
 
@@ -72,7 +73,7 @@ def stored_run(**setup):
     columns = {f"{c}_mm": p[:, k].tolist() for k, c in enumerate("xyz")}
     columns |= {"t_s": list(range(20)), "deviation_mm": [0.0] * 20}
     setup = {"setup_id": "A", "centre_mm": [300, 250, 100], "radius_mm": 150} | setup
-    return {"run_id": "r1", "test": "ballbar_helix", "role": "identify", "setup": setup, "columns": columns}
+    return run_of({"run_id": "r1", "test": "ballbar_helix", "role": "identify", "setup": setup, "columns": columns})
 
 
 def test_the_stored_set_up_is_carried_and_its_absence_too():

@@ -16,6 +16,7 @@ from abbe.service.identification.solve_report import assess, solution_doc
 from abbe.service.report.solution_sections import parameter_rows
 from abbe.service.site import Site, machine_doc
 from tests.models.solvers.truth import MACHINE, Truth
+from tests.run_documents import runs_of
 
 SITE = Site("sim", MACHINE, machine_doc("sim", MACHINE), DeviceUrls())
 
@@ -45,7 +46,7 @@ def raw_campaign(truth: Truth) -> list[dict]:
 
 @pytest.fixture(scope="module")
 def solved() -> Solved:
-    return solve_runs(SITE, raw_campaign(Truth(3)))
+    return solve_runs(SITE, runs_of(raw_campaign(Truth(3))))
 
 
 def test_every_step_diagonal_figure_has_its_uncertainty_and_says_what_is_not_in_it(solved):
@@ -81,10 +82,10 @@ def test_a_bar_in_other_millimetres_is_refused_only_if_it_claims_to_be_calibrate
         if run["test"] == "ballbar_helix":
             run["columns"]["deviation_mm"] = [v + 0.05 for v in run["columns"]["deviation_mm"]]
     with pytest.raises(InstrumentsDisagree, match="bar length 165"):
-        solve_runs(SITE, runs)
+        solve_runs(SITE, runs_of(runs))
     for run in runs:
         if run["test"] == "ballbar_helix":
             run["setup"] |= {"length_calibrated": False}
-    length = solve_runs(SITE, runs).joint.estimate
+    length = solve_runs(SITE, runs_of(runs)).joint.estimate
     assert length.value("bar_length_165") == pytest.approx(0.0515, abs=3 * length.u("bar_length_165"))
     assert length.u("bar_length_165") < 2e-3

@@ -15,6 +15,7 @@ from abbe.service.campaign_data.run_geometry import geometry_mistake
 from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.errors import CampaignRefused
 from abbe.service.identification.solve import _longest_contained
+from tests.run_documents import run_of, runs_of
 
 MACHINE = {"chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 
@@ -56,7 +57,7 @@ def put(found, **keys):
 
 
 def text(found):
-    what = geometry_mistake(MACHINE, found)
+    what = geometry_mistake(MACHINE, run_of(found))
     assert what is not None
     assert what.refuse
     assert what.remedy
@@ -65,7 +66,7 @@ def text(found):
 
 @pytest.mark.parametrize("good", [helix(), circle(), diagonal(), diagonal("ZYX")], ids=["helix", "circle", "diagonal", "reversed order"])
 def test_runs_as_they_should_be_are_left_alone(good):
-    assert geometry_mistake(MACHINE, good) is None
+    assert geometry_mistake(MACHINE, run_of(good)) is None
 
 
 @pytest.mark.parametrize(
@@ -95,7 +96,7 @@ def test_exchanged_axes_of_a_cube_show_in_the_order_of_the_steps():
 
 def test_a_run_beyond_the_stroke_names_axis_and_stroke():
     small = {"stroke_mm": MACHINE["stroke_mm"] | {"Z": [0, 200]}}
-    what = geometry_mistake(small, helix())
+    what = geometry_mistake(small, run_of(helix()))
     assert what is not None
     assert what.text == "Z goes 50 mm beyond the stroke 0 to 200 mm"
 
@@ -120,9 +121,9 @@ def test_a_refusal_names_the_first_run_and_how_many_more():
 
 def test_a_digest_is_of_the_data_not_of_the_name():
     first, again = helix(), helix() | {"run_id": "other", "campaign": "c2"}
-    assert run_digest(first) == run_digest(again)
+    assert run_digest(run_of(first)) == run_digest(run_of(again))
     again["columns"]["deviation_mm"][3] += 1e-9
-    assert run_digest(first) != run_digest(again)
+    assert run_digest(run_of(first)) != run_digest(run_of(again))
     one, two = {"a": "1", "b": "2"}, {"x": "2", "y": "1"}
     assert campaign_digest(one, "rigid21", "m") == campaign_digest(two, "rigid21", "m") != campaign_digest(one, "rigid6", "m")
     assert campaign_digest(one, "rigid21", "m") != campaign_digest(one, "rigid21", "other machine")
@@ -142,7 +143,7 @@ def test_a_machine_is_known_by_its_geometry():
 
 
 def of_lines(runs):
-    return [f.line for f in check_files(MACHINE, runs)]
+    return [f.line for f in check_files(MACHINE, runs_of(runs))]
 
 
 def test_one_spike_is_left_to_the_weights_and_many_are_another_unit():
@@ -162,7 +163,7 @@ def test_readings_that_are_all_the_same_are_one_line():
     for r in still:
         r["columns"]["deviation_mm"] = [0.0] * 300
     with pytest.raises(CampaignRefused) as told:
-        refuse(check_files(MACHINE, still))
+        refuse(check_files(MACHINE, runs_of(still)))
     assert str(told.value).startswith("run a: in this run and all others every reading is the same")
 
 
@@ -175,11 +176,11 @@ def fed(run, label, start, factor=1.0):
 
 def test_times_in_ms_and_runs_at_the_same_time_are_flagged_by_name():
     good = [fed(helix(), "a", 0), fed(helix(), "b", 2000), fed(circle(), "c", 4000)]
-    assert time_issues(good) == []
-    (flag,) = time_issues([*good, fed(helix(), "d", 6000, factor=1e3)])
+    assert time_issues(runs_of(good)) == []
+    (flag,) = time_issues(runs_of([*good, fed(helix(), "d", 6000, factor=1e3)]))
     assert (flag.run, flag.refuse) == ("d", False)
     assert "t_s holds ms" in flag.what
-    (flag,) = time_issues([*good, fed(helix(), "e", 2010)])
+    (flag,) = time_issues(runs_of([*good, fed(helix(), "e", 2010)]))
     assert {flag.run} <= {"b", "e"}
     assert "lies within that of run" in flag.what
 

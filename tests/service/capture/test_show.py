@@ -19,7 +19,7 @@ from tests.service.capture.capture_bench import abandon, batch
 
 SMALL = CaptureSettings(reserve_bytes=65536)
 START = {
-    "setup": {"setup_id": "B1", "t_set_s": 0.0},
+    "setup": {"setup_id": "B1", "t_set_s": 0.0, "centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0},
     "machine": {"name": "VMC-1"},
     "ctrl0_us": 0,
     "path": {"feed_mm_min": 600.0, "direction": 1, "points_mm": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]},

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from abbe.service.compensation.proposals import check_before_runs
+from abbe.service.domain.run import Run
 from abbe.service.errors import TableRefused
 from abbe.service.push.limits import PushLimits
+from tests.run_documents import run_of
 
 DOC = {"name": "mill"}
 SITE: Any = SimpleNamespace(doc=DOC, limits=PushLimits(), temperature_c=(18.0, 24.0))
@@ -17,12 +20,12 @@ BASE: Any = SimpleNamespace(status=SimpleNamespace(boot_id=7))
 NOON_S = 1_795_348_800.0  # 2026-11-22 12:00 UTC
 
 
-def run(**change: Any) -> dict[str, Any]:
+def run(**change: Any) -> Run:
     good = {
         "run_id": "ppp", "machine": DOC, "table": {"boot_id": 7}, "columns": {"temp_air_C": [20.0, 20.5]},
-        "stored": {"ended_utc": "2026-11-22T11:00:00+00:00"},
     }  # fmt: skip
-    return good | change
+    ended = change.pop("ended_utc", "2026-11-22T11:00:00+00:00")
+    return replace(run_of(good | change), ended_utc=ended)
 
 
 def test_a_good_one_passes() -> None:
@@ -35,10 +38,10 @@ def test_a_good_one_passes() -> None:
         ({"machine": {"name": "other"}}, "another machine"),
         ({"table": {"boot_id": 6}}, "before the control's last start"),
         ({"table": {}}, "before the control's last start"),
-        ({"stored": {"ended_utc": "2026-11-22T09:59:00+00:00"}}, "before the machine was identified"),
-        ({"stored": {"ended_utc": None}}, "before the machine was identified"),
+        ({"ended_utc": "2026-11-22T09:59:00+00:00"}, "before the machine was identified"),
+        ({"ended_utc": ""}, "before the machine was identified"),
         ({}, ""),
-        ({"stored": {"ended_utc": "2026-11-22T12:01:00+00:00"}}, "in the future"),
+        ({"ended_utc": "2026-11-22T12:01:00+00:00"}, "in the future"),
         ({"columns": {"temp_air_C": [20.0, 24.5]}}, "outside of 18 to 24"),
         ({"columns": {"temp_air_C": [20.0, float("nan")]}}, "outside of 18 to 24"),
     ],

@@ -14,6 +14,7 @@ from abbe.service.demo.demo_hidden_text import hidden_json, judged, truth_lines
 from abbe.service.discovery.new_measurement import NewMeasurement
 from abbe.service.domain.finding import EffectFound, Finding, GapUm
 from abbe.service.effects.model_book import _usual
+from tests.run_documents import run_of
 
 PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}
 SURGE = {"name": "counterbalance_surge", "key": "", "parameters": {"strength": 4.0}, "wild": 0}
@@ -73,13 +74,13 @@ def test_json_has_the_answer_and_the_truth_apart():
 def test_picked_readings_are_real_ones_and_lasers_stay():
     def run(test, n, deviation=True):
         t = [float(k) for k in range(n)]
-        return {"test": test, "columns": {"t_s": t, "deviation_mm": t if deviation else None, "valid": [1] * n}}
+        return run_of({"test": test, "columns": {"t_s": t, "deviation_mm": t if deviation else None, "valid": [1] * n}})
 
     runs = [run("ballbar_helix", 70), run("ballbar_circle", 30), run("laser_diagonal", 9), run("ballbar_helix", 50, deviation=False)]
     first, second, laser, sealed = picked(runs, 25)
-    assert first["columns"]["t_s"] == [2.0 + 4.0 * k for k in range(17)]
-    assert first["columns"]["deviation_mm"] == first["columns"]["t_s"]
-    assert len(second["columns"]["valid"]) == 7
+    assert first.columns.t_s.tolist() == [2.0 + 4.0 * k for k in range(17)]
+    assert first.columns.readings_mm.tolist() == first.columns.t_s.tolist()
+    assert len(second.columns) == 7
     assert (laser, sealed) == (runs[2], runs[3])
     assert picked(runs, 100) is runs
 

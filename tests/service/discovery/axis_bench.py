@@ -15,6 +15,7 @@ from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.runs.cases import case_of
 from abbe.service.site import machine_from_doc
+from tests.run_documents import runs_of
 
 Doc = dict[str, Any]
 MACHINE: Doc = {
@@ -86,7 +87,7 @@ def with_repeats(shape: Any, *, lost_um: float = 0.0, noise_um: float = 0.3, see
 
 def axis_case(runs: list[Doc]) -> Case:
     """The runs as the discovery takes them."""
-    return case_of(HEAD, machine_from_doc(MACHINE), runs)
+    return case_of(HEAD, machine_from_doc(MACHINE), runs_of(runs))
 
 
 def searched(runs: list[Doc]) -> tuple[Discovery, Finding]:

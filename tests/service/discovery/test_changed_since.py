@@ -33,6 +33,7 @@ from abbe.service.identification.solve_report import solution_doc
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
+from tests.run_documents import runs_of
 from tests.scenarios.campaign_files import measured, write_folder
 from tests.service.discovery.discovery_bench import Search
 
@@ -44,7 +45,7 @@ SEED, GROWN = 1, 60e-6
 def june() -> tuple[Doc, str, Doc]:
     """Machine, runs of June as text, and their solution."""
     site, runs = measured(SEED, "joint")
-    return site.doc, json.dumps(runs), solution_doc(solve_runs(site, runs))
+    return site.doc, json.dumps(runs), solution_doc(solve_runs(site, runs_of(runs)))
 
 
 def moved(runs: list[Doc], per_mm: np.ndarray, seed: int) -> list[Doc]:

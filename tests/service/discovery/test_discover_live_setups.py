@@ -18,6 +18,7 @@ from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, RecordPath, TestPlan, Unmount
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
+from tests.run_documents import run_of
 from tests.service.discovery.discovery_bench import MACHINE, Doc, write_case
 
 LIKE = Helix("a", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=4).plan(machine_from_doc(MACHINE))
@@ -40,7 +41,7 @@ def june(tmp_path: Path) -> Campaign:
 def repeats() -> CampaignPlan:
     """Three helices in one set-up, and a diagonal's in four others."""
     plan = next_plan(
-        ["longer_session", "laser_diagonals"], machine_from_doc(MACHINE), [RUN], name=("next1", "n1"), max_feed_mm_min=6000.0,
+        ["longer_session", "laser_diagonals"], machine_from_doc(MACHINE), [run_of(RUN)], name=("next1", "n1"), max_feed_mm_min=6000.0,
         about=Localization(runs=("r07",)),
     ).plan  # fmt: skip
     assert plan is not None
@@ -127,7 +128,7 @@ def test_a_run_that_is_left_out_still_tells_when_its_set_up_was_mounted(tmp_path
         run["setup"] |= {"setup_id": "S"}
         (folder / f"{name}.json").write_text(json.dumps(run))
     whole = from_folder(folder)
-    mounted_s = whole.runs[0]["setup"]["t_set_s"]
+    mounted_s = whole.runs[0].setup.t_set_s
     less = whole.without(["r01"])
     case = case_of(less.doc, less.site.machine, less.runs)
     assert {r.path.label: r.path.t_set_s for r in case.runs}["r02"] == mounted_s == 540.0

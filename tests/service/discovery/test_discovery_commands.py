@@ -173,10 +173,10 @@ def test_tables_are_made_without_what_they_cannot_take_out(abbe: Call, finds: Ca
     assert "needs a parameter of the control, not tables: enter the width as backlash compensation" in told.lines[0]
     known = prepare(raw, catalogue(), None).case.runs[0].path
     expected = catalogue()[0].signal((known,), "X", {})[0][:, 0] * 8.0
-    before, after = (np.array(c.runs[0]["columns"]["deviation_mm"]) for c in (raw, told.campaign))
+    before, after = (c.runs[0].columns.readings_mm for c in (raw, told.campaign))
     assert np.allclose(before - after, expected, atol=1e-12)
     assert np.ptp(expected) > 0.9 * WIDTH_MM
-    assert told.campaign.runs[3]["columns"]["deviation_mm"] is None
+    assert told.campaign.runs[3].is_sealed
 
 
 def test_a_model_of_another_geometry_is_not_used(abbe: Call, finds: Callable[[Search], Search], tmp_path: Path) -> None:

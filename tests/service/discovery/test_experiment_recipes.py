@@ -12,6 +12,7 @@ from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH,
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
 from abbe.service.site import machine_from_doc
+from tests.run_documents import run_of, runs_of
 from tests.service.discovery.discovery_bench import MACHINE, Doc
 
 HELIX: Doc = {
@@ -24,7 +25,7 @@ HELIX: Doc = {
 @pytest.mark.parametrize("add", sorted(ADDS))
 @pytest.mark.parametrize("runs", [[HELIX], []])
 def test_every_addition_is_planned_or_left_to_a_person(add: str, runs: list[Doc]) -> None:
-    found = next_plan([add], machine_from_doc(MACHINE), runs, name=("next1 now", "n1"), max_feed_mm_min=6000.0)
+    found = next_plan([add], machine_from_doc(MACHINE), runs_of(runs), name=("next1 now", "n1"), max_feed_mm_min=6000.0)
     if add not in MAKERS:
         assert (found.plan, found.by_hand) == (None, (add,))
         return
@@ -39,7 +40,7 @@ def test_the_additions_differ_from_the_first_helix_as_they_say() -> None:
     machine = machine_from_doc(MACHINE)
 
     def path(add: str) -> tuple[RecordPath, Doc]:
-        plan = next_plan([add], machine, [HELIX], name=("x", "n1"), max_feed_mm_min=6000.0).plan
+        plan = next_plan([add], machine, [run_of(HELIX)], name=("x", "n1"), max_feed_mm_min=6000.0).plan
         assert plan is not None
         return next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)), plan.tests[0].setup
 
@@ -52,7 +53,7 @@ def test_the_additions_differ_from_the_first_helix_as_they_say() -> None:
 
 def test_a_centre_without_room_for_a_hemisphere_gets_a_shorter_bar() -> None:
     high = HELIX | {"setup": HELIX["setup"] | {"centre_mm": [300.0, 250.0, 380.0]}}
-    plan = next_plan(["second_radius"], machine_from_doc(MACHINE), [high], name=("x", "n1"), max_feed_mm_min=6000.0).plan
+    plan = next_plan(["second_radius"], machine_from_doc(MACHINE), [run_of(high)], name=("x", "n1"), max_feed_mm_min=6000.0).plan
     assert plan is not None
     assert plan.tests[0].setup["radius_mm"] == pytest.approx(45.0)
 
@@ -61,7 +62,7 @@ def test_a_centre_without_room_for_a_hemisphere_gets_a_shorter_bar() -> None:
 def test_the_same_path_again_that_has_no_room_is_left_to_a_person(about: Localization | None) -> None:
     high = HELIX | {"run_id": "r07", "setup": HELIX["setup"] | {"centre_mm": [300.0, 250.0, 380.0]}}
     for add in ("second_feed", "longer_session"):
-        found = next_plan([add], machine_from_doc(MACHINE), [high], name=("x", "n1"), max_feed_mm_min=6000.0, about=about)
+        found = next_plan([add], machine_from_doc(MACHINE), [run_of(high)], name=("x", "n1"), max_feed_mm_min=6000.0, about=about)
         assert found.plan is None
         assert "Z would go to" in found.by_hand[0]
 
@@ -75,7 +76,7 @@ def test_a_repeat_is_the_run_again_with_all_that_its_set_up_says(about: Localiza
     )  # fmt: skip
     old = like.plan(machine)
     run = HELIX | {"run_id": "r07", "setup": old.setup, "columns": {"feed_mm_min": [900.0], "direction": [-1]}}
-    plan = next_plan(["longer_session"], machine, [run], name=("x", "n1"), max_feed_mm_min=6000.0, about=about).plan
+    plan = next_plan(["longer_session"], machine, [run_of(run)], name=("x", "n1"), max_feed_mm_min=6000.0, about=about).plan
     assert plan is not None
     assert plan.tests[0].setup | {"setup_id": "A"} == old.setup
     assert next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)) == next(s for s in old.steps if isinstance(s, RecordPath))
@@ -85,13 +86,13 @@ def test_a_repeat_is_the_run_again_with_all_that_its_set_up_says(about: Localiza
 def test_a_helix_that_is_not_known_completely_is_not_guessed(lacks: str) -> None:
     run = HELIX | {"run_id": "r07", "setup": {k: v for k, v in HELIX["setup"].items() if k != lacks}}
     for add in ("longer_session", "second_feed", "opposite_direction", "second_radius"):
-        found = next_plan([add], machine_from_doc(MACHINE), [run], name=("x", "n1"), max_feed_mm_min=6000.0)
+        found = next_plan([add], machine_from_doc(MACHINE), [run_of(run)], name=("x", "n1"), max_feed_mm_min=6000.0)
         assert found == NextPlan(None, (f"{add} ({NO_PATH})",))
-    assert next_plan(["laser_diagonals"], machine_from_doc(MACHINE), [run], name=("x", "n1"), max_feed_mm_min=6000.0).by_hand == ()
+    assert next_plan(["laser_diagonals"], machine_from_doc(MACHINE), [run_of(run)], name=("x", "n1"), max_feed_mm_min=6000.0).by_hand == ()
 
 
 def test_moves_are_no_faster_than_the_machine_file_allows() -> None:
-    plan = next_plan(["laser_diagonals"], machine_from_doc(MACHINE), [HELIX], name=("x", "n1"), max_feed_mm_min=3000.0).plan
+    plan = next_plan(["laser_diagonals"], machine_from_doc(MACHINE), [run_of(HELIX)], name=("x", "n1"), max_feed_mm_min=3000.0).plan
     assert plan is not None
     assert max(s.feed_mm_min for t in plan.tests for s in t.steps if isinstance(s, MoveTo)) == 3000.0
 
@@ -102,7 +103,9 @@ def test_the_half_of_the_new_sphere_is_the_one_on_which_the_place_is_seen(seen: 
     low = HELIX | {"run_id": "r07", "setup": HELIX["setup"] | {"centre_mm": [300.0, 250.0, 220.0]}}
     place = np.array([300.0, 250.0, 220.0]) + away_mm * np.array([seen[0], 0.0, seen[1]])
     about = Localization(position_mm=tuple(place.tolist()), runs=("r07",))
-    plan = next_plan(["second_radius"], machine_from_doc(MACHINE), [low], name=("x", "n1"), max_feed_mm_min=6000.0, about=about).plan
+    plan = next_plan(
+        ["second_radius"], machine_from_doc(MACHINE), [run_of(low)], name=("x", "n1"), max_feed_mm_min=6000.0, about=about
+    ).plan
     assert plan is not None
     assert plan.tests[0].setup["opens"] == opens
     path = np.array(next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)).points_mm)
@@ -114,7 +117,7 @@ def test_a_place_is_passed_by_a_denser_path_on_a_smaller_sphere() -> None:
     place = np.array([200.0, 250.0, 100.0]) + 150.0 * np.array([-0.6, 0.0, 0.8])  # on the second one's sphere
     about = Localization(position_mm=tuple(place.tolist()), radius_mm=20.0, runs=("r07",))
     plan = next_plan(
-        ["second_radius"], machine_from_doc(MACHINE), [HELIX, other], name=("x", "n1"), max_feed_mm_min=6000.0, about=about
+        ["second_radius"], machine_from_doc(MACHINE), runs_of([HELIX, other]), name=("x", "n1"), max_feed_mm_min=6000.0, about=about
     ).plan
     assert plan is not None
     setup = plan.tests[0].setup
@@ -130,7 +133,7 @@ def test_what_came_at_a_moment_is_waited_for_in_one_set_up() -> None:
     plan = next_plan(
         ["longer_session"],
         machine_from_doc(MACHINE),
-        [HELIX, other],
+        runs_of([HELIX, other]),
         name=("x", "n1"),
         max_feed_mm_min=6000.0,
         about=Localization(runs=("r07",)),
@@ -151,5 +154,7 @@ def test_what_came_at_a_moment_is_waited_for_in_one_set_up() -> None:
 )
 def test_a_run_that_is_no_helix_and_a_bar_that_is_turned_are_left_to_a_person(add: str, run: str, why: str) -> None:
     runs = [HELIX | {"run_id": "r07"}, {"run_id": "r02", "test": "ballbar_circle"}]
-    found = next_plan([add], machine_from_doc(MACHINE), runs, name=("x", "n1"), max_feed_mm_min=6000.0, about=Localization(runs=(run,)))
+    found = next_plan(
+        [add], machine_from_doc(MACHINE), runs_of(runs), name=("x", "n1"), max_feed_mm_min=6000.0, about=Localization(runs=(run,))
+    )
     assert found == NextPlan(None, (f"{add} ({why})",))

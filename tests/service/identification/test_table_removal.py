@@ -19,6 +19,7 @@ from abbe.service.campaign_data.campaign_folder import from_folder, from_store
 from abbe.service.compensation.proposals import check_same_table
 from abbe.service.discovery.discover import prepare
 from abbe.service.discovery.simulate import simulate
+from abbe.service.domain.run import RunTable
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
@@ -33,6 +34,7 @@ from abbe.service.identification.table_removal import (
 )
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
+from tests.run_documents import run_of
 from tests.service.discovery.discovery_bench import WIDTH_MM, write_case
 
 DB = "sqlite:///book.sqlite3"
@@ -77,21 +79,21 @@ def test_the_play_leaves_and_the_correction_stays() -> None:
     moved = (corrected - commanded) @ BEAM
     read = own + moved - moved[0]
     there = run(axes, read, "laser_step_diagonal", start_mm=axes[0].tolist(), end_mm=axes[-1].tolist(), order="XYZ")
-    told = np.array(subtract_table([there], OUT)[0]["columns"]["deviation_mm"])
+    told = subtract_table([run_of(there)], OUT)[0].columns.readings_mm
     assert np.abs(read - own - table).max() > 2e-3
     assert np.abs(told - own - table).max() < 1e-4  # the beam of the set-up and BEAM are one line
 
 
 def test_a_run_without_readings_stays() -> None:
-    there = run(steps(), np.zeros(61), "laser_step_diagonal")
-    there["columns"]["deviation_mm"] = None
+    there = replace(run_of(run(steps(), np.zeros(61), "laser_step_diagonal")), columns=run_of({"columns": {"x_mm": [0.0]}}).columns)
+    assert there.is_sealed
     assert subtract_table([there], OUT) == [there]
 
 
 @pytest.mark.parametrize("acting", [False, None, True])
 def test_runs_of_a_table_that_did_not_act_are_refused(acting: bool | None) -> None:
     base = cast("Base", SimpleNamespace(crc=5, tables="some"))
-    one = {"run_id": "r", "table": {"crc": 5} | ({} if acting is None else {"acting": acting})}
+    one = run_of({"table": {"crc": 5} | ({} if acting is None else {"acting": acting})})
     if acting is False:
         with pytest.raises(TableMismatch, match="did not act"):
             check_same_table(base, [one])
@@ -129,19 +131,16 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
         job = prepare(before, catalogue(), None, table=then)
         assert left.removed is not None
         assert job.flags[-1] == table_line(left.removed)
-        assert [r["columns"]["deviation_mm"] for r in job.runs] == [r["columns"]["deviation_mm"] for r in left.runs]
+        assert all(a.columns.equals(b.columns) for a, b in zip(job.runs, left.runs, strict=True))
         assert job.campaign is before
-        gap = np.array(before.runs[0]["columns"]["deviation_mm"]) - left.runs[0]["columns"]["deviation_mm"]
+        gap = before.runs[0].columns.readings_mm - left.runs[0].columns.readings_mm
         assert np.abs(gap).max() > 1e-4
         # What is predicted is what the instrument reads: with the table, whose part was taken out of the readings only to be solved.
         plain = prepare(left, catalogue(), None)
         added = simulate(job).predicted_mm["r01"] - simulate(plain).predicted_mm["r01"]
         assert np.allclose(added, gap, atol=1e-9)
         # The digest of a search is that of what was measured: a solver's last digit makes no other search.
-        moved = [
-            run | {"columns": run["columns"] | {"deviation_mm": [v + 1e-12 for v in run["columns"]["deviation_mm"] or []] or None}}
-            for run in job.runs
-        ]
+        moved = [run if run.is_sealed else run.with_readings(run.columns.readings_mm + 1e-12) for run in job.runs]
         assert replace(job, runs=moved).digest == job.digest
         assert prepare(before, catalogue(), None).digest != job.digest
     capsys.readouterr()
@@ -161,24 +160,22 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
 def test_a_table_of_a_kind_that_nobody_reads_is_not_known(tmp_path: Path) -> None:
     folder = write_case(tmp_path / "files", campaign="july")
     with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
-        before = from_folder(folder)
-        for run in before.runs:
-            run["table"] = {"crc": 5}
+        read = from_folder(folder)
+        before = replace(read, runs=[replace(run, table=RunTable(crc=5)) for run in read.runs])
         store.tables.add(store.machines.add("VMC-1", {}), None, b"someone else's", 5, {})
         then = campaign_table(store, before)
         assert (then.table, then.why) == (None, f"measured with table 00000005, of a kind that cannot be read: {NOT_REMOVED}")
 
 
 def test_runs_of_another_table_or_of_none_keep_their_readings(tmp_path: Path) -> None:
-    before = from_folder(write_case(tmp_path / "files", campaign="july"))
-    for run, told in zip(before.runs, ({"crc": 5, "acting": True}, {"crc": 5}, {"crc": 5, "acting": False}, {"crc": 6}), strict=True):
-        run["table"] = told
+    read = from_folder(write_case(tmp_path / "files", campaign="july"))
+    tables = (RunTable(crc=5, acting=True), RunTable(crc=5), RunTable(crc=5, acting=False), RunTable(crc=6))
+    before = replace(read, runs=[replace(run, table=table) for run, table in zip(read.runs, tables, strict=True)])
     left = remove_table(before, kinked())
-    same = [a["columns"]["deviation_mm"] == b["columns"]["deviation_mm"] for a, b in zip(before.runs, left.runs, strict=True)]
+    same = [a.columns.equals(b.columns) for a, b in zip(before.runs, left.runs, strict=True)]
     assert same == [False, False, True, True]  # the third is held out, and was measured with the compensation switched off
     with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
-        before.runs[1]["table"] = {"crc": 6}
+        before.runs[1] = replace(before.runs[1], table=RunTable(crc=6))
         assert campaign_table(store, before).why.startswith("these runs were not all measured with one table")
-        for run in before.runs:
-            run["table"] = {"crc": 6, "acting": False}
-        assert campaign_table(store, before) == NO_TABLE
+        off = replace(before, runs=[replace(run, table=RunTable(crc=6, acting=False)) for run in before.runs])
+        assert campaign_table(store, off) == NO_TABLE

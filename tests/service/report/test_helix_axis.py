@@ -10,6 +10,7 @@ import pytest
 from abbe.models.paths.helix import even_helix_points, helix_points
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.capture.live import angles_along
+from abbe.service.domain.run import Run
 from abbe.service.errors import MeasurementFault
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.model import PolarTrace
@@ -19,6 +20,7 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.runs.helix_axis import helix_axis
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.compare_runs import LoadedRun, curve, incomparable_reason
+from tests.run_documents import run_of
 from tests.scenarios.campaign_files import measured
 
 CENTRE = np.array([300.0, 250.0, 200.0])
@@ -49,11 +51,12 @@ def drawn(run: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> tuple[Documen
 
     monkeypatch.setattr(report_measured, "polar_plot", noted)
     site, _ = measured(3)
-    return run_report(Measured(Campaign("june", site, [run], None, {})), run["run_id"], Rules()), seen
+    return run_report(Measured(Campaign("june", site, [run_of(run)], None, {})), run["run_id"], Rules()), seen
 
 
-def compared(run: dict[str, Any]) -> LoadedRun:
-    return LoadedRun(f"june/{run['run_id']}", "mill-7", run, run_data(run), ())
+def compared(run: dict[str, Any] | Run) -> LoadedRun:
+    one = run if isinstance(run, Run) else run_of(run)
+    return LoadedRun(f"june/{one.run_id}", "mill-7", one, run_data(one), ())
 
 
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
@@ -98,7 +101,7 @@ def test_a_stated_and_an_inferred_axis_are_one_axis() -> None:
 def test_the_axis_is_found_of_every_law_and_either_way(law: Any, turns: float, forth: int) -> None:
     for axis in range(3):
         at = helix_points(CENTRE, RADIUS, turns=turns, n=400, law=law, axis=axis)[::forth]
-        assert helix_axis({}, at) == axis
+        assert helix_axis("", at) == axis
 
 
 def test_every_helix_of_an_imported_campaign_has_its_axis() -> None:
@@ -107,4 +110,4 @@ def test_every_helix_of_an_imported_campaign_has_its_axis() -> None:
     assert helices
     for run in helices:
         assert "axis" not in run["setup"]
-        assert helix_axis(run["setup"], run_data(run).axes_mm) is not None
+        assert helix_axis("", run_data(run_of(run)).axes_mm) is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from abbe.drivers.api import BarSample
 from abbe.service.domain.measured import ImportedRun
 from abbe.service.errors import MeasurementFault, StoreError
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
-from abbe.service.runs.columns import load_run, pack_columns
+from abbe.service.runs.columns import load_run, pack_columns, run_document
 from abbe.service.storage.store import Store
 
 RATE_HZ = 1000
@@ -21,11 +22,12 @@ POINTS = [[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 40.0, 0.0]
 PATH_US = 1_000_000
 SYNC = 8
 MACHINE = {"name": "VMC-1"}
+SETUP = {"setup_id": "A", "t_set_s": 3.5, "centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0}
 
 
 def start_doc() -> dict[str, Any]:
     path = {"feed_mm_min": FEED_MM_MIN, "direction": -1, "points_mm": POINTS}
-    return {"setup": {"setup_id": "A", "t_set_s": 3.5}, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
+    return {"setup": SETUP, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
 
 
 def stream(phase_us: int = 300, duration_us: int = PATH_US, idle: int = 20) -> list[BarSample]:
@@ -47,7 +49,7 @@ def stored(
         store.chunks.append(run_id, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
     if end is not None or status != "running":
         store.runs.finish(run_id, status, "", end)
-    return load_run(store, run_id)
+    return load_run(store, run_id).to_document()
 
 
 END = {"path_start_us": 8_000_000, "path_end_us": 8_000_000 + PATH_US}
@@ -154,7 +156,7 @@ def test_laser_columns(store: Store, campaign_id: int) -> None:
     store.chunks.append(run_id, "laser", 0, 2, JSON_CODEC, encode_json(records[:2]), 0.0, 0.0, 0, 0)
     store.chunks.append(run_id, "laser", 1, 1, JSON_CODEC, encode_json(records[2:]), 0.0, 0.0, 0, 0)
     store.runs.finish(run_id, "complete", "", {})
-    columns = load_run(store, "r02")["columns"]
+    columns = load_run(store, "r02").columns.to_document()
     assert columns["t_s"] == [0.0, 1.0, 2.5]
     assert columns["x_mm"] == [10.0, 20.0, 30.0]
     assert columns["deviation_mm"][:2] == pytest.approx([0.0, 1e-6])
@@ -164,16 +166,21 @@ def test_laser_columns(store: Store, campaign_id: int) -> None:
 
 
 def test_imported_run_comes_back_as_it_was(store: Store) -> None:
-    columns = {"t_s": [0, 1.0], "deviation_mm": None, "load_percent": [1e-05, 3]}
+    columns = {"t_s": [0, 1.0], "x_mm": [0, 0], "y_mm": [0, 0], "z_mm": [1, 2.5], "feed_mm_min": [100, 100], "direction": [1, 1]}
+    columns |= {"load_percent": [1e-05, 3], "temp_air_C": None, "deviation_mm": None}
     run = {"format": "abbe-run/1", "mystery": {"a": [1]}, "columns": None, "run_id": "r01", "zeta": None}
+    run |= {"test": "laser_linear", "role": "sealed", "setup": {"setup_id": "L", "t_set_s": 0, "note": "by hand"}}
     packed = encode_json(pack_columns(columns))
     store.runs.import_campaign(
         ("m", {}), ("c9", {}), [ImportedRun("r01", "laser_linear", "sealed", {"imported": run}, 2, JSON_CODEC, packed)]
     )
-    back = load_run(store, "c9/r01")
-    assert back == run | {"columns": columns}
-    assert list(back) == list(run)
-    assert list(back["columns"]) == list(columns)
+    record = store.runs.find("c9/r01")
+    read = load_run(store, "c9/r01")
+    back = run_document(read, record, store.chunks.of_run(record.id))
+    assert json.dumps(back) == json.dumps(run | {"columns": columns})
+    assert read.is_sealed
+    assert read.columns.further["load_percent"].tolist() == [1e-05, 3.0]
+    assert read.setup.document == run["setup"]
 
 
 def test_documents_of_strangers_give_one_error(store: Store, campaign_id: int) -> None:
@@ -188,6 +195,6 @@ def test_documents_of_strangers_give_one_error(store: Store, campaign_id: int) -
 def test_a_set_up_was_mounted_when_the_end_document_says(store: Store) -> None:
     campaign = store.campaigns.add(store.machines.add("m", MACHINE), "c", {})
     run = stored(store, campaign, stream(), END | {"mounted_us": 7_250_000})
-    assert run["setup"] == {"setup_id": "A", "t_set_s": 2.25}
+    assert run["setup"] == SETUP | {"t_set_s": 2.25}
     other = store.campaigns.add(store.machines.add("m", MACHINE), "d", {})
     assert stored(store, other, stream(), END)["setup"]["t_set_s"] == 3.5  # it was mounted before, or nobody noted it

@@ -15,7 +15,7 @@ from abbe.drivers.api import BarSample
 from abbe.service.errors import FileFormatError, StoreError
 from abbe.service.runs.checks import UNITS, read_json
 from abbe.service.runs.codec import BAR_CODEC, encode_bar
-from abbe.service.runs.columns import load_run
+from abbe.service.runs.columns import load_run, run_document
 from abbe.service.runs.exchange import export_folder, import_folder, read_folder
 from abbe.service.storage.store import Store
 
@@ -47,8 +47,10 @@ def test_round_trip_is_exact(campaign_folder: Path, tmp_path: Path) -> None:
 def test_import_keeps_everything_in_every_database(store: Store, campaign_folder: Path, tmp_path: Path) -> None:
     import_folder(store, campaign_folder)
     assert [run.visible_status for run in store.runs.all("c1")] == ["complete"] * 3
-    assert load_run(store, "c1/r02")["columns"]["deviation_mm"] is None
-    assert load_run(store, "r01") == read_json(campaign_folder / "r01-x.json")
+    assert load_run(store, "c1/r02").is_sealed
+    record = store.runs.find("r01")
+    read = run_document(load_run(store, "r01"), record, store.chunks.of_run(record.id))
+    assert read == read_json(campaign_folder / "r01-x.json")
     exported = export_folder(store, "c1", tmp_path / "out")
     assert read_json(exported / "campaign.json") == read_json(campaign_folder / "campaign.json")
     with pytest.raises(StoreError, match="campaign 'c1' is in the database already"):
@@ -268,4 +270,4 @@ def test_measured_campaign_is_a_good_folder(file_store: Store, tmp_path: Path) -
     assert sorted(path.name for path in folder.iterdir()) == ["campaign.json", "helix_1_2.json"]
     assert_round_trip(folder, tmp_path)
     assert read_json(folder / "campaign.json")["setups"] == {"A": {"kind": "ballbar", "t_set_s": 1.0}}
-    assert read_json(folder / "helix_1_2.json") == load_run(file_store, run_id)
+    assert read_json(folder / "helix_1_2.json") == load_run(file_store, run_id).to_document()

@@ -12,8 +12,9 @@ from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.devices.session import KEPT, noted, notes_since
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.domain.owner import Owner
+from abbe.service.domain.run import Run
 from abbe.service.runs.codec import BAR_CODEC, encode_bar
-from abbe.service.runs.columns import run_document
+from abbe.service.runs.columns import single_run
 
 RATE_HZ = 100
 FEED_MM_S = 20.0
@@ -26,7 +27,13 @@ SYNC = 8
 def start_doc() -> dict[str, Any]:
     points = [[0.0, 0.0, 0.0], [FEED_MM_S * SECONDS, 0.0, 0.0]]
     path = {"feed_mm_min": 60.0 * FEED_MM_S, "direction": 1, "points_mm": points}
-    return {"setup": {"setup_id": "A", "t_set_s": 3.5}, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
+    return {
+        "setup": {"setup_id": "A", "t_set_s": 3.5, "centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0},
+        "machine": MACHINE,
+        "ctrl0_us": 5_000_000,
+        "path": path,
+        "rate_hz": RATE_HZ,
+    }
 
 
 def measured(
@@ -71,7 +78,7 @@ def measured(
     owner = Owner("", 0, "")
     known = {"campaign": "c1", "label": "r01", "test": "ballbar_helix", "role": "identify", "status": "complete", "reason": ""}
     known |= {"start_doc": doc, "end_doc": end, "started_utc": utc, "ended_utc": utc}
-    return run_document(RunRecord(id=1, campaign_id=1, owner=owner, **known), chunks)
+    return single_run(RunRecord(id=1, campaign_id=1, owner=owner, **known), chunks).to_document()
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 100.0, -100.0, 1000.0, -1000.0])
@@ -94,7 +101,7 @@ def test_a_sync_line_that_is_late_is_held_against_the_arrivals_and_said(late_s, 
     run = measured(drift_ppm=100.0, sync_late_s=late_s)
     assert says in run["timing"]["trouble"]
     assert run["timing"]["sync_start_ms"] == pytest.approx(1e3 * late_s, abs=8.0)
-    (flag,) = [f for f in time_issues([run]) if "sync line" in f.what]
+    (flag,) = [f for f in time_issues([Run.from_document(run)]) if "sync line" in f.what]
     assert not flag.refuse
 
 

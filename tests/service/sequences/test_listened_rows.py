@@ -13,6 +13,7 @@ from abbe.service.sequences.nc.blocks import LASER_DWELL_S
 from abbe.service.sequences.recipes.recipe import Diagonal, FaceDiagonal, Linear
 from abbe.service.sequences.steps import MountLaser
 from tests.pretended_status import controller_status
+from tests.run_documents import run_of
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 COMPENSATED = 1 << 3
@@ -92,7 +93,7 @@ async def listened(recipe, lost, monkeypatch):
     monkeypatch.setattr(listen, "_at_start", there)
     recorder, said = Recorder(), []
     end = await listen.listen_to(Devices(heard), recorder, plan, said.append)
-    return plan, laser_columns(recorder.records, {"setup": plan.setup, "ctrl0_us": 0}), end, said
+    return plan, laser_columns(recorder.records, {"setup": plan.setup, "ctrl0_us": 0}).to_document(), end, said
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -117,7 +118,7 @@ async def test_the_solvers_see_the_same_travel_as_if_nothing_had_been_lost(monke
     runs = []
     for lost in (set(), {2, 9}):
         plan, columns, _, _ = await listened(KINDS["step diagonal"], lost, monkeypatch)
-        runs.append(run_data({"run_id": "r", "test": plan.test, "setup": plan.setup, "columns": columns}))
+        runs.append(run_data(run_of({"run_id": "r", "test": plan.test, "setup": plan.setup, "columns": columns})))
     whole, less = runs
     keep = np.setdiff1d(np.arange(len(whole.t_s)), [2, 9])
     assert (less.sign == whole.sign[keep]).all()
@@ -133,10 +134,10 @@ async def test_where_the_first_reading_is_missing_the_others_count_from_the_firs
         )
         about = {"ctrl_us": 1_000_000 * k, "status": COMPENSATED, "signal_permille": 900, "air_temp_c": 20.0, "air_pressure_pa": 101325.0}
         records.append(told | about | {"target_mm": list(one.target_mm), "direction": one.direction, "feed_mm_min": 0.0})
-    columns = laser_columns(records, {"setup": plan.setup, "ctrl0_us": 0})
+    columns = laser_columns(records, {"setup": plan.setup, "ctrl0_us": 0}).to_document()
     assert columns["valid"][0] == 0
     run = {"run_id": "r", "test": plan.test, "setup": plan.setup, "columns": columns}
-    assert np.abs(run_data(run).deviation_mm).max() < 1e-6
+    assert np.abs(run_data(run_of(run)).deviation_mm).max() < 1e-6
 
 
 def test_times_of_missing_readings_lie_between_their_neighbours():

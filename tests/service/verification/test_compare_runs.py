@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from abbe.service.rendering.document import ReportFigure
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.compare_runs import LoadedRun, curve, difference, figure_rows, incomparable_reason, remarks
+from tests.run_documents import run_of
 
 RADIUS = 100.0
 
@@ -22,7 +24,7 @@ def circle(seed: int, bump_um: float = 0.0, *, reverse: bool = False, **setup: A
     columns = {f"{c}_mm": axes[:, k].tolist() for k, c in enumerate("xyz")}
     columns |= {"t_s": np.arange(400.0).tolist(), "deviation_mm": deviation.tolist()}
     known = {"setup_id": "A", "centre_mm": [0.0, 0.0, 0.0], "radius_mm": RADIUS, "plane": "XY"} | setup
-    run = {"run_id": f"c{seed}", "test": "ballbar_circle", "setup": known, "columns": columns}
+    run = run_of({"run_id": f"c{seed}", "test": "ballbar_circle", "setup": known, "columns": columns})
     return LoadedRun(f"june/c{seed}", "mill-7", run, run_data(run), ())
 
 
@@ -47,10 +49,10 @@ def test_noise_alone_is_no_difference() -> None:
 def test_what_cannot_be_compared_says_why() -> None:
     one = circle(1)
     assert incomparable_reason(one, circle(2)) == ""
-    other_plane = one.run | {"setup": one.run["setup"] | {"plane": "YZ"}}
+    other_plane = replace(one.run, setup=replace(one.run.bar, plane="YZ"))
     assert "plane of june/c2 is YZ" in incomparable_reason(one, LoadedRun("june/c2", "mill-7", other_plane, one.data, ()))
     assert "measured on machine lathe" in incomparable_reason(one, LoadedRun("june/c2", "lathe", one.run, one.data, ()))
-    helix = one.run | {"test": "ballbar_helix"}
+    helix = replace(one.run, test="ballbar_helix")
     assert "only runs of one test" in incomparable_reason(one, LoadedRun("june/c2", "mill-7", helix, one.data, ()))
     moved = circle(2, centre_mm=[5.0, 0.0, 0.0])
     assert remarks([one, moved]) == ["june/c2 was measured elsewhere than june/c1 (centre_mm): the difference holds that too"]

@@ -17,6 +17,7 @@ from abbe.service.runs.coverage import COMPLETE, LEAST, covered_share, not_judge
 from abbe.service.verification.compare_runs import incomparable_reason
 from abbe.service.verification.iso_report import evaluate
 from abbe.service.verification.verify import figures
+from tests.run_documents import run_of, runs_of
 from tests.scenarios.campaign_files import measured
 from tests.service.report.test_helix_axis import compared, helix_about
 
@@ -43,7 +44,7 @@ def path_of(run: Doc) -> Doc:
 
 def test_a_stopped_run_says_how_much_of_its_path_it_read() -> None:
     whole = helix_about("Z", axis="Z")
-    part = with_state(cut(whole, 313 / 6970), record(whole, "stopped", path_of(whole)))
+    part = with_state(run_of(cut(whole, 313 / 6970)), record(whole, "stopped", path_of(whole)))
     assert not_judged(part) == "stopped: 3.6 % of the path; not judged"  # its points lie 0.8 of their mean distance apart at its beginning
     assert covered_share(part) == pytest.approx(0.8 * 313 / 6970, abs=0.001)
 
@@ -52,16 +53,17 @@ def test_a_stopped_run_says_how_much_of_its_path_it_read() -> None:
 def test_no_run_that_did_not_come_to_its_end_is_judged(status: str) -> None:
     """Also one that had read all but its last sample: what stopped it may have been in it."""
     whole = helix_about("Z", axis="Z")
-    part = with_state(cut(whole, 0.99), record(whole, status, path_of(whole)))
+    part = with_state(run_of(cut(whole, 0.99)), record(whole, status, path_of(whole)))
     assert not_judged(part).startswith(status.replace("_", " "))
 
 
 def test_a_complete_run_with_a_few_gaps_stays_judged_and_with_a_large_one_not() -> None:
     whole = helix_about("Z", axis="Z")
     few = whole | {"columns": whole["columns"] | {"valid": [0 if k % 100 == 7 else 1 for k in range(500)]}}
-    assert with_state(few, record(few, COMPLETE, path_of(whole))) == few
+    read = run_of(few)
+    assert with_state(read, record(few, COMPLETE, path_of(whole))) is read
     large = whole | {"columns": whole["columns"] | {"valid": [0 if 100 <= k < 200 else 1 for k in range(500)]}}
-    told = with_state(large, record(large, COMPLETE, path_of(whole)))
+    told = with_state(run_of(large), record(large, COMPLETE, path_of(whole)))
     assert covered_share(told) == pytest.approx(1.0 - 0.92 * 0.2, abs=0.02)
     assert covered_share(told) < LEAST
     assert not_judged(told).startswith("incomplete: ")
@@ -70,15 +72,15 @@ def test_a_complete_run_with_a_few_gaps_stays_judged_and_with_a_large_one_not() 
 def test_standstills_are_counted_of_a_laser_run() -> None:
     run = next(r for r in measured(3)[1] if r["test"] == "laser_diagonal")
     count = len(run["columns"]["t_s"])
-    part = with_state(cut(run, 0.25), record(run, "stopped", {"standstills": count}))
+    part = with_state(run_of(cut(run, 0.25)), record(run, "stopped", {"standstills": count}))
     assert covered_share(part) == pytest.approx(0.25, abs=0.5 / count + 1e-4)
 
 
 def test_a_file_whose_helix_ends_early_is_not_judged() -> None:
     """An imported run has no state: its set-up says how many turns there are."""
     runs = [r for r in measured(3)[1] if r["test"] == "ballbar_helix"]
-    assert all(not_judged(run) == "" for run in measured(3)[1])
-    short = cut(runs[0] | {"setup": runs[0]["setup"] | {"axis": "X"}}, 0.5)
+    assert all(not_judged(run_of(run)) == "" for run in measured(3)[1])
+    short = run_of(cut(runs[0] | {"setup": runs[0]["setup"] | {"axis": "X"}}, 0.5))
     assert not_judged(short) == "incomplete: 49.8 % of the path; not judged"
 
 
@@ -86,20 +88,20 @@ def test_a_file_whose_helix_ends_early_is_not_judged() -> None:
 def test_a_short_helix_of_a_file_without_an_axis_is_not_judged(share: float) -> None:
     """Its path is too short to tell the axis: then nobody knows how much was read, and nothing is judged."""
     whole = helix_about("Z")
-    assert not_judged(whole) == ""
-    assert "of the path" in not_judged(cut(whole, share))
+    assert not_judged(run_of(whole)) == ""
+    assert "of the path" in not_judged(run_of(cut(whole, share)))
 
 
 def test_a_hole_in_a_file_was_not_read() -> None:
     helix = helix_about("Z", axis="Z")
     holed = helix | {"columns": helix["columns"] | {"valid": [0 if 200 <= k < 300 else 1 for k in range(500)]}}
-    assert covered_share(holed) == pytest.approx(0.8, abs=0.02)
+    assert covered_share(run_of(holed)) == pytest.approx(0.8, abs=0.02)
     laser = verification()[0]
     ends = [1 if s <= 2 or s >= 10 else 0 for s in [*range(13), *range(12, -1, -1)]]
     holed = laser | {"columns": laser["columns"] | {"valid": ends}}
-    assert covered_share(laser) == pytest.approx(1.0)
-    assert covered_share(holed) == pytest.approx(4 / 12)
-    assert not_judged(holed) == "incomplete: 33.3 % of the path; not judged"
+    assert covered_share(run_of(laser)) == pytest.approx(1.0)
+    assert covered_share(run_of(holed)) == pytest.approx(4 / 12)
+    assert not_judged(run_of(holed)) == "incomplete: 33.3 % of the path; not judged"
 
 
 def verification() -> list[Doc]:
@@ -127,19 +129,19 @@ def verification() -> list[Doc]:
 def test_a_check_with_a_stopped_helix_has_no_verdict() -> None:
     """`figures` is what checks, corrections and reports judge by."""
     runs = verification()
-    assert figures(runs).helix is not None
-    stopped = with_state(cut(runs[-1], 0.3), record(runs[-1], "stopped", path_of(runs[-1])))
+    assert figures(runs_of(runs)).helix is not None
+    stopped = with_state(run_of(cut(runs[-1], 0.3)), record(runs[-1], "stopped", path_of(runs[-1])))
     with pytest.raises(MeasurementFault, match=r"stopped: \d+\.\d % of the path; not judged"):
-        figures([*runs[:-1], stopped])
+        figures([*runs_of(runs[:-1]), stopped])
     with pytest.raises(MeasurementFault, match=r"stopped: .*not judged"):
-        figures([runs[0] | {"state": {"status": "stopped", "covered": 0.5}}, *runs[1:]])
+        figures(runs_of([runs[0] | {"state": {"status": "stopped", "covered": 0.5}}, *runs[1:]]))
 
 
 def test_iso_figures_leave_out_what_was_stopped_and_say_so() -> None:
     runs = verification()[:4]
-    whole = evaluate(runs)
+    whole = evaluate(runs_of(runs))
     assert any(f.method == "ISO 230-6" for f in whole.figures)
-    part = evaluate([runs[0] | {"state": {"status": "aborted", "covered": 0.5}}, *runs[1:]])
+    part = evaluate(runs_of([runs[0] | {"state": {"status": "aborted", "covered": 0.5}}, *runs[1:]]))
     assert "figures by ISO 230 of run ppp: aborted: 50.0 % of the path; not judged" in part.not_observable
     assert len(part.figures) < len(whole.figures)
 
@@ -148,9 +150,9 @@ def test_the_report_of_a_campaign_leaves_out_a_file_that_ends_early() -> None:
     runs = verification()
     site = measured(3)[0]
     rules = Rules({"body_diagonal_um": 50.0, "helix_rms_um": 50.0})
-    symbols = [f.symbol for f in campaign_report(Measured(Campaign("june", site, runs, None, {})), rules).figures]
+    symbols = [f.symbol for f in campaign_report(Measured(Campaign("june", site, runs_of(runs), None, {})), rules).figures]
     short = cut(runs[-1] | {"setup": runs[-1]["setup"] | {"axis": "X"}}, 0.4)
-    document = campaign_report(Measured(Campaign("june", site, [*runs[:-1], short], None, {})), rules)
+    document = campaign_report(Measured(Campaign("june", site, runs_of([*runs[:-1], short]), None, {})), rules)
     assert any(line.startswith(f"run {short['run_id']} is incomplete: ") for line in document.remarks)
     assert "helix" in " ".join(symbols)
     assert "helix" not in " ".join(f.symbol for f in document.figures)
@@ -158,6 +160,6 @@ def test_the_report_of_a_campaign_leaves_out_a_file_that_ends_early() -> None:
 
 def test_a_part_of_a_path_is_compared_with_nothing() -> None:
     whole = helix_about("Z", axis="Z")
-    part = with_state(cut(whole, 0.5), record(whole, "stopped", path_of(whole)))
+    part = with_state(run_of(cut(whole, 0.5)), record(whole, "stopped", path_of(whole)))
     assert "stopped: 45.1 % of the path" in incomparable_reason(compared(whole), compared(part))
     assert "not judged" in incomparable_reason(compared(part), compared(whole))

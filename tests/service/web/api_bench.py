@@ -49,6 +49,7 @@ from tests.service.discovery.discovery_bench import MACHINE, Search, write_case
 PHRASE = "correct horse battery staple"
 NAME = "VMC-1"
 RATE_HZ, PATH_US = 1000, 1_000_000
+SETUP = {"setup_id": "A", "t_set_s": 3.5, "centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0}
 POINTS = [[0.0, 0.0, 0.0], [30.0, 0.0, 0.0], [30.0, 40.0, 0.0], [30.0, 40.0, 30.0]]
 SAMPLES = 1040
 CHECKS = 12
@@ -120,7 +121,7 @@ def fill(store: Store, folder: Path) -> list[int]:
 def _runs(store: Store, campaign: int) -> None:
     """A ball-bar run, one of the laser, one that broke off, one that was written by something else."""
     path = {"feed_mm_min": 6000.0, "direction": -1, "points_mm": POINTS}
-    start = {"setup": {"setup_id": "A", "t_set_s": 3.5}, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
+    start = {"setup": SETUP, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": RATE_HZ}
     samples = bar_samples()
     for label, status in (("r01", "complete"), ("r02", "aborted")):
         run = store.runs.start(campaign, label, "ballbar_helix", "identify", start)

@@ -84,7 +84,7 @@ async def test_laser_records_and_columns(client, plant):
     assert (part["count"], part["total"], part["records"][0]["note"]) == (5, 25, "é")
     bar = plant.store.runs.find("c2/r01").id
     columns = await got(client, f"/runs/{bar}/columns", first=10, limit=5)
-    whole = load_run(plant.store, bar)["columns"]
+    whole = load_run(plant.store, bar).columns.to_document()
     assert columns["columns"]["x_mm"] == whole["x_mm"][10:15]
     assert columns["total"] == len(whole["x_mm"])
     sealed = plant.store.runs.find("c1/r04").id

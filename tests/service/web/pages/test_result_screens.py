@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -181,9 +182,8 @@ def test_a_difference_counts_the_mounting_and_names_direction_and_feed(running: 
     record = running.store.runs.find(runs_of(running, "ballbar_helix")[0])
     run, document = run_document(running.store, record, Rules())
     one = LoadedRun("a", "m", run, run_data(run), document.figures)
-    columns = {name: list(values) for name, values in run["columns"].items()}
-    columns["direction"], columns["feed_mm_min"] = [-v for v in columns["direction"]], [2 * v for v in columns["feed_mm_min"]]
-    other = LoadedRun("b", "m", run | {"columns": columns}, one.data, document.figures)
+    columns = replace(run.columns, direction=-run.columns.direction, feed_mm_min=2.0 * run.columns.feed_mm_min)
+    other = LoadedRun("b", "m", replace(run, columns=columns), one.data, document.figures)
     told = remarks([one, other])
     assert ["another direction" in told[0], "depends on feed" in told[1], len(told), remarks([one, one])] == [True, True, 2, []]
     found = difference(curve(one), curve(one))

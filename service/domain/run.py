@@ -1,0 +1,468 @@
+"""A measured run: set-up, columns and circumstances of an ``abbe-run/1`` document, parsed once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.models.arrays import F1, F2
+from abbe.service.domain.document import Doc
+from abbe.service.domain.run_file import RUN_FORMAT
+from abbe.service.errors import MeasurementFault, StoreError
+
+B1 = NDArray[np.bool_]
+SENSORS = ("x", "y", "z", "spindle", "air")
+"""Temperature sensors with a column of their own, ``temp_x_C`` .. ``temp_air_C``."""
+PLACES = ("x_mm", "y_mm", "z_mm")
+PRESSURE = "pressure_air_Pa"
+_TYPED = frozenset(("t_s", *PLACES, "feed_mm_min", "direction", "deviation_mm", "valid"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Columns:
+    """Readings of a run, one row each, n rows.
+
+    ``q_mm``: commanded positions, shape (n, 3); ``direction``: +1 or -1; ``deviation_mm``: None for a sealed run; ``valid``: all true if
+    the document does not state it (``valid_stated``); ``further``: other columns by name, in order.
+    """
+
+    t_s: F1
+    q_mm: F2
+    feed_mm_min: F1
+    direction: F1
+    deviation_mm: F1 | None
+    valid: B1
+    valid_stated: bool = True
+    further: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse ``columns`` of a run; a column that is null counts as missing."""
+        t_s, valid = _floats(doc["t_s"]), doc.get("valid")
+        return cls(
+            t_s=t_s,
+            q_mm=np.column_stack([_floats(doc[name]) for name in PLACES]),
+            feed_mm_min=_floats(doc["feed_mm_min"]),
+            direction=_floats(doc["direction"]),
+            deviation_mm=None if doc["deviation_mm"] is None else _floats(doc["deviation_mm"]),
+            valid=np.ones(t_s.size, dtype=np.bool_) if valid is None else np.asarray(valid).astype(np.bool_),
+            valid_stated=valid is not None,
+            further={name: _numbers(values) for name, values in doc.items() if name not in _TYPED and values is not None},
+        )
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Columns]) -> Columns:
+        """The rows of several parts with the columns of the last one."""
+        last = parts[-1]
+        sealed = last.deviation_mm is None
+        return replace(
+            last,
+            t_s=np.concatenate([part.t_s for part in parts]),
+            q_mm=np.concatenate([part.q_mm for part in parts]),
+            feed_mm_min=np.concatenate([part.feed_mm_min for part in parts]),
+            direction=np.concatenate([part.direction for part in parts]),
+            deviation_mm=None if sealed else np.concatenate([part.readings_mm for part in parts]),
+            valid=np.concatenate([part.valid for part in parts]),
+            further={name: np.concatenate([part.further[name] for part in parts]) for name in last.further},
+        )
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return int(self.t_s.size)
+
+    @property
+    def readings_mm(self) -> F1:
+        """The readings as they are, also invalid ones, shape (n,).
+
+        Raises
+        ------
+        MeasurementFault
+            The run is sealed.
+        """
+        if self.deviation_mm is None:
+            raise MeasurementFault("it is sealed, its readings are not there", "it can only be predicted")
+        return self.deviation_mm
+
+    @property
+    def temperatures_c(self) -> dict[str, F1]:
+        """Temperatures by sensor (`SENSORS`), °C."""
+        return {s: _floats(self.further[f"temp_{s}_C"]) for s in SENSORS if f"temp_{s}_C" in self.further}
+
+    @property
+    def air_c(self) -> F1:
+        """Temperature of the air at each row, °C; empty without such a column."""
+        return self.temperatures_c.get("air", np.zeros(0))
+
+    def by_name(self) -> dict[str, NDArray[Any]]:
+        """All columns by their names in the format, without those that are sealed or missing."""
+        places = {name: self.q_mm[:, k] for k, name in enumerate(PLACES)}
+        out: dict[str, NDArray[Any]] = {"t_s": self.t_s, **places, "feed_mm_min": self.feed_mm_min, "direction": self.direction}
+        out |= {} if self.deviation_mm is None else {"deviation_mm": self.deviation_mm}
+        before = {name: v for name, v in self.further.items() if name.startswith("temp_") or name == PRESSURE}
+        out |= before | ({"valid": self.valid} if self.valid_stated else {})
+        return out | {name: v for name, v in self.further.items() if name not in before}
+
+    def rows(self, chosen: Any) -> Columns:
+        """The chosen rows (an index of NumPy: a slice, row numbers or a mask) of every column."""
+        return replace(
+            self,
+            t_s=self.t_s[chosen],
+            q_mm=self.q_mm[chosen],
+            feed_mm_min=self.feed_mm_min[chosen],
+            direction=self.direction[chosen],
+            deviation_mm=None if self.deviation_mm is None else self.deviation_mm[chosen],
+            valid=self.valid[chosen],
+            further={name: values[chosen] for name, values in self.further.items()},
+        )
+
+    def equals(self, other: Columns) -> bool:
+        """Whether both have the same columns with the same numbers."""
+        mine, theirs = self.by_name(), other.by_name()
+        return mine.keys() == theirs.keys() and all(np.array_equal(values, theirs[name], equal_nan=True) for name, values in mine.items())
+
+    def to_document(self) -> Doc:
+        """Plain lists of Python numbers by column; ``deviation_mm`` is null for a sealed run."""
+        out: Doc = {name: values.tolist() for name, values in self.by_name().items()}
+        out |= {"direction": self.direction.astype(np.int64).tolist()}
+        out |= {"valid": self.valid.astype(np.int64).tolist()} if self.valid_stated else {}
+        return out if self.deviation_mm is not None else out | {"deviation_mm": None}
+
+
+def _floats(values: Any) -> F1:
+    return np.asarray(values, dtype=np.float64)
+
+
+def _numbers(values: Any) -> NDArray[Any]:
+    """A column with its type: integers stay integers."""
+    found = np.asarray(values)
+    return found if found.dtype.kind in "iu" else _floats(values)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Setup:
+    """Mounting of an instrument.
+
+    ``t_set_s``: time of mounting on the campaign's clock; ``tool_mm``: None for the machine's own; ``axis``: letter of the axis of a helix
+    or of a positioning test; ``document``: all keys as stored, also those without a field, for digests and listings.
+    """
+
+    setup_id: str
+    t_set_s: float | None
+    tool_mm: F1 | None
+    axis: str
+    document: Doc = field(repr=False)
+
+    def mounted(self, t_set_s: float) -> Self:
+        """The same set-up with this time of mounting, s."""
+        return replace(self, t_set_s=t_set_s, document=self.document | {"t_set_s": t_set_s})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BarSetup(Setup):
+    """Mounting of a ball-bar: the cup's centre, the bar, and the path about it.
+
+    ``turns``: of a helix; ``plane``, ``span_deg``: of a circle.
+    """
+
+    centre_mm: F1
+    radius_mm: float
+    turns: float | None
+    plane: str
+    span_deg: float
+    length_calibrated: bool | None
+    u_length_mm: float | None
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse ``setup`` of a ball-bar run."""
+        return cls(
+            **_common(doc),
+            centre_mm=_floats(doc["centre_mm"]),
+            radius_mm=float(doc["radius_mm"]),
+            turns=_number(doc.get("turns")),
+            plane=str(doc.get("plane") or ""),
+            span_deg=float(doc.get("span_deg") or 360.0),
+            length_calibrated=doc.get("length_calibrated"),
+            u_length_mm=_number(doc.get("u_length_mm")),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LaserSetup(Setup):
+    """Mounting of a laser along one line.
+
+    ``diagonal``: letters of the body diagonal; ``face``: plane of a face diagonal; ``order``: of the axes of a step diagonal, empty for a
+    plain one, None if not stated; ``increment_mm``: of a step, by axis; ``overrun_mm``: beyond both ends before turning.
+    """
+
+    start_mm: F1 | None
+    end_mm: F1 | None
+    nominal_beam: F1 | None
+    diagonal: str
+    face: str
+    order: str | None
+    steps: int
+    increment_mm: F1 | None
+    cycles: int
+    overrun_mm: float
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse ``setup`` of a laser run."""
+        return cls(
+            **_common(doc),
+            start_mm=_point(doc.get("start_mm")),
+            end_mm=_point(doc.get("end_mm")),
+            nominal_beam=_point(doc.get("nominal_beam")),
+            diagonal=str(doc.get("diagonal") or ""),
+            face=str(doc.get("face") or ""),
+            order=doc.get("order"),
+            steps=int(doc.get("steps") or 0),
+            increment_mm=_point(doc.get("increment_mm")),
+            cycles=int(doc.get("cycles", 1)),
+            overrun_mm=float(doc.get("overrun_mm") or 0.0),
+        )
+
+    @property
+    def ends_mm(self) -> tuple[F1, F1]:
+        """Start and end, mm.
+
+        Raises
+        ------
+        ValueError
+            The set-up states no start or no end.
+        """
+        if self.start_mm is None or self.end_mm is None:
+            raise ValueError(f"set-up {self.setup_id} does not state start_mm and end_mm")
+        return self.start_mm, self.end_mm
+
+    @property
+    def span_mm(self) -> F1:
+        """From start to end, mm, shape (3,); raises like `ends_mm`."""
+        start, end = self.ends_mm
+        return end - start
+
+
+def parsed_setup(test: str, doc: Doc) -> BarSetup | LaserSetup:
+    """Parse ``setup`` of a run of this test."""
+    return BarSetup.from_document(doc) if test.startswith("ballbar") else LaserSetup.from_document(doc)
+
+
+def _common(doc: Doc) -> dict[str, Any]:
+    return {
+        "setup_id": str(doc["setup_id"]),
+        "t_set_s": _number(doc.get("t_set_s")),
+        "tool_mm": _point(doc.get("tool_mm")),
+        "axis": str(doc.get("axis") or ""),
+        "document": doc,
+    }
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _point(value: Any) -> F1 | None:
+    return None if value is None else _floats(value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunTable:
+    """The compensation table that was active during a run.
+
+    ``crc``: None if the controller did not state it; ``acting``: whether it acted, None if not recorded; ``document``: as stored.
+    """
+
+    crc: int | None = None
+    bank: int | None = None
+    acting: bool | None = None
+    boot_id: int | None = None
+    document: Doc = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_document(cls, doc: Doc | None) -> Self:
+        """Parse ``table`` of a run; None counts as empty."""
+        known = doc or {}
+        numbers = {key: None if known.get(key) is None else int(known[key]) for key in ("crc", "bank", "boot_id")}
+        return cls(**numbers, acting=known.get("acting"), document=known)
+
+    @property
+    def acting_crc(self) -> int | None:
+        """CRC of the table, None if there was none, or if it did not act."""
+        return None if self.acting is False else self.crc
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPart:
+    """An interrupted run whose readings belong to the run that resumed its path."""
+
+    run: str
+    readings: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunTiming:
+    """Agreement of the clocks of a ball-bar run (`abbe.service.runs.clocks`).
+
+    ``trouble``: their disagreement, empty without one; ``pieces``: of a path that was resumed; ``document``: all figures as stored.
+    """
+
+    trouble: str = ""
+    pieces: tuple[RunPart, ...] = ()
+    document: Doc = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_document(cls, doc: Doc | None) -> Self:
+        """Parse ``timing`` of a run; None counts as empty."""
+        known = doc or {}
+        pieces = tuple(RunPart(run=str(one["run"]), readings=int(one["readings"])) for one in known.get("pieces", ()))
+        return cls(trouble=str(known.get("trouble") or ""), pieces=pieces, document=known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunState:
+    """State of a run that is incomplete or has not read enough of its path; ``covered``: share that it has read, None if unknown."""
+
+    status: str
+    covered: float | None = None
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse ``state`` of a run."""
+        return cls(status=str(doc.get("status", "complete")), covered=_number(doc.get("covered")))
+
+    def to_document(self) -> Doc:
+        """The key ``state``."""
+        return {"status": self.status} | ({} if self.covered is None else {"covered": self.covered})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """One measured sequence (``abbe-run/1``).
+
+    ``machine``: machine object of the format; ``state``: None for a complete run; ``ended_utc``: end of a stored run;
+    ``measured_digest``, ``subtracted``: digest of the measured data, and descriptions of what was subtracted from the readings since; empty
+    if they are as measured.
+    """
+
+    campaign: str
+    run_id: str
+    test: str
+    role: str
+    machine: Doc = field(repr=False)
+    setup: BarSetup | LaserSetup
+    columns: Columns = field(repr=False)
+    table: RunTable = RunTable()
+    timing: RunTiming = RunTiming()
+    state: RunState | None = None
+    ended_utc: str = ""
+    measured_digest: str = ""
+    subtracted: tuple[str, ...] = ()
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse an ``abbe-run/1`` document; keys outside the format are not kept.
+
+        Raises
+        ------
+        StoreError
+            A key is missing, or has another type.
+        """
+        try:
+            test = str(doc["test"])
+            return cls(
+                campaign=str(doc.get("campaign", "")),
+                run_id=str(doc["run_id"]),
+                test=test,
+                role=str(doc["role"]),
+                machine=doc.get("machine") or {},
+                setup=parsed_setup(test, doc["setup"]),
+                columns=Columns.from_document(doc["columns"]),
+                table=RunTable.from_document(doc.get("table")),
+                timing=RunTiming.from_document(doc.get("timing")),
+                state=RunState.from_document(doc["state"]) if doc.get("state") else None,
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as err:
+            raise StoreError(
+                f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document lacks or garbles {err}", "it was not written by Abbe"
+            ) from None
+
+    def to_document(self) -> Doc:
+        """The ``abbe-run/1`` document."""
+        head = {"format": RUN_FORMAT, "campaign": self.campaign, "run_id": self.run_id, "test": self.test, "role": self.role}
+        body = {"machine": self.machine, "setup": self.setup.document, "columns": self.columns.to_document()}
+        more = {"table": self.table.document, "timing": self.timing.document}
+        state = {} if self.state is None else {"state": self.state.to_document()}
+        return head | body | {key: value for key, value in more.items() if value} | state
+
+    @property
+    def is_bar(self) -> bool:
+        """Whether a ball-bar read it."""
+        return isinstance(self.setup, BarSetup)
+
+    @property
+    def is_sealed(self) -> bool:
+        """Whether its readings are withheld."""
+        return self.columns.deviation_mm is None
+
+    @property
+    def identifies(self) -> bool:
+        """Whether solutions and searches are fitted to it."""
+        return self.role == "identify"
+
+    @property
+    def bar(self) -> BarSetup:
+        """The set-up of a ball-bar run.
+
+        Raises
+        ------
+        MeasurementFault
+            It is a laser run.
+        """
+        if not isinstance(self.setup, BarSetup):
+            raise MeasurementFault(f"run {self.run_id} was not measured with a ball-bar", "leave it out")
+        return self.setup
+
+    @property
+    def laser(self) -> LaserSetup:
+        """The set-up of a laser run.
+
+        Raises
+        ------
+        MeasurementFault
+            It is a ball-bar run.
+        """
+        if not isinstance(self.setup, LaserSetup):
+            raise MeasurementFault(f"run {self.run_id} was not measured with a laser", "leave it out")
+        return self.setup
+
+    @property
+    def beam(self) -> F1:
+        """Nominal beam of a laser run, unit vector: as stated, else from start to end (of a positioning test along its axis).
+
+        Raises
+        ------
+        MeasurementFault
+            The set-up states no beam, or it is a ball-bar run.
+        """
+        setup = self.laser
+        beam = setup.nominal_beam
+        if beam is None and setup.start_mm is not None and setup.end_mm is not None:
+            beam = setup.span_mm * np.eye(3)["XYZ".index(setup.axis)] if setup.axis else setup.span_mm
+        length = np.nan if beam is None else float(np.linalg.norm(beam))
+        if beam is None or beam.shape != (3,) or not (np.isfinite(length) and length > 0.0):
+            why = f"run {self.run_id}: a laser run needs a beam: nominal_beam, or start and end apart"
+            raise MeasurementFault(why, "correct the run or leave it out")
+        return np.asarray(beam / length)
+
+    def with_readings(self, deviation_mm: F1) -> Run:
+        """The run with other readings, mm, shape (n,)."""
+        return replace(self, columns=replace(self.columns, deviation_mm=deviation_mm))
+
+    def mounted(self, t_set_s: float) -> Run:
+        """The run with this mounting time of its set-up, s."""
+        return replace(self, setup=self.setup.mounted(t_set_s))
