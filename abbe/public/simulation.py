@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.effects.effect import Effect, Values
@@ -161,7 +161,7 @@ def _coefficient(effect: Effect, strength: float, values: Values) -> float:
     reach = next((r for r in 10.0 ** np.arange(0.0, 19.0) if above(-r) * above(r) <= 0.0), None)
     if reach is None:
         raise Unusable(f"{effect.name} cannot have the strength {strength:g} {effect.unit}", "use a size in its range, with its sign")
-    return float(brentq(above, -reach, reach, xtol=1e-12))
+    return float(scipy.optimize.brentq(above, -reach, reach, xtol=1e-12))
 
 
 def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, instruments: SimulatedInstruments) -> Run:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -102,7 +102,7 @@ def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, s
     width = max(2, round(smooth_s / step / 2)) * 2 + 1
     if t_s.size < 3 * width:
         raise ValueError("lag: the path is too short for this smoothing")
-    slope_all = np.asarray(savgol_filter(0.5 * (out + back), width, 3, deriv=1, delta=step))
+    slope_all = np.asarray(scipy.signal.savgol_filter(0.5 * (out + back), width, 3, deriv=1, delta=step))
     inner = slice(width, t_s.size - width)  # the ends know only one side
     slope = slope_all[inner]
     free = np.ones((t_s.size, 1)) if columns is None else np.column_stack([np.ones(t_s.size), columns])

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.compensation.additive import SQUARENESS_SLOPES, MeanParameter, mean_parameter
@@ -180,7 +180,7 @@ def observable_alone(solution: JointSolution, *, weak: bool = False) -> frozense
 def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
     """Motions that carry the deviation with the machine's own tool when all others are zero; angles are given up first."""
     field = _field(solution)
-    triangle = linalg.qr(field / np.maximum(np.linalg.norm(field, axis=0), 1e-300), mode="r")[0][: field.shape[1]]
+    triangle = scipy.linalg.qr(field / np.maximum(np.linalg.norm(field, axis=0), 1e-300), mode="r")[0][: field.shape[1]]
     names = [*[t.motion for t in solution.terms], *["rigid"] * 6]
 
     def rank(motions: set[str]) -> int:

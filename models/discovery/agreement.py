@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Agreement, Unjudged
@@ -84,7 +84,7 @@ def agreements(
 
 def _root(covariance: F2) -> F2:
     """Factor R with R R^T = ``covariance``; eigenvalues that rounding made negative count as zero."""
-    values, vectors = linalg.eigh(0.5 * (covariance + covariance.T))
+    values, vectors = scipy.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
@@ -150,7 +150,7 @@ def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float)
     inner = known.T @ known
     inner.flat[:: len(inner) + 1] += 1.0
     b, own = known.T @ y, len(inner) - free
-    solution = linalg.solve(inner, np.column_stack([b, np.eye(len(inner))[:, own:]]), assume_a="pos")
+    solution = scipy.linalg.solve(inner, np.column_stack([b, np.eye(len(inner))[:, own:]]), assume_a="pos")
     freedom = len(white) - free + float(np.trace(solution[own:, 1:]))
     if freedom < 1.0:
         return None

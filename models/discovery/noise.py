@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, signal
+import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -50,7 +50,7 @@ def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours:
         m, c, v = colours[kind].filter()
         part = columns[start : start + n]
         scale = 1.0 / np.sqrt(v)
-        out[start : start + n] = signal.lfilter([scale, -m * scale], [1.0, c], part, axis=0)
+        out[start : start + n] = scipy.signal.lfilter([scale, -m * scale], [1.0, c], part, axis=0)
         out[start] *= np.sqrt(v)
         start += n
     return out
@@ -93,7 +93,7 @@ def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str]) -> F1:
     for n, kind in zip(lengths, kinds, strict=True):
         if kind == "laser" and n > 8:
             part = residual[start : start + n]
-            off = part - ndimage.median_filter(part, 5, mode="nearest")
+            off = part - scipy.ndimage.median_filter(part, 5, mode="nearest")
             far = np.abs(off) > LONE * robust_sd(off)
             if far.mean() <= 0.1:
                 out[start : start + n][far] = 0.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.candidates import Pick, with_values
@@ -101,7 +101,7 @@ def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> Solve
     more = white[:, 1:]
     cross = tangent.columns.T @ (white / sd_mm)
     gram = np.block([[tangent.blend(problem.colours), cross[:, 1:]], [cross[:, 1:].T, more.T @ more]])
-    root = linalg.block_diag(base.root, *(np.diag(s) for s in sd))
+    root = scipy.linalg.block_diag(base.root, *(np.diag(s) for s in sd))
     gram = root.T @ gram @ root
     gram.flat[:: len(gram) + 1] += 1.0
     inverse = root @ np.linalg.inv(gram) @ root.T

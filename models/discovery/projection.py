@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -49,7 +49,7 @@ class SignalProjection:
         """Project out ``columns`` (n, p) times ``weight``, with Gram matrix ``gram``; the unknowns have independent priors."""
         scaled = gram * prior_sd[:, None] * prior_sd
         scaled.flat[:: len(gram) + 1] += 1.0
-        root = linalg.solve_triangular(np.linalg.cholesky(scaled), np.diag(prior_sd), lower=True)
+        root = scipy.linalg.solve_triangular(np.linalg.cholesky(scaled), np.diag(prior_sd), lower=True)
         projection = cls(y, columns, np.ones(y.size) if weight is None else weight, root, np.zeros((0, y.size)), np.zeros(0))
         return replace(projection, moment=projection.seen(y[:, None])[:, 0])
 
@@ -99,4 +99,4 @@ class SignalProjection:
 def rows_of(left: F2, columns: F2, prior_sd: F1) -> F2:
     """Rows that project out columns, given the columns after projection (``left``); the unknowns have independent priors."""
     gram = columns.T @ left + np.diag(prior_sd**-2.0)
-    return np.asarray(linalg.solve_triangular(linalg.cholesky(0.5 * (gram + gram.T), lower=True), left.T, lower=True))
+    return np.asarray(scipy.linalg.solve_triangular(scipy.linalg.cholesky(0.5 * (gram + gram.T), lower=True), left.T, lower=True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from abbe.models.arrays import F2
 from abbe.models.discovery.candidates import Pick, gain_of, with_values
@@ -47,7 +47,7 @@ def _along(parameter: Parameter, pick: Pick, best: float, gain: Callable[[Pick],
         return with_values(pick, {**pick.values, parameter.name: float(np.exp(x)) if logs else float(x)})
 
     bounds = (np.log(low), np.log(high)) if logs else (low, high)
-    found = optimize.minimize_scalar(
+    found = scipy.optimize.minimize_scalar(
         lambda x: -gain(at(x)), bounds=bounds, method="bounded", options={"maxiter": EVALUATIONS, "xatol": 1e-4 * (bounds[1] - bounds[0])}
     )
     return (at(found.x), -float(found.fun)) if -found.fun > best else (pick, best)

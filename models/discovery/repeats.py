@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -79,7 +79,7 @@ def repeat_drift(place: F1, t_s: F1, reading_mm: F1) -> RepeatDrift | None:
     rows = order[keep]
     t, y = t_s[rows], reading_mm[rows]
     means = (which[keep][:, None] == np.arange(groups.size)).astype(np.float64)
-    basis = linalg.orth(means)
+    basis = scipy.linalg.orth(means)
     shapes = _shapes((t - t[0]) / float(np.ptp(t)))
     left = shapes - basis @ (basis.T @ shapes)
     size = np.linalg.norm(left, axis=0)
@@ -143,7 +143,7 @@ def _memory(residual: F1, taken: F2) -> float:
     if ss <= 0.0:
         return 0.0
     seen = float(residual[1:] @ residual[:-1]) / ss
-    q = linalg.orth(taken)
+    q = scipy.linalg.orth(taken)
     project = np.eye(n) - q @ q.T
     expected = []
     for memory in MEMORIES:
@@ -157,7 +157,7 @@ def _chance(gain: float, basis: F2, units: F2, memory: float) -> float:
     """Chance that some form explains as much of noise with that memory."""
     rng = np.random.default_rng(20261121)
     n = basis.shape[0]
-    root = linalg.cholesky(_correlation(n, memory), lower=True)
+    root = scipy.linalg.cholesky(_correlation(n, memory), lower=True)
     noise = root @ rng.standard_normal((n, TRIALS))
     noise -= basis @ (basis.T @ noise)
     best = ((units.T @ noise) ** 2).max(axis=0) / np.einsum("ij,ij->j", noise, noise)

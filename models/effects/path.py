@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.chain import REST_MM, travel_sign
@@ -134,7 +134,7 @@ def driven(q_mm: F2, t_s: F1, feed_mm_min: F1, *, dwelling: bool, temp_c: Mappin
     if dwelling or len(t_s) < 3:
         sign = travel_sign(q_mm)
         return Places(q_mm, sign, since_reversal(q_mm, sign), v, a, t_s, temp_c)
-    v = np.asarray(CubicSpline(t_s, q_mm, axis=0)(t_s, 1))  # chords are shorter than arcs: 2 % near a helix's pole
+    v = np.asarray(scipy.interpolate.CubicSpline(t_s, q_mm, axis=0)(t_s, 1))  # chords are shorter than arcs: 2 % near a helix's pole
     speed = np.linalg.norm(v, axis=1, keepdims=True)
     v *= np.divide(feed_mm_min[:, None] / 60.0, speed, out=np.ones_like(speed), where=speed > 0)
     a = np.gradient(v, t_s, axis=0, edge_order=2)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linprog
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.solvers.observations import reading_noise_mm
@@ -140,7 +140,7 @@ def zone_mm(path: CircularTest) -> float:
     scale = float(np.ptp(y)) or 1.0
     inside = np.column_stack([a[:, :2], np.zeros(y.size), np.ones(y.size)])  # a cos + b sin + low <= y
     outside = np.column_stack([-a[:, :2], -np.ones(y.size), np.zeros(y.size)])  # y <= a cos + b sin + high
-    found = linprog(
+    found = scipy.optimize.linprog(
         [0.0, 0.0, 1.0, -1.0],
         A_ub=np.concatenate([inside, outside]),
         b_ub=np.concatenate([y, -y]) / scale,

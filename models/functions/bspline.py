@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import interpolate
 
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.axis_function import frozen_vector, interval, positions, same_size
@@ -57,7 +57,7 @@ class BSpline:
             raise ValueError(f"bspline: knot {knot:g} stands more than {limit} times (inner knots {k} at most, first and last {k + 1})")
         if not t[k] < t[m]:
             raise ValueError(f"bspline: knots_mm must rise from knot {k + 1} to knot {m + 1}, where the function is stated")
-        object.__setattr__(self, "_spline", interpolate.BSpline(t, self.coefficients, k))
+        object.__setattr__(self, "_spline", scipy.interpolate.BSpline(t, self.coefficients, k))
         with np.errstate(over="ignore"):
             object.__setattr__(self, "_slopes", self._spline.derivative())
 
@@ -90,7 +90,7 @@ class BSpline:
         x = np.clip(positions(x_mm), *self.domain_mm)
         if x.size == 0:
             return np.zeros((0, self.coefficients.size))  # scipy looks for the least position
-        matrix = interpolate.BSpline.design_matrix(x, self.knots_mm, self.degree)
+        matrix = scipy.interpolate.BSpline.design_matrix(x, self.knots_mm, self.degree)
         return np.asarray(matrix.toarray(), dtype=np.float64)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:

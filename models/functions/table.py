@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import interpolate
 
 from abbe.models.arrays import F1, F2
 from abbe.models.functions.axis_function import frozen_vector, positions, same_size
@@ -101,7 +101,7 @@ class Table:
         x, unit = np.clip(positions(x_mm), *self.domain_mm), np.eye(self.value.size)
         if self._spline is None:
             return np.stack([np.interp(x, self.position_mm, one) for one in unit], axis=-1)
-        return np.asarray(interpolate.CubicSpline(self.position_mm, unit)(x), dtype=np.float64)
+        return np.asarray(scipy.interpolate.CubicSpline(self.position_mm, unit)(x), dtype=np.float64)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
         """Other values at the same positions."""
@@ -115,7 +115,7 @@ class Table:
 def _cubic(position_mm: F1, value: F1) -> Any:
     try:
         with np.errstate(all="ignore"):
-            spline = interpolate.CubicSpline(position_mm, value)
+            spline = scipy.interpolate.CubicSpline(position_mm, value)
     except ValueError:
         spline = None  # scipy's solver met an infinity
     if spline is None or not np.isfinite(spline.c).all():

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
@@ -70,7 +70,7 @@ def mounting_information(what: PlanningProblem, tests: tuple[Measurement, ...]) 
         nuisance.append(full[:, len(what.terms) + 3 :][:, own] * setup.prior_sd[own])
     a, b = np.concatenate(shared), np.concatenate(nuisance)
     cross = b.T @ a
-    return np.asarray(a.T @ a - cross.T @ linalg.solve(b.T @ b + np.eye(len(own)), cross, assume_a="pos"))
+    return np.asarray(a.T @ a - cross.T @ scipy.linalg.solve(b.T @ b + np.eye(len(own)), cross, assume_a="pos"))
 
 
 def _search_runs(what: PlanningProblem, tests: tuple[Measurement, ...]) -> tuple[RunData, ...]:
@@ -107,7 +107,7 @@ def _shared_columns(what: PlanningProblem, run: RunData, full: F2, setup_names: 
 
 def factor(information: F2) -> F2:
     """Rows F with F^T F = information, without directions that tell less than a hundred-thousandth of the prior, shape (r, size)."""
-    value, vector = linalg.eigh(information, subset_by_value=(1e-5, np.inf))
+    value, vector = scipy.linalg.eigh(information, subset_by_value=(1e-5, np.inf))
     return np.asarray(np.sqrt(value)[:, None] * vector.T)
 
 
@@ -141,6 +141,6 @@ def uncertainty_mm(information: F2, rows: F2, stated_mm2: F1 | float = 0.0) -> t
 
     ``stated_mm2``: variance on top of what readings and priors leave, at each node (`scale_temperature_mm2`).
     """
-    half = linalg.solve_triangular(linalg.cholesky(information, lower=True), rows.T, lower=True)
+    half = scipy.linalg.solve_triangular(scipy.linalg.cholesky(information, lower=True), rows.T, lower=True)
     v = (half**2).sum(axis=0).reshape(-1, 3).sum(axis=1) + stated_mm2
     return float(np.sqrt(v.max())), float(np.sqrt(v.mean()))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.planning.candidates import bars_that_fit
@@ -96,7 +96,7 @@ class Search:
 
     def criterion(self, chosen: Chosen) -> float:
         """Logarithm of the power-mean standard uncertainty (mm) of a plan."""
-        half = linalg.solve_triangular(linalg.cholesky(self.information(chosen), lower=True), self._rows.T, lower=True)
+        half = scipy.linalg.solve_triangular(scipy.linalg.cholesky(self.information(chosen), lower=True), self._rows.T, lower=True)
         return self._judge((half**2).sum(axis=0))
 
     @staticmethod
@@ -111,8 +111,8 @@ class Search:
 
     def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...], thrift: float = 1.0) -> list[Measurement]:
         """Affordable tests of the pool, and what fits to the cups that stand, by gain / minutes^thrift, the best first."""
-        lower = linalg.cholesky(self.information(chosen), lower=True)
-        half = linalg.solve_triangular(lower, self._rows.T, lower=True)
+        lower = scipy.linalg.cholesky(self.information(chosen), lower=True)
+        half = scipy.linalg.solve_triangular(lower, self._rows.T, lower=True)
         start = (half**2).sum(axis=0)
         now, rates = self._judge(start), dict[Measurement, float]()
         for test in (*pool, *self._at_cups(chosen)):
@@ -122,9 +122,9 @@ class Search:
             cost = self.cost_min(test, before)
             if cost > budget_min:
                 continue
-            b = linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
-            s = linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
-            reduction = linalg.solve_triangular(s, b @ half, lower=True)
+            b = scipy.linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
+            s = scipy.linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
+            reduction = scipy.linalg.solve_triangular(s, b @ half, lower=True)
             rates[test] = (now - self._judge(start - (reduction**2).sum(axis=0))) / cost**thrift
         return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
@@ -185,7 +185,8 @@ def motions_of(solution: JointSolution) -> tuple[MotionStatus, ...]:
 def posterior_covariance(information: F2, prior_root: F2) -> F2:
     """Covariance of all unknowns, shape (p, p), from the information of the readings and the prior covariance root root^T."""
     scaled = prior_root.T @ information @ prior_root + np.eye(information.shape[0])
-    half = linalg.solve_triangular(linalg.cholesky(scaled, lower=True, check_finite=False), prior_root.T, lower=True, check_finite=False)
+    low = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
+    half = scipy.linalg.solve_triangular(low, prior_root.T, lower=True, check_finite=False)
     return np.asarray(half.T @ half)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
@@ -67,10 +67,10 @@ def posterior(sums: InformationSums, c: Components, model: SizeModel) -> Compone
     """Most probable unknowns, their covariance and the evidence."""
     gram, moment, square = blend(sums, c, c.half(model))
     np.fill_diagonal(gram, gram.diagonal() + 1.0)
-    low = linalg.cholesky(gram, lower=True, overwrite_a=True, check_finite=False)
-    z = linalg.solve_triangular(low, moment, lower=True, check_finite=False)
-    x = linalg.solve_triangular(low, z, lower=True, trans=1, check_finite=False)
-    inverse, _ = linalg.lapack.dpotri(low, lower=1)  # its lower half only; the rest is the zeros of the factor
+    low = scipy.linalg.cholesky(gram, lower=True, overwrite_a=True, check_finite=False)
+    z = scipy.linalg.solve_triangular(low, moment, lower=True, check_finite=False)
+    x = scipy.linalg.solve_triangular(low, z, lower=True, trans=1, check_finite=False)
+    inverse, _ = scipy.linalg.lapack.dpotri(low, lower=1)  # its lower half only; the rest is the zeros of the factor
     cov = inverse + inverse.T
     np.fill_diagonal(cov, inverse.diagonal())
     log_det = 2.0 * float(np.log(low.diagonal()).sum())
@@ -136,7 +136,7 @@ def estimate(sums: InformationSums, model: SizeModel, start: Components) -> Fitt
     for _ in range(STEPS):
         gradient, info = slope(sums, c, model, p)
         info = _positive(info + np.diag(weight), float(weight.min()))
-        step = linalg.solve(info, gradient - weight * np.concatenate([c.psi, c.eta]), assume_a="pos")
+        step = scipy.linalg.solve(info, gradient - weight * np.concatenate([c.psi, c.eta]), assume_a="pos")
         step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
         trial = _moved(c, step)
         better, found = objective(trial)
@@ -149,12 +149,12 @@ def estimate(sums: InformationSums, model: SizeModel, start: Components) -> Fitt
         gain, c, value, p = better - value, trial, better, found
         if gain < TOLERANCE:
             break
-    return FittedComponents(c, np.asarray(linalg.inv(info)), value)
+    return FittedComponents(c, np.asarray(scipy.linalg.inv(info)), value)
 
 
 def _positive(info: F2, least: float) -> F2:
     """The matrix with eigenvalues of at least ``least``; smaller ones come from rounding only (readings without noise)."""
-    values, vectors = linalg.eigh(info)
+    values, vectors = scipy.linalg.eigh(info)
     return info if values[0] >= least else np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
 
@@ -262,11 +262,11 @@ def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, l
     out = []
     for k in levels:
         keep = np.flatnonzero(level[at] <= k)
-        low = linalg.cholesky(covariance[np.ix_(keep, keep)], lower=True, check_finite=False)
+        low = scipy.linalg.cholesky(covariance[np.ix_(keep, keep)], lower=True, check_finite=False)
         inside = low.T @ gram[np.ix_(keep, keep)] @ low
         np.fill_diagonal(inside, inside.diagonal() + 1.0)
-        factor = linalg.cholesky(inside, lower=True, check_finite=False)
-        z = linalg.solve_triangular(factor, low.T @ moment[keep], lower=True, check_finite=False)
+        factor = scipy.linalg.cholesky(inside, lower=True, check_finite=False)
+        z = scipy.linalg.solve_triangular(factor, low.T @ moment[keep], lower=True, check_finite=False)
         out.append(fixed + 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum()))
     return levels, np.array(out)
 
@@ -277,9 +277,9 @@ def _without_setup(gram: F2, moment: F1, root: F2, level: I1) -> tuple[F2, F1, f
     sd = root.diagonal()[rest]  # independent of each other
     own = gram[np.ix_(rest, rest)] * sd[:, None] * sd
     np.fill_diagonal(own, own.diagonal() + 1.0)
-    factor = linalg.cholesky(own, lower=True, check_finite=False)
+    factor = scipy.linalg.cholesky(own, lower=True, check_finite=False)
     both = np.column_stack([gram[np.ix_(rest, terms)], moment[rest]]) * sd[:, None]
-    half = linalg.solve_triangular(factor, both, lower=True, check_finite=False)
+    half = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
     z = half[:, -1]
     fixed = 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum())
     return gram[np.ix_(terms, terms)] - half[:, :-1].T @ half[:, :-1], moment[terms] - half[:, :-1].T @ z, fixed

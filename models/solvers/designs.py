@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
@@ -162,5 +162,5 @@ def shortest_solution(a: F2, y: F1, scale: F1) -> F1:
     -------
     array, shape (p,), the parameters in their own units.
     """
-    x = linalg.lstsq(a * scale, y, cond=RANK_TOLERANCE, lapack_driver="gelsd")[0]
+    x = scipy.linalg.lstsq(a * scale, y, cond=RANK_TOLERANCE, lapack_driver="gelsd")[0]
     return np.asarray(x * scale)

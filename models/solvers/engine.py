@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term
@@ -214,8 +214,8 @@ def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, siz
     """Standard deviation of each residual in units of its noise: what the fit took of it is missing."""
     information, _, _ = blend(whole.turned(sizes.root, sizes.blocks), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
-    low = linalg.cholesky(information, lower=True)
-    h = leverage(problem.readings.a, linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
+    low = scipy.linalg.cholesky(information, lower=True)
+    h = leverage(problem.readings.a, scipy.linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
     return np.asarray(np.sqrt(np.maximum(1.0 - h / np.exp(c.eta)[problem.readings.kind], 0.05)))
 
 

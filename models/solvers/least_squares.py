@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -26,18 +26,18 @@ def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
         Something in the matrix is no finite number.
     """
     try:
-        u, s, vt = linalg.svd(a, full_matrices=full_matrices, check_finite=False)
-    except linalg.LinAlgError:
-        u, s, vt = linalg.svd(a, full_matrices=full_matrices, lapack_driver="gesvd")
+        u, s, vt = scipy.linalg.svd(a, full_matrices=full_matrices, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        u, s, vt = scipy.linalg.svd(a, full_matrices=full_matrices, lapack_driver="gesvd")
     return np.asarray(u), np.asarray(s), np.asarray(vt)
 
 
 def singular_values(a: F2) -> F1:
     """Singular values alone, largest first; raises as `svd`."""
     try:
-        return np.asarray(linalg.svd(a, compute_uv=False, check_finite=False))
-    except linalg.LinAlgError:
-        return np.asarray(linalg.svd(a, compute_uv=False, lapack_driver="gesvd"))
+        return np.asarray(scipy.linalg.svd(a, compute_uv=False, check_finite=False))
+    except scipy.linalg.LinAlgError:
+        return np.asarray(scipy.linalg.svd(a, compute_uv=False, lapack_driver="gesvd"))
 
 
 @dataclass(frozen=True)
@@ -119,15 +119,15 @@ def _check(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> Non
 
 def _solve_whitened(names: tuple[str, ...], b: F2, z: F1, ridge: F1) -> tuple[F1, F2]:
     """Minimum of |b x - z|^2 + |ridge x|^2 by QR of the stacked system, and the inverse of its normal matrix."""
-    q, r, pivot = linalg.qr(np.concatenate([b, np.diag(ridge)]), mode="economic", pivoting=True)
+    q, r, pivot = scipy.linalg.qr(np.concatenate([b, np.diag(ridge)]), mode="economic", pivoting=True)
     keep = np.abs(np.diag(r)) > 1e-12 * abs(r[0, 0])
     if not keep.all():
         raise ValueError(f"least squares: no prior and no data for a combination with {names[int(pivot[np.flatnonzero(~keep)[0]])]}")
     n = len(names)
     x = np.empty(n)
-    x[pivot] = linalg.solve_triangular(r, q.T @ np.concatenate([z, np.zeros(n)]))
+    x[pivot] = scipy.linalg.solve_triangular(r, q.T @ np.concatenate([z, np.zeros(n)]))
     r_inv = np.empty((n, n))
-    r_inv[pivot] = linalg.solve_triangular(r, np.eye(n))
+    r_inv[pivot] = scipy.linalg.solve_triangular(r, np.eye(n))
     return x, r_inv @ r_inv.T
 
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
@@ -54,9 +54,9 @@ def together(parts: Sequence[Part]) -> Posterior:
     """Posterior from some runs together."""
     n = parts[0].a.shape[1]
     information = sum((p.information for p in parts), np.eye(n))
-    lower = linalg.cholesky(information, lower=True)
-    half = linalg.solve_triangular(lower, sum((p.a.T @ p.y for p in parts), np.zeros(n)), lower=True)
-    theta = linalg.solve_triangular(lower, half, lower=True, trans=1)
+    lower = scipy.linalg.cholesky(information, lower=True)
+    half = scipy.linalg.solve_triangular(lower, sum((p.a.T @ p.y for p in parts), np.zeros(n)), lower=True)
+    theta = scipy.linalg.solve_triangular(lower, half, lower=True, trans=1)
     left = sum(float(p.y @ p.y) for p in parts) - float(half @ half)
     log_p = -0.5 * left - float(np.log(np.diag(lower)).sum()) - sum(p.log_sigma for p in parts)
     return Posterior(lower, theta, log_p)
@@ -69,10 +69,10 @@ def conditional(others: Posterior, variants: dict[str, Part]) -> dict[str, float
     for name, part in variants.items():
         found = next((k for k in known if np.array_equal(k[0], part.a)), None)
         if found is None:
-            spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
-            found = (part.a, spread, linalg.cholesky(spread @ spread.T + np.eye(len(spread)), lower=True))
+            spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
+            found = (part.a, spread, scipy.linalg.cholesky(spread @ spread.T + np.eye(len(spread)), lower=True))
             known.append(found)
-        left = linalg.solve_triangular(found[2], part.y - part.a @ others.theta, lower=True)
+        left = scipy.linalg.solve_triangular(found[2], part.y - part.a @ others.theta, lower=True)
         out[name] = -0.5 * float(left @ left) - float(np.log(np.diag(found[2])).sum()) - part.log_sigma
     return out
 
@@ -96,7 +96,7 @@ def _against_the_rest(a: F2, y: F1) -> tuple[float, F1]:
 
     Source: Rasmussen and Williams, Gaussian Processes, eqs 5.8 and 5.12.
     """
-    values, vectors = linalg.eigh(a @ a.T)
+    values, vectors = scipy.linalg.eigh(a @ a.T)
     values, turned = np.clip(values, 0.0, None), vectors.T @ y
     spread = values[:, None] + SIGMA_GRID_MM**2
     log_p = -0.5 * (turned[:, None] ** 2 / spread + np.log(spread)).sum(axis=0)
@@ -220,10 +220,10 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
 def _cleaned(run: _Run, others: Posterior) -> _Run | None:
     """The run without readings that the other runs show to be outliers; None: there are none."""
     part = run.as_is
-    spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
+    spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)
     while True:
-        precision = linalg.inv(spread[~drop] @ spread[~drop].T + np.eye(int((~drop).sum())))
+        precision = scipy.linalg.inv(spread[~drop] @ spread[~drop].T + np.eye(int((~drop).sum())))
         z = precision @ off[~drop] / np.sqrt(np.diag(precision))
         if np.abs(z).max() <= SURE_SIGMA:
             break
@@ -326,9 +326,9 @@ def _misfit(others: Posterior, run: _Run) -> tuple[float, float]:
     r = part.y - part.a[:, :first] @ others.theta[:first]
     own = part.a[:, first:]
     own = own[:, np.abs(own).max(axis=0) > 0]
-    q, _ = linalg.qr(own, mode="economic")
+    q, _ = scipy.linalg.qr(own, mode="economic")
     left = r - q @ (q.T @ r)
-    spread = linalg.solve_triangular(others.factor, part.a.T, lower=True).T
+    spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     spread = spread - q @ (q.T @ spread)
     expected = 1.0 + float((spread**2).sum()) / len(r)
     return run.sigma_mm * float(np.sqrt(np.mean(left**2))), run.sigma_mm * float(np.sqrt(expected))

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.solvers.observations import RunData
@@ -61,7 +61,7 @@ def _of_run(run: RunData, z: F1, use: np.ndarray[tuple[int, ...], np.dtype[np.bo
 
 def _size(label: str, z: F1) -> ResidualTest:
     chi2 = float(z @ z)
-    p = float(special.gammaincc(0.5 * z.size, 0.5 * chi2))
+    p = float(scipy.special.gammaincc(0.5 * z.size, 0.5 * chi2))
     text = f"{label}: residuals are {np.sqrt(chi2 / z.size):.1f} times as large as those of the other runs of this instrument"
     return ResidualTest(label, "size", chi2, p, p, False, text)
 
@@ -74,7 +74,7 @@ def _signs(label: str, z: F1) -> ResidualTest:
     mean = 1.0 + 2.0 * n1 * n2 / (n1 + n2)
     variance = (mean - 1.0) * (mean - 2.0) / (n1 + n2 - 1.0)
     score = (count - mean) / np.sqrt(max(variance, 1e-12))
-    p = float(2.0 * special.ndtr(-abs(score)))
+    p = float(2.0 * scipy.special.ndtr(-abs(score)))
     word = "seldom" if score < 0 else "often"
     return ResidualTest(label, "signs", float(score), p, p, False, f"{label}: residuals change sign too {word} for noise")
 
@@ -91,7 +91,7 @@ def _alike(label: str, name: str, z: F1, at: F1, unit: str) -> ResidualTest:
     r = autocorrelation(z, lags)
     k = np.arange(1, lags + 1)
     q = float(z.size * (z.size + 2.0) * np.sum(r**2 / (z.size - k)))
-    p = float(special.gammaincc(0.5 * lags, 0.5 * q))
+    p = float(scipy.special.gammaincc(0.5 * lags, 0.5 * q))
     small = np.flatnonzero(r < 2.0 / np.sqrt(z.size))
     length = int(small[0]) if small.size else lags
     span = float(np.median(at[max(length, 1) :] - at[: -max(length, 1)]))
@@ -111,7 +111,7 @@ def _direction(label: str, axis: str, z: F1, sign: F1) -> list[ResidualTest]:
         return []
     gap = float(plus.mean() - minus.mean())
     score = gap / float(np.sqrt(1.0 / plus.size + 1.0 / minus.size))
-    p = float(2.0 * special.ndtr(-abs(score)))
+    p = float(2.0 * scipy.special.ndtr(-abs(score)))
     text = f"{label}: forward and backward travel of {axis} differ by {abs(gap):.1f} standard deviations more than one lost motion explains"
     return [ResidualTest(label, f"direction {axis}", float(score), p, p, False, text)]
 
@@ -187,7 +187,7 @@ def leverage(a: F2, root: F2) -> F1:
 
 def outlier_threshold(n: int) -> float:
     """Size in standard deviations that ``n`` normal readings exceed with the chance `FALSE_ALARM` only; never below 3.5."""
-    return max(3.5, float(-special.ndtri(0.5 * FALSE_ALARM / max(n, 1))))
+    return max(3.5, float(-scipy.special.ndtri(0.5 * FALSE_ALARM / max(n, 1))))
 
 
 def outlier_weights(size: F1, limit: float) -> F1:

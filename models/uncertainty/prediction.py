@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.volume import RigidFree, unit_deviation
@@ -248,9 +248,9 @@ def unobserved_directions(solution: JointSolution) -> F2:
     typical = term_prior_sd(solution.machine, solution.terms, Priors())
     own, other = solution.information[:n, :n], solution.information[n:, n:]
     across = solution.information[:n, n:]
-    taken = linalg.solve(other + np.diag(solution.prior_sd[n:] ** -2.0), across.T, assume_a="pos")
+    taken = scipy.linalg.solve(other + np.diag(solution.prior_sd[n:] ** -2.0), across.T, assume_a="pos")
     left = (own - across @ taken) * np.outer(typical, typical)
-    values, vectors = linalg.eigh(0.5 * (left + left.T))
+    values, vectors = scipy.linalg.eigh(0.5 * (left + left.T))
     return np.asarray(typical[:, None] * vectors[:, values < NO_TRACE_SIGMA**2])
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term, smooth_terms
@@ -46,7 +46,7 @@ def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
 
     The contribution of the estimated sizes is clipped so that it never makes a combination of these results more certain.
     """
-    turn, small = linalg.qr(per_unit, mode="economic") if len(per_unit) > per_unit.shape[1] else (None, per_unit)
+    turn, small = scipy.linalg.qr(per_unit, mode="economic") if len(per_unit) > per_unit.shape[1] else (None, per_unit)
     total = np.zeros((len(small), len(small)))
     for s in sources.sources:
         plus = small @ s.factor
@@ -112,7 +112,7 @@ class Response:
         ``variance_mm2``: of each reading (n,); None: what its weight stands for. ``seen``: which readings have them.
         """
         size = np.sqrt(self.weight) if variance_mm2 is None else np.sqrt(variance_mm2) * self.weight
-        r = linalg.qr(self.design[seen] * size[seen, None], mode="r")[0][: self.design.shape[1]]
+        r = scipy.linalg.qr(self.design[seen] * size[seen, None], mode="r")[0][: self.design.shape[1]]
         return np.asarray(self.covariance @ r.T)
 
     def dof_of(self, kind: str) -> float:
@@ -138,8 +138,8 @@ def response(solution: JointSolution) -> Response:
     root = prior_factor(solution.prior_root)
     normal = root.T @ solution.information @ root
     np.fill_diagonal(normal, normal.diagonal() + 1.0)
-    inner = linalg.solve_triangular(linalg.cholesky(normal, lower=True), root.T, lower=True)
-    pull = linalg.cho_solve((linalg.cholesky(normal, lower=True), True), root.T).T  # C R^-T
+    inner = scipy.linalg.solve_triangular(scipy.linalg.cholesky(normal, lower=True), root.T, lower=True)
+    pull = scipy.linalg.cho_solve((scipy.linalg.cholesky(normal, lower=True), True), root.T).T  # C R^-T
     covariance = inner.T @ inner
     widening = solution.estimate.covariance - covariance
     return Response(design, solution.weight_per_mm2, kind, covariance, pull, widening, solution.estimate.dof)
@@ -148,7 +148,7 @@ def response(solution: JointSolution) -> Response:
 def prior_factor(root: F2) -> F2:
     """Triangular factor of the prior covariance root root^T: what each unknown adds to those before it, low orders of a motion first."""
     scale = np.linalg.norm(root, axis=1)
-    return np.asarray(scale[:, None] * linalg.qr((root / scale[:, None]).T, mode="r")[0].T)
+    return np.asarray(scale[:, None] * scipy.linalg.qr((root / scale[:, None]).T, mode="r")[0].T)
 
 
 # What error motions of higher order than the chosen one may still do: the price of a smooth model.
@@ -176,8 +176,8 @@ def order_source(solution: JointSolution, r: Response, orders_above: int) -> tup
     seen = omitted.T @ weighted - (weighted.T @ r.design) @ carried
     sd = omitted_prior_sd(solution, above)
     normal = np.eye(len(above)) + 0.5 * np.outer(sd, sd) * (seen + seen.T)
-    lower = linalg.cholesky(normal, lower=True)
-    root = sd[:, None] * linalg.solve_triangular(lower, np.eye(len(above)), lower=True).T
+    lower = scipy.linalg.cholesky(normal, lower=True)
+    root = sd[:, None] * scipy.linalg.solve_triangular(lower, np.eye(len(above)), lower=True).T
     residual = np.concatenate([fit.residual_mm for fit in solution.runs])
     asked = root @ (root.T @ (weighted.T @ residual))
     phi = np.concatenate([root, asked[:, None]], axis=1)
@@ -346,7 +346,7 @@ def _compressed(factor: F2) -> F2:
     """The same covariance from no more columns than rows."""
     if factor.shape[1] <= factor.shape[0]:
         return factor
-    return np.asarray(linalg.qr(factor.T, mode="r")[0][: factor.shape[0]].T)
+    return np.asarray(scipy.linalg.qr(factor.T, mode="r")[0][: factor.shape[0]].T)
 
 
 def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
@@ -372,7 +372,7 @@ def _widening(r: Response, n: int) -> tuple[F2, F2]:
     """
     whole = r.widening[:n, :n]
     scale = np.sqrt(np.diag(r.covariance)[:n])
-    value, vector = linalg.eigh(whole / np.outer(scale, scale))
+    value, vector = scipy.linalg.eigh(whole / np.outer(scale, scale))
     roots = scale[:, None] * vector * np.sqrt(np.abs(value))
     return roots[:, value > 0], roots[:, value < 0]
 

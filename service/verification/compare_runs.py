@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
@@ -184,7 +184,7 @@ def _laser(one: LoadedRun) -> ComparedCurve:
 def difference(first: ComparedCurve, second: ComparedCurve) -> RunDifference | None:
     """Second minus first at the places of the first that both runs read; None for fewer than three."""
     far = NEAR_RAD if first.round else 0.05
-    distance, at = cKDTree(second.place).query(first.place)
+    distance, at = scipy.spatial.cKDTree(second.place).query(first.place)
     near = distance <= far
     if int(near.sum()) < 3:
         return None

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term, term_values
@@ -60,8 +60,8 @@ def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) ->
     """
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
-    low = linalg.cholesky(inside, lower=True)
-    half = linalg.solve_triangular(low, base.T @ np.column_stack([gram, moment]), lower=True)
+    low = scipy.linalg.cholesky(inside, lower=True)
+    half = scipy.linalg.solve_triangular(low, base.T @ np.column_stack([gram, moment]), lower=True)
     own = gram - half[:, :-1].T @ half[:, :-1]
     gradient = moment - half[:, :-1].T @ half[:, -1]
     return [_one(a, own, gradient) for a in asked]
@@ -71,14 +71,14 @@ def log_evidence(gram: F2, moment: F1, base: F2) -> float:
     """Log marginal likelihood with everything along ``base`` unknown, less constants common to all bases."""
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
-    low = linalg.cholesky(inside, lower=True)
-    z = linalg.solve_triangular(low, base.T @ moment, lower=True)
+    low = scipy.linalg.cholesky(inside, lower=True)
+    z = scipy.linalg.solve_triangular(low, base.T @ moment, lower=True)
     return 0.5 * float(z @ z) - float(np.log(low.diagonal()).sum())
 
 
 def _one(asked: AskedChange, gram: F2, moment: F1) -> ChangeEvidence:
     d = asked.directions
-    values, vectors = linalg.eigh(d.T @ gram @ d)
+    values, vectors = scipy.linalg.eigh(d.T @ gram @ d)
     values, along = np.maximum(values, 0.0), vectors.T @ (d.T @ moment)
     found = []
     for size in asked.sizes:
@@ -255,10 +255,10 @@ class ChangeContext:
         whole = np.column_stack([factor, self._free(chosen, asked.name)])
         inside = whole.T @ chosen.gram @ whole
         inside[np.diag_indices_from(inside)] += 1.0
-        low = linalg.cho_factor(inside)
+        low = scipy.linalg.cho_factor(inside)
         mine = slice(0, factor.shape[1])
-        x = linalg.cho_solve(low, whole.T @ chosen.moment)[mine]
-        covariance = linalg.cho_solve(low, np.eye(len(inside))[:, mine])[mine]
+        x = scipy.linalg.cho_solve(low, whole.T @ chosen.moment)[mine]
+        covariance = scipy.linalg.cho_solve(low, np.eye(len(inside))[:, mine])[mine]
         typical = self.problem.sizes.typical[: self._n, None]
         turned = factor[: self._n] * typical
         return turned @ x, turned @ covariance @ turned.T
@@ -332,7 +332,7 @@ class ChangeContext:
         at[:n] -= coefficients / typical[:n]
         y = (self.fit.residual_mm[rows] + self.problem.sigma[rows] * (r.a[rows] @ at)) / noise
         a = r.a[rows, n:] * sd * (self.problem.sigma[rows] / noise)[:, None]
-        x = linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y, assume_a="pos")
+        x = scipy.linalg.solve(a.T @ a + np.eye(a.shape[1]), a.T @ y, assume_a="pos")
         return float(np.sum(((y - a @ x) * noise) ** 2))
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import NextTest
@@ -203,7 +203,7 @@ class _Columns:
             scale = 1.0 / np.sqrt(np.diag(inner) + 1e-30)
             inner = inner * scale * scale[:, None] + RIDGE * np.eye(use.size)
             b = gram[use, -1] * scale
-            out.append(np.sqrt(max(gram[-1, -1] - b @ linalg.solve(inner, b, assume_a="pos"), 0.0)))
+            out.append(np.sqrt(max(gram[-1, -1] - b @ scipy.linalg.solve(inner, b, assume_a="pos"), 0.0)))
         return np.array(out)
 
 

@@ -10,9 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
-from scipy.signal import fftconvolve
-from scipy.spatial import cKDTree
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.effects.path import Path
@@ -109,11 +107,11 @@ def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F
     """
     length = np.sum(columns**2, axis=0) / 2.0 + 1e-12
     cell = ((x - x.min()) / bin_size).astype(np.intp)
-    size = fft.next_fast_len(max(int(np.ceil(1.0 / (step * bin_size))), int(cell.max()) + 1), real=True)
+    size = scipy.fft.next_fast_len(max(int(np.ceil(1.0 / (step * bin_size))), int(cell.max()) + 1), real=True)
     binned = np.stack([np.bincount(cell, c * rest, size) for c in columns.T])
     f = np.arange(size // 2 + 1) / (size * bin_size)
     inside = (f >= low) & (f <= high)
-    power = np.abs(fft.rfft(binned, axis=1)[:, inside]) ** 2 / length[:, None]
+    power = np.abs(scipy.fft.rfft(binned, axis=1)[:, inside]) ** 2 / length[:, None]
     return f[inside], power
 
 
@@ -133,7 +131,7 @@ def bursts(seen: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float
             if not f.size or len(lag) > p.n:
                 continue
             swing = np.exp(2j * np.pi * f[:, None] * lag)
-            power = np.abs(fftconvolve(np.broadcast_to(rest, (len(f), p.n)), window * swing, mode="same", axes=1)) ** 2
+            power = np.abs(scipy.signal.fftconvolve(np.broadcast_to(rest, (len(f), p.n)), window * swing, mode="same", axes=1)) ** 2
             power /= 0.5 * float(np.sum(window**2))
             k, i = np.unravel_index(int(np.argmax(power)), power.shape)
             found.append((float(power[k, i]), float(p.at.t_s[i]), width, float(f[k])))
@@ -146,7 +144,7 @@ def bumps(seen: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[f
     q = np.concatenate([p.at.q_mm for p in seen.paths])
     t, look, rest = seen.stacked()
     _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
-    tree = cKDTree(q)
+    tree = scipy.spatial.cKDTree(q)
     total = np.concatenate([_bump_gains(q[cells[i : i + PLACES]], tree, look, rest, widths_mm) for i in range(0, len(cells), PLACES)])
     chosen: list[int] = []
     for i in np.argsort(-total):
@@ -157,9 +155,9 @@ def bumps(seen: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[f
     return tuple(float(t[cells[i]]) for i in chosen)
 
 
-def _bump_gains(places: F2, tree: cKDTree, look: F2, rest: F1, widths_mm: tuple[float, ...]) -> F1:
+def _bump_gains(places: F2, tree: scipy.spatial.cKDTree, look: F2, rest: F1, widths_mm: tuple[float, ...]) -> F1:
     """Largest reduction of chi-square by a bump of any width at each place, shape (places,)."""
-    near = cKDTree(places).sparse_distance_matrix(tree, 2.5 * max(widths_mm), output_type="coo_matrix")
+    near = scipy.spatial.cKDTree(places).sparse_distance_matrix(tree, 2.5 * max(widths_mm), output_type="coo_matrix")
     total = np.zeros(len(places))
     for width in widths_mm:
         g = np.exp(-0.5 * (near.data / width) ** 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.effects.path import Path
@@ -116,7 +116,7 @@ def _likelihood(square: F1, columns: F2, start: F1) -> F1:
         slope = 0.5 * ((1.0 / v) @ columns - (square / v**2 / level) @ columns)
         return 0.5 * (float(np.log(v).sum()) + n * np.log(level)), slope
 
-    found = optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1e4)] * columns.shape[1])
+    found = scipy.optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1e4)] * columns.shape[1])
     level = float(np.mean(square / (1.0 + columns @ found.x)))
     return np.concatenate([[level], found.x])
 

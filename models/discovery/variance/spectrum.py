@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special
+import scipy
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.noise import Colour
@@ -145,7 +145,7 @@ def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]
         return 0.0, 0.0, 0.0
     top = 4.0 * np.sqrt(np.sum(z**2)) / np.sqrt(np.sum(e**2) + 1e-300)
     a = np.linspace(0.0, max(top, 1e-9), 200)
-    bessel = np.log(special.i0e(np.outer(a, z))) + np.outer(a, z)
+    bessel = np.log(scipy.special.i0e(np.outer(a, z))) + np.outer(a, z)
     like = (bessel - 0.25 * np.outer(a**2, e)).sum(axis=1)
     k = int(np.argmax(like))
     weight = np.exp(like - like[k])

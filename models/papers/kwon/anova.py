@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+import scipy
 
 from abbe.models.arrays import F1
 from abbe.models.papers.kwon.errors import SurfaceNotDetermined
@@ -119,7 +119,7 @@ def anova_from_sums(ss_reg: float, ss_res: float, df_reg: int, df_res: int, ss_t
     if both == 0.0:
         return Anova(0.0, 0.0, ss_tot or 0.0, df_reg, df_res, float("nan"), float("nan"), 0.0)
     f = (ss_reg / df_reg) / (ss_res / df_res) if ss_res > 0.0 else float("inf")
-    p = float(special.fdtrc(df_reg, df_res, f)) if np.isfinite(f) else 0.0
+    p = float(scipy.special.fdtrc(df_reg, df_res, f)) if np.isfinite(f) else 0.0
     return Anova(ss_reg, ss_res, both if ss_tot is None else ss_tot, df_reg, df_res, f, p, ss_reg / both)
 
 
@@ -127,4 +127,4 @@ def critical_f(df_reg: int, df_res: int, alpha: float = 0.01) -> float:
     """F(df_reg, df_res, alpha): the value that chance exceeds with probability alpha."""
     if not 0.0 < alpha < 1.0 or df_reg < 1 or df_res < 1:
         raise ValueError(f"critical F: alpha {alpha:g} must lie in (0, 1) and {df_reg}, {df_res} degrees of freedom be 1 or more")
-    return float(special.fdtri(df_reg, df_res, 1.0 - alpha))
+    return float(scipy.special.fdtri(df_reg, df_res, 1.0 - alpha))

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize, special
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.rotation import rotation_matrix
@@ -107,7 +107,7 @@ def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
     carried = s**2 > variance
     y2, s2 = along[carried] ** 2, s[carried] ** 2
     chi2, k = float((y2 / (variance + s2)).sum()), int(carried.sum())
-    test = PriorTest(chi2, k, float(special.chdtrc(k, chi2)) if k else 1.0)
+    test = PriorTest(chi2, k, float(scipy.special.chdtrc(k, chi2)) if k else 1.0)
     factor = _prior_factor(y2, s2, variance)
     return Weights(variance, factor, int(((factor * s) ** 2 > variance).sum()), test)
 
@@ -121,8 +121,8 @@ def outlying_points(residual: F2) -> tuple[int, ...]:
         In units of the stated uncertainty; the median length of all rows, where it is larger than that lets expect, sets the scale.
     """
     length2 = (residual**2).sum(axis=1)
-    scale = max(1.0, float(np.median(length2) / special.chdtri(SPATIAL, 0.5)))
-    limit = float(special.chdtri(SPATIAL, STRAY / max(length2.size, 1)))
+    scale = max(1.0, float(np.median(length2) / scipy.special.chdtri(SPATIAL, 0.5)))
+    limit = float(scipy.special.chdtri(SPATIAL, STRAY / max(length2.size, 1)))
     return tuple(int(i) for i in np.flatnonzero(length2 > limit * scale))
 
 
@@ -140,7 +140,7 @@ def _prior_factor(y2: F1, s2: F1, variance: float) -> float:
         return float((y2 / (variance + factor2 * s2)).sum()) - target
 
     # s^2 is above the variance here: twice the factor that s^2 alone would need is always enough.
-    return float(np.sqrt(optimize.brentq(excess, 1.0, 2.0 * at_one / target, xtol=1e-12, rtol=1e-12)))
+    return float(np.sqrt(scipy.optimize.brentq(excess, 1.0, 2.0 * at_one / target, xtol=1e-12, rtol=1e-12)))
 
 
 # Commands with their CMM points, and how such points depend on parameters and placement, in units of their uncertainty.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 
@@ -100,5 +100,5 @@ def residual_statistics(residual_mm: F1, df_res: int, repeat_sd_mm: float, repea
     variance = float((residual**2).sum()) / df_res
     ratio = variance / repeat_sd_mm**2
     return ResidualStatistics(
-        float(np.sqrt(variance)), float(np.abs(residual).max()), ratio, float(special.fdtrc(df_res, repeat_dof, ratio))
+        float(np.sqrt(variance)), float(np.abs(residual).max()), ratio, float(scipy.special.fdtrc(df_res, repeat_dof, ratio))
     )

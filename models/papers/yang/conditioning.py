@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.papers.yang.simplified import ZConvention, matrix_of
@@ -107,7 +107,7 @@ def conditioning(a: F2) -> Conditioning:
     """
     if np.ndim(a) != 2 or not np.size(a) or not np.isfinite(a).all() or not np.any(a):
         raise ValueError(f"conditioning: the design of shape {np.shape(a)} must be finite and show at least one parameter")
-    s = linalg.svd(unit_columns(a)[0], compute_uv=False)
+    s = scipy.linalg.svd(unit_columns(a)[0], compute_uv=False)
     rank = int((s > RANK_TOLERANCE * s[0]).sum())
     return Conditioning(s, rank, float(s[0] / s[rank - 1]))
 
@@ -131,10 +131,10 @@ def spread(a: F2) -> Spread:
         The design has not full rank.
     """
     unit, factor = unit_columns(a)
-    _, r = linalg.qr(unit, mode="economic")
+    _, r = scipy.linalg.qr(unit, mode="economic")
     if np.abs(np.diag(r)).min() < RANK_TOLERANCE:
         raise ValueError("the design has not full rank: some combination of its parameters has no finite uncertainty")
-    inverse = linalg.solve_triangular(r, np.eye(a.shape[1])) * factor[:, None]
+    inverse = scipy.linalg.solve_triangular(r, np.eye(a.shape[1])) * factor[:, None]
     covariance = inverse @ inverse.T
     sigma: F1 = np.sqrt(np.diag(covariance))
     return Spread(sigma, np.asarray(covariance / np.outer(sigma, sigma)))

@@ -10,7 +10,7 @@ from dataclasses import astuple, dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -121,10 +121,10 @@ def fit_eq9(points_mm: F2, origin_mm: F1, delta_r_mm: F1, radius_mm: float, *, z
     scale = np.linalg.norm(a, axis=0)
     if not (scale > 0).all():
         raise ValueError("eq (9): the points do not leave a plane or line through the centre, some parameters are not seen")
-    q, r = linalg.qr(a / scale, mode="economic")
+    q, r = scipy.linalg.qr(a / scale, mode="economic")
     if np.abs(np.diag(r)).min() < 1e-9:
         raise ValueError("eq (9): the points do not determine the six parameters")
-    x = linalg.solve_triangular(r, q.T @ delta_r_mm) / scale
-    inverse = linalg.solve_triangular(r, np.eye(6)) / scale[:, None]
+    x = scipy.linalg.solve_triangular(r, q.T @ delta_r_mm) / scale
+    inverse = scipy.linalg.solve_triangular(r, np.eye(6)) / scale[:, None]
     warnings = (PRINTED_WARNING,) if z_convention == "workpiece" else ()
     return SixFit(SixParameters(*(float(v) for v in x)), inverse @ inverse.T, np.asarray(delta_r_mm - a @ x), warnings)

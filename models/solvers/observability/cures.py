@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
@@ -402,4 +402,4 @@ def _known_with(campaign: CampaignLayout, runs: tuple[RunData, ...], setup: Setu
 
 
 def _upper(shown: F2) -> F2:
-    return np.asarray(linalg.qr(shown, mode="r", check_finite=False)[0][: shown.shape[1]])
+    return np.asarray(scipy.linalg.qr(shown, mode="r", check_finite=False)[0][: shown.shape[1]])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
@@ -334,7 +334,7 @@ def _effect(family: Family, field: F2, factor: F1, prior_sd: F1) -> float:
 def _typical(family: Family, prior_sd: F1) -> F2:
     """Factor of the prior covariance restricted to these combinations: columns of one standard deviation each, own units."""
     scaled = family.vectors / prior_sd[:, None]
-    q, _ = linalg.qr(scaled, mode="economic", check_finite=False)
+    q, _ = scipy.linalg.qr(scaled, mode="economic", check_finite=False)
     return np.asarray(q * prior_sd[:, None])
 
 
@@ -342,7 +342,7 @@ def _group(
     terms: tuple[Term, ...], family: Family, seen: ObservedInformation, tried: list[CureTrial], effect_mm: float, prior_sd: F1
 ) -> HiddenGroup:
     count = family.vectors.shape[1]
-    coordinates = linalg.qr(seen.null_space.T @ (family.vectors / seen.factor[:, None]), mode="economic", check_finite=False)[0]
+    coordinates = scipy.linalg.qr(seen.null_space.T @ (family.vectors / seen.factor[:, None]), mode="economic", check_finite=False)[0]
     shown = [(t.addition, t.shows(coordinates)) for t in tried]
     full = [a for a, n in shown if n == count]
     one = family.vectors[:, 0] / np.linalg.norm(family.vectors[:, 0] / prior_sd)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term
@@ -147,7 +147,7 @@ def compressed(columns: CampaignColumns) -> CampaignColumns:
     whole = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1)
     unit, factor = unit_columns(whole)
     if whole.shape[0] > whole.shape[1]:
-        unit = linalg.qr(unit, mode="r", check_finite=False)[0][: whole.shape[1]]
+        unit = scipy.linalg.qr(unit, mode="r", check_finite=False)[0][: whole.shape[1]]
     r = unit / factor
     p = columns.machine.shape[1]
     return CampaignColumns(r[:, :p], r[:, p : p + 3], r[:, p + 3 :], columns.setup_names)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term
@@ -113,7 +113,7 @@ def frame_free_design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2, re
     """Deviation per unit of every coefficient with the best-fit rigid motion over ``reference_mm`` removed, shape (n, 3, p)."""
     at_reference = design(machine, terms, reference_mm).reshape(-1, len(terms))
     centre = reference_mm.mean(axis=0)
-    rigid = linalg.lstsq(rigid_design(reference_mm).reshape(-1, 6), at_reference, check_finite=False)[0]
+    rigid = scipy.linalg.lstsq(rigid_design(reference_mm).reshape(-1, 6), at_reference, check_finite=False)[0]
     motion = _rigid_about(axes_mm, centre)
     return np.asarray(design(machine, terms, axes_mm) - motion @ rigid)
 
