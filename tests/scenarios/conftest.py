@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from abbe.service.cli import run
 from tests import hardware
 from tests.patience import within
 
@@ -80,6 +81,19 @@ def start_sims(tmp_path: Path) -> Iterator[Callable[..., Sims]]:
             return running.enter_context(simulated(tmp_path, *args, extra=extra))
 
         yield start
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Run `abbe ...` in this process, in the test's folder: exit code, stdout, stderr. A process of its own takes seconds to start."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        code = run([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return call
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 
 import pytest
 
-from abbe.service.cli import run
 from tests.scenarios.conftest import simulated
 from tests.scenarios.world import bar_chunks, laser_chunks, position_and_counters, runs_of, wait_for
 
@@ -19,19 +18,6 @@ def still(tmp_path_factory):
     """One simulated machine that no test may move."""
     with simulated(tmp_path_factory.mktemp("still"), "--speed", "60") as sims:
         yield sims
-
-
-@pytest.fixture
-def abbe(tmp_path, monkeypatch, capsys):
-    """The command line in this process, in the test's folder: exit code, output, errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words):
-        capsys.readouterr()
-        code = run(list(words))
-        return code, *capsys.readouterr()
-
-    return call
 
 
 def one_line(ended, code, *words):
@@ -61,32 +47,32 @@ def meanwhile(condition, what, do):
     assert done, what
 
 
-def test_missing_machine_file(abbe):
-    one_line(abbe("measure", "nowhere.toml"), "CFG-001", "nowhere.toml")
+def test_missing_machine_file(command):
+    one_line(command("measure", "nowhere.toml"), "CFG-001", "nowhere.toml")
 
 
-def test_unknown_key_names_the_nearest_valid_one(abbe, tmp_path, still):
+def test_unknown_key_names_the_nearest_valid_one(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text() + "[limits]\ntable_valu_um = 5\n")
-    one_line(abbe("measure", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
+    one_line(command("measure", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
 
 
-def test_port_refused(abbe, tmp_path, still):
+def test_port_refused(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text().replace(still.ready["cnc"], "modbus+tcp://127.0.0.1:9?unit=1"))
-    one_line(abbe("measure", "machine.toml"), "DRV-002", "127.0.0.1:9")
+    one_line(command("measure", "machine.toml"), "DRV-002", "127.0.0.1:9")
 
 
-def test_a_path_beyond_the_stroke_moves_nothing(abbe, tmp_path, still):
+def test_a_path_beyond_the_stroke_moves_nothing(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text())
     before = position_and_counters(still)
-    one_line(abbe("measure", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
+    one_line(command("measure", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
     assert position_and_counters(still) == before
     assert not (tmp_path / "abbe.sqlite3").exists() or runs_of(tmp_path) == []
 
 
-def test_ball_bar_unplugged_in_mid_run(abbe, start_sims):
+def test_ball_bar_unplugged_in_mid_run(command, start_sims):
     sims = start_sims("--speed", "10")
     with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask("unplug_ballbar")):
-        ended = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,150")
+        ended = command("measure", str(sims.machine_file), "--helix", "300,250,100,150")
     one_line(ended, "DRV-002", "unplugged")
     run = runs_of(sims.machine_file.parent)[-1]
     assert run.status == "failed"
@@ -94,12 +80,12 @@ def test_ball_bar_unplugged_in_mid_run(abbe, start_sims):
     assert bar_chunks(sims.machine_file.parent) > 5  # what was measured is kept
 
 
-def test_laser_beam_lost(abbe, start_sims):
+def test_laser_beam_lost(command, start_sims):
     sims = start_sims("--speed", "20")
     # The first readings of a line of 42 are stored: the beam goes while it is being read, not while it is zeroed for the next one.
     first = (lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, "the first readings of a laser line")
     with meanwhile(*first, lambda: sims.ask("beam", blocked=True)):
-        ended = abbe("measure", str(sims.machine_file), "--recipe", "verification")
+        ended = command("measure", str(sims.machine_file), "--recipe", "verification")
     one_line(ended, "ILK-007", "beam")
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")
@@ -107,17 +93,17 @@ def test_laser_beam_lost(abbe, start_sims):
 
 
 @pytest.mark.parametrize(("fault", "word"), [("estop", "e-stop"), ("door", "door")])
-def test_an_interlock_stops_the_run(abbe, start_sims, fault, word):
+def test_an_interlock_stops_the_run(command, start_sims, fault, word):
     sims = start_sims("--speed", "10")
     with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask(fault, on=True)):
-        code, _, err = abbe("measure", str(sims.machine_file), "--helix", "300,250,100,150")
+        code, _, err = command("measure", str(sims.machine_file), "--helix", "300,250,100,150")
     assert code == 2
     last = err.strip().splitlines()[-1]
     assert last.startswith("error ")
     assert word in last
 
 
-def test_nan_in_a_run_file_imports_nothing(abbe, shared, tmp_path):
+def test_nan_in_a_run_file_imports_nothing(command, shared, tmp_path):
     source = shared / "data" / "axis-tests" / "week42-x"
     folder = tmp_path / "damaged"
     folder.mkdir()
@@ -126,6 +112,6 @@ def test_nan_in_a_run_file_imports_nothing(abbe, shared, tmp_path):
     run = json.loads((folder / "r02.json").read_text())
     run["columns"]["deviation_mm"][3] = float("nan")
     (folder / "r02.json").write_text(json.dumps(run))
-    one_line(abbe("import", str(folder)), "FMT-001", "r02.json", "deviation_mm")
-    code, out, err = abbe("runs", "--json")
+    one_line(command("import", str(folder)), "FMT-001", "r02.json", "deviation_mm")
+    code, out, err = command("runs", "--json")
     assert code == 2 or json.loads(out) == [], err

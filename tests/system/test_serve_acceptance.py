@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
+import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.registry import open_controller
+from abbe.service import cli
 from abbe.service.config import load_machine
 from abbe.service.storage.store import Store
 from tests.system.serve_bench import Broker, Machine, abbe, free_port, payload
@@ -137,24 +138,43 @@ def test_the_machine_goes_away_and_the_service_says_so(tmp_path: Path, ending: E
     assert running.terminate()[0] == 0
 
 
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, ending: ExitStack) -> None:
-    broker = Broker(tmp_path)
-    ending.callback(lambda: broker.process.close())
-    machine = Machine(tmp_path, SPEED, *sections(broker, free_port(), "0 6 * * 1"))
-    machine.process.close()
-    good = machine.file.read_text()
-    cases = {
-        'recipe = "no-such"': good.replace('recipe = "quick-check"', 'recipe = "no-such"'),
-        "0.0.0.0": good.replace("[web]", '[web]\nhost = "0.0.0.0"'),
-        "cron": good.replace("0 6 * * 1", "0 25 * * 1"),
-    }
-    for text in cases.values() if os.environ.get("ABBE_TEST_LONG") else [cases["cron"]]:  # each is a start of the whole program
-        machine.file.write_text(text)
-        wrong = abbe("serve", machine.file)
-        assert wrong.wait() == 2
-        assert len(wrong.lines) == 1, wrong.lines
-        assert wrong.lines[0].startswith("error CFG-001: ")
-    machine.file.write_text(good)
-    taken = abbe("serve", machine.file, "--port", str(broker.port))
-    assert taken.wait() == 2
+GOOD = """
+name = "mill-7"
+chain = "w-X-Y-b-Z-t"
+stroke_mm = {X = [0, 600], Y = [0, 500], Z = [0, 450]}
+[devices]
+cnc = "modbus+tcp://127.0.0.1:1502"
+ballbar = "socket://127.0.0.1:4001"
+laser = "modbus+rtu:///dev/ttyS0?baud=115200"
+fixture = "fixture+tcp://127.0.0.1:4002"
+[web]
+port = 0
+[[schedule]]
+name = "often"
+cron = "0 6 * * 1"
+recipe = "quick-check"
+"""
+BAD = {
+    "no-such": GOOD.replace('recipe = "quick-check"', 'recipe = "no-such"'),
+    "0.0.0.0": GOOD.replace("[web]", '[web]\nhost = "0.0.0.0"'),
+    "cron": GOOD.replace("0 6 * * 1", "0 25 * * 1"),
+}
+
+
+@pytest.mark.parametrize("told", BAD)
+def test_a_bad_machine_file_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: str) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(BAD[told])
+    assert cli.run(["serve", str(file)]) == 2
+    out, err = capsys.readouterr()
+    assert (out, len(err.splitlines()), err.startswith("error CFG-001: ")) == ("", 1, True), err
+    assert told in err
+
+
+def test_a_port_that_is_taken_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(GOOD)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = abbe("serve", file, "--port", str(other.getsockname()[1]))
+        assert taken.wait() == 2
     assert [line for line in taken.lines if line.startswith("error ")] == taken.lines

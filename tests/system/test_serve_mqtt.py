@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -94,7 +95,7 @@ def test_the_broker_says_offline_when_the_service_is_killed(tmp_path: Path, endi
     assert payload(receiver.expect('"state":"offline"'))["machine"] == "mill-7"
 
 
-@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("lost", [False, True] if os.environ.get("ABBE_TEST_LONG") else [True])
 def test_a_defect_ends_the_service_with_a_traceback_and_a_farewell(tmp_path: Path, ending: ExitStack, lost: bool) -> None:
     """systemd starts it again; the slot is claimed, so that the defect is not met a second time at once.
 
