@@ -4,37 +4,25 @@ from __future__ import annotations
 
 import typer
 
-from abbe.service.cli.administration.alarm import alarm
-from abbe.service.cli.administration.audit import audit
-from abbe.service.cli.administration.audited import record_all
+from abbe.service.cli.administration.audit import audit, record_all
 from abbe.service.cli.administration.backup import backup, restore
-from abbe.service.cli.administration.configuration import check_config, schema
-from abbe.service.cli.administration.fleet import fleet
-from abbe.service.cli.administration.key import key
+from abbe.service.cli.administration.checks import alarm, fleet, trend
 from abbe.service.cli.administration.serve import serve
-from abbe.service.cli.administration.system import SIM_SETTINGS, sim, version
-from abbe.service.cli.administration.user import user
+from abbe.service.cli.administration.system import SIM_SETTINGS, check_config, schema, sim, version
+from abbe.service.cli.administration.user import key, user
 from abbe.service.cli.demo import demo
-from abbe.service.cli.errors import errors
-from abbe.service.cli.listen import listen
-from abbe.service.cli.measure import correct, measure
+from abbe.service.cli.measure import correct, listen, measure
 from abbe.service.cli.plan import plan
 from abbe.service.cli.reference import papers, vectors
 from abbe.service.cli.results.discover import discover
-from abbe.service.cli.results.effects import effects
-from abbe.service.cli.results.exchange import export_campaign, import_campaign
-from abbe.service.cli.results.model import model
+from abbe.service.cli.results.model import effects, model
 from abbe.service.cli.results.report import report
-from abbe.service.cli.results.show import runs, show
-from abbe.service.cli.results.simulate import simulate
-from abbe.service.cli.results.solve import solve
-from abbe.service.cli.results.solve_all import solve_all
-from abbe.service.cli.results.trend import trend
+from abbe.service.cli.results.show import export_campaign, import_campaign, runs, show
+from abbe.service.cli.results.simulate import errors, simulate
+from abbe.service.cli.results.solve import solve, solve_all
 from abbe.service.cli.tables.comp import comp
-from abbe.service.cli.tables.comp_commission import commission
 from abbe.service.cli.tables.comp_proposals import approve, diff, propose, reject, show_proposals
-from abbe.service.cli.tables.comp_push import push, rollback
-from abbe.service.cli.tables.table import accept_table
+from abbe.service.cli.tables.comp_push import accept_table, commission, push, rollback
 
 app = typer.Typer(
     name="abbe",

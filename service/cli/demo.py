@@ -46,8 +46,7 @@ def demo(
         return
     from rich.console import Console
 
-    from abbe.service.cli.progress import display
-    from abbe.service.cli.running import run_job
+    from abbe.service.cli.running import display, run_job
     from abbe.service.demo.demo import run_demo
     from abbe.service.demo.demo_report import demo_json, demo_report
     from abbe.service.demo.demo_serve import run_served_demo
@@ -74,10 +73,8 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     """Run a discovery; only the simulator knows the effect behind the seed."""
     from rich.console import Console
 
-    from abbe.service.cli.progress import display
-    from abbe.service.cli.running import run_job
-    from abbe.service.demo.demo_hidden import run_hidden_demo
-    from abbe.service.demo.demo_hidden_text import hidden_json, summary_lines
+    from abbe.service.cli.running import display, run_job
+    from abbe.service.demo.demo_hidden import hidden_json, run_hidden_demo, summary_lines
     from abbe.service.rendering.document_page import write_document
     from abbe.service.report.report_discovery import found_report
 

@@ -1,4 +1,4 @@
-"""`abbe measure` and `abbe correct`: measure and correct by hand, on the devices of a machine file."""
+"""`abbe measure`, `abbe correct` and `abbe listen`: measure and correct by hand, on the devices of a machine file."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
+
 
 MachineArgument = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
 AcceptTable = Annotated[
@@ -147,7 +148,7 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
     from abbe.service.campaigns.measure import measure as work
     from abbe.service.campaigns.resume import resume as find
     from abbe.service.cli.ask import console_confirm
-    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import display
 
     async def yes(_: str) -> bool:
         return True
@@ -183,8 +184,7 @@ def correct(
     accept_table: AcceptTable = False,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; roll back to the old table if the machine is not better (exit code 1)."""
-    from abbe.service.cli.running import run_job
-    from abbe.service.cli.waiting import rollback_when_safe
+    from abbe.service.cli.running import rollback_when_safe, run_job
     from abbe.service.compensation.correct import Correction
     from abbe.service.compensation.correct import correct as work_correct
     from abbe.service.compensation.gate import PushContext, check_preconditions
@@ -201,7 +201,7 @@ def correct(
     hints: list[str] = []
 
     async def work(store: Store) -> Correction:
-        from abbe.service.cli.progress import display
+        from abbe.service.cli.running import display
 
         store.campaigns.find(campaign)
         with display() as sink:
@@ -279,3 +279,35 @@ def warn_of_open_push(url: str, site: Site) -> None:
         warnings = open_pushes(store, site.name, site.control)
     for line in warnings:
         typer.echo(f"warning: {line}", err=True)
+
+
+def listen(
+    machine: MachineArgument,
+    recipe: Annotated[Path, typer.Option(metavar="FILE.toml", help="The recipe that the NC program was written from; laser tests.")],
+    name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
+    accept_table: AcceptTable = False,
+) -> None:
+    """Listen to the laser while the operator runs the NC program of a recipe; its standstills become the readings."""
+    from abbe.service.campaigns.listen import listen_campaign
+    from abbe.service.cli.running import run_job
+    from abbe.service.clock import SystemClock
+    from abbe.service.config import load_machine
+    from abbe.service.sequences.check import paced
+    from abbe.service.sequences.recipes.recipe_file import read_recipe
+    from abbe.service.sequences.steps import CampaignPlan
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+
+    loaded = load_machine(machine)
+    site = site_of(loaded.machine)
+    title, recipes = read_recipe(recipe)
+    plan = CampaignPlan(title, tuple(r.plan(site.machine) for r in recipes))
+    plan = replace(paced(plan, site.max_feed_mm_min), name=name or f"{title} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
+
+    async def work(store: Store) -> None:
+        async with ready_session(store, site, accept_table=accept_table) as session:
+            await listen_campaign(session, store, site, plan, lambda text: typer.echo(text))
+
+    with Store.open(loaded.database_url) as store:
+        run_job(work(store))
+    typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")

@@ -32,7 +32,7 @@ def plan(
 ) -> None:
     """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
     from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report, read_instruments
-    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import display
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import form_of, write_document
     from abbe.service.rendering.page_file import write_page

@@ -1,4 +1,4 @@
-"""Run a job that moves axes: any signal that ends this process first cancels the job, so that the axes stop."""
+"""Run a job at the console: signals that stop the axes first, the display of progress, and the wait for a safe machine."""
 
 from __future__ import annotations
 
@@ -7,12 +7,23 @@ import errno
 import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import typer
 
 from abbe.service.errors import Stopped
 from abbe.service.sequences.control import Control
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+    from abbe.service.devices.session import Session
+    from abbe.service.domain.progress import Progress, ProgressSink
+    from abbe.service.site import Site
+    from abbe.service.storage.store import Store
+
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP")
 T = TypeVar("T")
@@ -94,3 +105,88 @@ def _handled(stop: Handler, names: tuple[str, ...]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def display() -> Iterator[ProgressSink]:
+    """Yield a sink for progress: a bar with ETA on a terminal, one line per stage elsewhere."""
+    from rich.console import Console
+
+    log = Console(stderr=True)
+    if not log.is_terminal:
+        last = ["", ""]
+
+        def plain(p: Progress) -> None:
+            waits = _waits(p)
+            if p.stage != last[0]:
+                last[0] = p.stage
+                log.print(f"{p.stage}: {p.message}", highlight=False)
+            if waits and waits != last[1]:
+                log.print(f"{p.stage}: {waits}", highlight=False)
+            last[1] = waits
+
+        yield plain
+        return
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns: tuple[Any, ...] = (
+        TextColumn("{task.fields[stage]:<14}"),
+        BarColumn(),
+        TextColumn("{task.fields[eta]:>9}"),
+        TimeElapsedColumn(),
+    )
+    with Bars(*columns, TextColumn("{task.description}"), console=log) as bars:
+        tasks: dict[str, Any] = {}
+
+        def live(p: Progress) -> None:
+            if p.stage not in tasks:
+                tasks[p.stage] = bars.add_task(p.message, stage=p.stage, eta="", total=p.total)
+            eta = "" if p.eta_s is None else f"{p.eta_s:.0f} s left"
+            bars.update(tasks[p.stage], completed=p.done, description=_waits(p) or p.message, eta=eta)
+
+        yield live
+
+
+def _waits(p: Progress) -> str:
+    """Return what a measurement waits for; empty while it runs."""
+    return f"{p.state}: {p.why}" if p.state in ("paused", "suspended") else ""
+
+
+@asynccontextmanager
+async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s: float) -> AsyncIterator[None]:
+    """If a job ends in `StillActive`, wait at the console and roll back as soon as that is safe (exit code 1).
+
+    Without a console, or with ``wait_s`` 0, the error is raised: the next start of any command rolls back first. Ctrl-C ends the wait with
+    the same consequence.
+    """
+    from abbe.service.clock import SystemClock
+    from abbe.service.compensation.recover import finish_when_safe
+    from abbe.service.errors import StillActive
+
+    try:
+        yield
+    except StillActive as error:
+        if wait_s <= 0.0 or not sys.stdin.isatty():
+            raise
+        notes = list(getattr(error, "__notes__", []))
+        say("; ".join([str(error), *notes]) + "\a")
+        say("make the machine ready: Abbe restores the old table as soon as that is safe; Ctrl-C ends the wait")
+        try:
+            done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), notify=say)
+        except asyncio.CancelledError as ended:
+            ended.add_note("the unverified table is STILL ACTIVE; the next abbe command takes it back before anything else")
+            raise
+        except Exception as ended:
+            for note in (*notes, "the unverified table may still be active; the next abbe command takes it back before anything else"):
+                ended.add_note(note)
+            raise
+        say(f"rolled back: {done or 'nothing was left to take back'}")
+        for note in notes:  # cup and bar may still be mounted
+            say(note)
+        raise typer.Exit(1) from None
+
+
+def say(text: str) -> None:
+    """Print one line on stderr."""
+    typer.echo(text, err=True)

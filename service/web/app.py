@@ -20,11 +20,11 @@ from abbe.service.queries.status import Status, StatusSource
 from abbe.service.storage.store import Store
 from abbe.service.users.roles import Permission
 from abbe.service.web import problems
-from abbe.service.web.api.install import add_api
+from abbe.service.web.api.measured import add_measured, add_plant
+from abbe.service.web.api.results import add_reports, add_results
 from abbe.service.web.api.sources import Sources
-from abbe.service.web.api.table_orders import add_table_orders
+from abbe.service.web.api.tables import add_table_orders, add_tables
 from abbe.service.web.core_link.core_line import CoreLine
-from abbe.service.web.core_link.core_unavailable import add_core_unavailable
 from abbe.service.web.document import SecurityHeaders, complete
 from abbe.service.web.frame import FrameMiddleware
 from abbe.service.web.jobs import add_jobs
@@ -37,13 +37,20 @@ from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
 from abbe.service.web.page import HERE, ICON, environment, render
 from abbe.service.web.pages.context import PageContext
-from abbe.service.web.pages.live import add_live_page
-from abbe.service.web.pages.new import add_new_page
+from abbe.service.web.pages.new import add_live_page, add_new_page
 from abbe.service.web.pages.plant_screens import add_plant_screens
+from abbe.service.web.pages.proposals import add_table_screen
 from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.pages.routes import add_pages
-from abbe.service.web.pages.table import add_table_screen
+from abbe.service.web.problems import add_core_unavailable
 from abbe.service.web.schemas import Health, LatestChecks, Problem
+
+
+def add_api(app: FastAPI, sources: Sources) -> None:
+    """Add every route of the interface to the application itself: the auth middleware reads permissions from the application's routes."""
+    for add in (add_measured, add_results, add_tables, add_plant, add_reports):
+        add(app, sources)
+
 
 PAGE_ROWS = 60
 

@@ -13,8 +13,7 @@ import signal
 
 import pytest
 
-from abbe.service.demo.demo_hidden import ANEW, CAMPAIGN, run_hidden_demo
-from abbe.service.demo.demo_hidden_text import judged, summary_lines
+from abbe.service.demo.demo_hidden import ANEW, CAMPAIGN, judged, run_hidden_demo, summary_lines
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.storage.store import Store
 from abbe.simulators.hidden.suite import packaged, picked

@@ -1,4 +1,4 @@
-"""`abbe user`: users of the page and the interface, and their roles."""
+"""`abbe user`: users of the page and the interface, and their roles; `abbe key`: keys that sign compensation files."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 if TYPE_CHECKING:
     from abbe.service.storage.store import Store
     from abbe.service.users.people import People
+
 
 user = typer.Typer(help="Users of the page and of the interface: viewer, operator, metrologist, approver, admin.", no_args_is_help=True)
 token = typer.Typer(help="Tokens of programs: the rights of a user, at most those of their scopes.", no_args_is_help=True)
@@ -141,3 +142,18 @@ def _password() -> str:
     if getpass.getpass("again: ") != first:
         raise PasswordRefused("the two passwords differ", "type it again")
     return first
+
+
+key = typer.Typer(help="Keys that sign compensation files.", no_args_is_help=True)
+
+
+@key.command("new")
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="New file for the private key.", show_default=False)],
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Create a key. The private one stays in FILE, readable by its owner only; the public one is printed, for [signatures] trusted."""
+    from abbe.service.signed.keys import new_key
+
+    typer.echo(new_key(file))

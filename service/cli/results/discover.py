@@ -151,8 +151,7 @@ def _run_live(
 def _measured(store: Store, site: Site, campaign: Campaign, addition: Addition, *, accept_table: bool) -> float:
     """Run the rest of an added measurement on the machine; a stop reports what is kept. Return the seconds to wait, or 0."""
     from abbe.service.cli.measure import ready_session
-    from abbe.service.cli.progress import display
-    from abbe.service.cli.running import run_job
+    from abbe.service.cli.running import display, run_job
     from abbe.service.discovery.discover_live import measure_added
 
     if addition.begun is not None:
@@ -175,7 +174,7 @@ def _measured(store: Store, site: Site, campaign: Campaign, addition: Addition, 
 
 def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
     """Return the finding, with progress on stderr; Ctrl-C reports what is kept."""
-    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import display
     from abbe.service.discovery.discover import discover as work
     from abbe.service.discovery.discovery_engine import search
 

@@ -1,4 +1,4 @@
-"""`abbe model`: the model book of a machine - list, show, compare, revert."""
+"""`abbe model`: the model book of a machine - list, show, compare, revert; `abbe effects`: the catalogue of effects."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from abbe.service.domain.model_book import ModelVersion
     from abbe.service.effects.model_book import LabelSize
     from abbe.service.storage.store import Store
+
 
 model = typer.Typer(
     help="The model book of a machine: versions with their effects, where each came from, and how to revert.", no_args_is_help=True
@@ -130,3 +131,29 @@ def _doc(found: ModelVersion) -> dict[str, Any]:
     from abbe.service.domain.document import document
 
     return {"machine": found.machine, "version": found.version, "created_utc": found.created_utc} | document(found.book)
+
+
+def effects(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="One effect; without it all are listed.", show_default=False)] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""
+    from abbe.service.discovery.effect_pages import HEADINGS, effect_doc, effect_lines, effect_row
+    from abbe.service.effects.axis_test import SLOW_DRIFT
+    from abbe.service.effects.effect_catalogue import catalogue, effect_named, plugins
+
+    for broken in plugins().broken:
+        typer.echo(f"{broken.code}: {broken}", err=True)
+    if name is None:
+        found = (*catalogue(), SLOW_DRIFT)
+        if as_json:
+            print_json([effect_doc(e) for e in found])
+            return
+        print_table(HEADINGS, [effect_row(e) for e in found])
+        typer.echo("one effect's page: abbe effects NAME")
+        return
+    effect = effect_named(name)
+    if as_json:
+        print_json(effect_doc(effect))
+        return
+    print_table((effect.name, ""), effect_lines(effect))

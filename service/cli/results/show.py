@@ -1,15 +1,53 @@
-"""``abbe runs`` and ``abbe show``: the measured runs and campaigns."""
+"""`abbe runs`, `show`, `export` and `import`: campaigns and runs of a database."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, run_or_campaign
 
 if TYPE_CHECKING:
-    from abbe.service.domain.measured import ChunkRecord, RunRecord
+    from abbe.service.domain.measured import CampaignRecord, ChunkRecord, RunRecord
+    from abbe.service.sequences.journal import Trouble
+    from abbe.service.storage.store import Store
+
+
+def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> None:
+    """Print a campaign: one line for each run, one for each kind of incident and how it ended."""
+    from abbe.service.sequences.journal import not_written, troubles
+
+    runs, journal = store.runs.all(campaign.id), store.checkpoints.of_campaign(campaign.id)
+    found, lost = troubles(journal), not_written(journal)
+    who = {"number": campaign.id, "campaign": campaign.name, "machine": store.machines.get(campaign.machine_id).name}
+    who |= {"created_utc": campaign.created_utc}
+    if as_json:
+        states = [{"number": one.id, "run_id": one.label, "test": one.test, "status": one.visible_status} for one in runs]
+        print_json(who | {"runs": states, "incidents": [one.doc() for one in found], "incidents_not_written": lost})
+        return
+    print_table(("key", "value"), [(key, str(value)) for key, value in who.items()], title=f"campaign {campaign.name}")
+    rows = [(str(one.id), one.label, one.test, one.visible_status, one.reason) for one in runs]
+    print_table(("number", "run", "test", "status", "reason"), rows, title="runs")
+    if journal:  # an imported campaign has no journal
+        _incidents(found, lost)
+
+
+def _incidents(found: list[Trouble], lost: int) -> None:
+    if found:
+        heads = ("link", "code", "times", "how it ended", "runs", "latest")
+        print_table(heads, [_row(one) for one in found], title=f"incidents of the links: {sum(one.times for one in found)}")
+    else:
+        typer.echo("no incident of a link")
+    if lost:
+        typer.echo(f"{lost} incidents could not be written: the database was locked or gone")
+
+
+def _row(one: Trouble) -> tuple[str, ...]:
+    doc: dict[str, Any] = one.doc()
+    ends = ", ".join(f"{state} {count}" for state, count in doc["ends"].items())
+    return (one.link, one.code, str(one.times), ends, ", ".join(one.runs), one.last)
 
 
 def runs(
@@ -42,7 +80,7 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show one run: state, set-up and statistics of its columns (--json: as an exchange file). Or a campaign: runs and incidents."""
-    from abbe.service.cli.results.show_campaign import show_campaign
+    from abbe.service.cli.results.show import show_campaign
     from abbe.service.domain.measured import RunRecord
     from abbe.service.queries.measured import run_summary
     from abbe.service.queries.reader import json_value
@@ -100,3 +138,32 @@ def _statistics(key: str, values: list[float] | None) -> tuple[str, ...]:
     if not values:
         return (key, "sealed" if values is None else "0", "", "", "")
     return (key, str(len(values)), f"{min(values):.9g}", f"{max(values):.9g}", f"{sum(values) / len(values):.9g}")
+
+
+def export_campaign(
+    campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Name or number of the campaign.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.", show_default=False)],
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Write a campaign as a folder with campaign.json and one file a run."""
+    from abbe.service.runs.exchange import export_folder
+
+    with open_store(database_url(db, machine)) as store:
+        written = export_folder(store, campaign, folder)
+        count = len(store.runs.all(store.campaigns.find(campaign).id))
+    typer.echo(f"exported campaign {campaign!r} with {count} runs to {written}")
+
+
+def import_campaign(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with campaign.json.", show_default=False)],
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Check a campaign folder and store it: all of it or, after any mistake, nothing."""
+    from abbe.service.runs.exchange import import_folder, read_folder
+
+    read_folder(folder)  # before a database is created
+    with open_store(database_url(db, machine), must_exist=False) as store:
+        record = store.campaigns.find(import_folder(store, folder))
+        typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")

@@ -1,7 +1,8 @@
-"""`abbe simulate`: the present model's prediction of every run, beside the measurement."""
+"""`abbe simulate` and `abbe errors`: readings, and actual positions of the tool, from known errors."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from abbe.service.cli.results.discover import opened
 if TYPE_CHECKING:
     from abbe.service.discovery.discover import DiscoveryJob
     from abbe.service.discovery.simulate import Simulation
+    from abbe.service.verification.deviations import Deviations
 
 
 def simulate(
@@ -30,7 +32,7 @@ def simulate(
 
     The present model is the campaign's, with the effects of the machine's model book.
     """
-    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import display
     from abbe.service.discovery.discover import prepare
     from abbe.service.discovery.simulate import simulate as work
     from abbe.service.discovery.simulate import simulation_doc
@@ -54,7 +56,7 @@ def simulate(
     if as_json:
         print_json(simulation_doc(job, simulation))
         return
-    _print(job, simulation)
+    _print_simulation(job, simulation)
     if report is not None:
         typer.echo(f"report: {report}")
 
@@ -70,7 +72,7 @@ def _write_report(job: DiscoveryJob, simulation: Simulation, target: Path) -> No
     write_document(simulation_report(job, finding, verdict_line(finding), made), target)
 
 
-def _print(job: DiscoveryJob, simulation: Simulation) -> None:
+def _print_simulation(job: DiscoveryJob, simulation: Simulation) -> None:
     from abbe.service.discovery.simulate import simulated_finding, verdict_line
     from abbe.service.rendering.numbers import plain
 
@@ -86,3 +88,51 @@ def _print(job: DiscoveryJob, simulation: Simulation) -> None:
     headings = ("run", "test", "role", "readings", "measured - simulated, rms (µm)", "noise (µm)", "times the noise")
     print_table(headings, rows)
     typer.echo(" ".join(verdict_line(found)[1:]))
+
+
+ROWS = 20
+
+
+def errors(
+    machine: Annotated[Path, typer.Option("--machine", metavar="FILE", help="Machine file (TOML), or a machine object (TOML or JSON).")],
+    errors_file: Annotated[Path, typer.Option("--errors", metavar="FILE", help="Error functions (abbe-errors/1).")],
+    points: Annotated[Path, typer.Option("--points", metavar="FILE", help="CSV: x_mm,y_mm,z_mm; optional direction_x.., tool_x_mm..")],
+    exact: Annotated[bool, typer.Option("--exact", help="Finite rotations instead of first order.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Deviation of the tool at points, for a machine whose error functions are known. Points outside the strokes are refused."""
+    from abbe.service.verification.deviations import deviations, deviations_json
+
+    found = deviations(machine, errors_file, points, exact=exact)
+    if as_json:
+        for piece in deviations_json(found):  # one line: indenting a hundred thousand points takes seconds
+            sys.stdout.write(piece)
+        sys.stdout.write("\n")
+    else:
+        _print_deviations(found)
+
+
+def _print_deviations(found: Deviations) -> None:
+    from abbe.service.verification.deviations import MEANING
+
+    count, norm, u = len(found.points.lines), found.norm_mm, found.u_mm
+    headings = ["x", "y", "z", "dX", "dY", "dZ", "norm"]
+    if u is not None:
+        headings += [f"U({name})" for name in headings[3:]]
+    rows = []
+    for k in range(min(count, ROWS)):
+        cells = [f"{value:g}" for value in found.points.axes_mm[k]]
+        cells += [f"{value * 1e3:.4f}" for value in (*found.deviation_mm[k], norm[k])]
+        rows.append(cells + ([] if u is None else [f"{2e3 * value:.4f}" for value in u[k]]))
+    expanded = "" if u is None else ", U = expanded uncertainty (k = 2)"
+    print_table(headings, rows, title=f"{found.machine}: deviation in µm at positions in mm, {found.model}{expanded}")
+    if count > ROWS:
+        typer.echo(f"{count - ROWS} more points; --json lists all")
+    worst = int(norm.argmax())
+    at = ", ".join(f"{value:g}" for value in found.points.axes_mm[worst])
+    spread = "" if u is None else f" (U = {2e3 * u[worst, 3]:.4f} µm)"
+    typer.echo(f"{count} points, largest deviation {norm[worst] * 1e3:.4f} µm{spread} at ({at})")
+    typer.echo(MEANING)
+    typer.echo(found.uncertainty)
+    for text in found.warnings:
+        typer.echo(f"warning: {text}")

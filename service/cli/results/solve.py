@@ -1,4 +1,4 @@
-"""`abbe solve`: identify the machine's errors from the runs of a campaign, without touching the machine."""
+"""`abbe solve` and `abbe solve-all`: identify a machine's errors from the runs of campaigns, without touching the machine."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.domain.solution_file import SolutionFile
+    from abbe.service.identification.executors import Executor
     from abbe.service.identification.solve import Solved
     from abbe.service.identification.solve_report import Assessment
     from abbe.service.storage.store import Store
@@ -138,7 +139,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
 
 def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
     """Return the account of the solution and its document, with progress on stderr."""
-    from abbe.service.cli.progress import display
+    from abbe.service.cli.running import display
     from abbe.service.domain.progress import Progress
     from abbe.service.identification.solve import solve_runs
     from abbe.service.identification.solve_report import as_doc, assess, solution_of
@@ -299,3 +300,45 @@ def _step_rows(figures: dict[str, float]) -> list[list[str]]:
         name, _, unit = key.rpartition("_")
         rows.append([name.replace("_", " "), f"{figures[key]:.2f}", f"{2 * figures['u_' + key]:.2f}", {"um": "µm", "urad": "µrad"}[unit]])
     return rows
+
+
+def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
+    pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="Campaigns by name, e.g. 'june-*'.")] = "*",
+    model: Annotated[ModelName, typer.Option("--model", help="As for abbe solve.")] = ModelName.rigid21,
+    workers: Annotated[int, typer.Option("--workers", min=1, max=256, help="Processes of this computer.")] = 1,
+    dask: Annotated[
+        str | None, typer.Option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster instead.", show_default=False)
+    ] = None,
+    store_solutions: Annotated[bool, typer.Option("--keep", help="Store each solution.")] = False,
+    db: Annotated[str | None, typer.Option("--store", "--db", metavar="URL", help="Database.", show_default=False)] = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Solve many campaigns of a database again, each exactly as abbe solve does; exit code 1 if one was refused."""
+    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.errors import NotStored
+    from abbe.service.identification.reanalysis import HEADINGS, row, tasks_of
+    from abbe.service.identification.reanalysis import solve_all as run
+
+    url = database_url(db, machine)
+    with open_store(url) as store:
+        tasks = tasks_of(store, url, pattern, model.value)
+        if not tasks:
+            raise NotStored(f"no campaign matches {pattern!r} in {store.url}", "`abbe runs` lists what there is")
+        answers = list(run(tasks, _executor(workers, dask), store if store_solutions else None))
+    if as_json:
+        print_json([answer.doc or {"campaign": answer.campaign, "refused": answer.refused} for answer in answers])
+    else:
+        print_table(HEADINGS, [row(answer) for answer in answers])
+    raise typer.Exit(1 if any(answer.doc is None for answer in answers) else 0)
+
+
+def _executor(workers: int, dask: str | None) -> Executor:
+    from abbe.service.errors import ConfigError
+    from abbe.service.identification.executors import DaskExecutor, ProcessExecutor, SerialExecutor
+
+    if dask is None:
+        return SerialExecutor() if workers == 1 else ProcessExecutor(workers)
+    if workers != 1:
+        raise ConfigError("--workers and --dask both say where to compute", "give one of them")
+    return DaskExecutor(dask)

@@ -27,8 +27,7 @@ def propose(
     """Solve a campaign and store the resulting tables as a proposal; nothing is written to the controller (exit code 1: objections)."""
     from dataclasses import replace
 
-    from abbe.service.cli.progress import display
-    from abbe.service.cli.running import run_job
+    from abbe.service.cli.running import display, run_job
     from abbe.service.compensation.proposals import gather, make
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls

@@ -18,7 +18,7 @@ from abbe.service.reference.printed import values
 from abbe.service.reference.text import minus, short
 from abbe.service.rendering.document import Picture
 from abbe.service.rendering.plots.curves import Comparison, comparison_plot
-from abbe.service.rendering.plots.facets import lobing_plot, surface_plot
+from abbe.service.rendering.plots.isometric import lobing_plot, surface_plot
 from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot
 from abbe.service.rendering.plots.volume import deformed_grid
 

@@ -1,4 +1,4 @@
-"""Routes: machines, campaigns, runs and their samples."""
+"""Routes: machines, campaigns, runs and their samples; devices, recipes, the timetable, and error codes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
 from abbe.service.queries import measured
+from abbe.service.queries.timetable import schedule_state
+from abbe.service.sequences.recipes.campaigns import RECIPES
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
+from abbe.service.web.catalogue import entries
 from abbe.service.web.login.access import needs
-from abbe.service.web.schemas import CampaignList, MachineList, RunList
+from abbe.service.web.schemas import CampaignList, DeviceList, ErrorList, MachineList, Recipe, RecipeList, RunList, Timetable
 
 JSON_ROWS = 10_000
 BINARY_ROWS = 100_000
@@ -106,3 +109,36 @@ def _add_samples(app: FastAPI, sources: Sources) -> None:
     def columns(number: Number, first: First = 0, limit: Rows = 1000) -> measured.RunColumns:
         """A stretch of the evaluated readings: position, time, deviation."""
         return measured.columns(sources.reader, number, first, limit)
+
+
+def add_plant(app: FastAPI, sources: Sources) -> None:
+    """Add the routes."""
+    machine = sources.reader.machine
+
+    @app.get("/api/v1/errors")
+    @needs(Permission.READ)
+    def errors() -> ErrorList:
+        """All error codes with their meanings."""
+        return ErrorList(errors=entries())
+
+    @app.get("/api/v1/devices")
+    @needs(Permission.READ)
+    def devices() -> DeviceList:
+        """Devices of this service's machine and the time of their last answer."""
+        return DeviceList(machine=machine, devices=sources.devices())
+
+    @app.get("/api/v1/recipes")
+    @needs(Permission.READ)
+    def recipes() -> RecipeList:
+        """Builtin recipes that a schedule can name."""
+        return RecipeList(recipes=[Recipe(name=name, about=_about(make)) for name, make in sorted(RECIPES.items())])
+
+    @app.get("/api/v1/schedules")
+    @needs(Permission.READ)
+    def schedules() -> Timetable:
+        """The timetable with the next slot of each schedule and the outcome of the latest slots."""
+        return Timetable(machine=machine, schedules=[schedule_state(sources.reader, one) for one in sources.schedules])
+
+
+def _about(make: object) -> str:
+    return " ".join((make.__doc__ or "").split())

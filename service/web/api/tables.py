@@ -1,4 +1,4 @@
-"""Routes: proposed tables, decisions on them, and the push journal."""
+"""Routes: proposed tables, decisions on them, the push journal, and orders to push or roll back."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ from typing import Annotated
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import Response
 
+from abbe.service.channel.messages import Answer
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import reject as work_reject
+from abbe.service.domain.job_state import JobState
 from abbe.service.domain.push_entry import PushEntry
 from abbe.service.queries import tables
 from abbe.service.queries.reader import as_stored
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
-from abbe.service.web.api.once import Key, once
+from abbe.service.web.api.once import REPLAYED, Key, once
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
+from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.jobs import ACCEPTED, REFUSALS, answered
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
-from abbe.service.web.schemas import ApproveBody, Decision, ProposalList, PushJournal, RejectBody
+from abbe.service.web.schemas import ApproveBody, Decision, ProposalList, PushBody, PushJournal, RejectBody, RollbackBody
 
 LONGEST_BODY = 4096
 
@@ -123,3 +127,44 @@ def _add_pushes(app: FastAPI, sources: Sources) -> None:
     def push_entry(number: Number) -> PushEntry:
         """One entry of the journal with the facts that it recorded."""
         return tables.push_entry(sources.reader, number)
+
+
+RESPONSES = ACCEPTED | REFUSALS
+
+
+def add_table_orders(app: FastAPI, core: CoreLine) -> None:
+    """Add the routes."""
+
+    @app.post("/api/v1/tables/rollback", status_code=202, responses=RESPONSES, response_model=JobState, max_body_size=LONGEST_BODY)
+    @needs(Permission.APPROVE)
+    async def rollback(request: Request, body: RollbackBody, key: Key) -> Response:
+        """Replace the table in force by the one before it, as `abbe comp rollback` does; a refusal (409) gives the reason."""
+        visit: Visit = request.state.visit
+        visit.target = f"table of push {body.push} ({body.crc})"
+        reason = body.reason.replace("\0", "\ufffd")  # not every database can store NUL
+        answer = await core.roll_back(body.push, int(body.crc, 16), reason, key, visit.principal.name)
+        return _job_answer(core, visit, answer)
+
+    @app.post(
+        "/api/v1/proposals/{number}/push",
+        status_code=202,
+        responses=RESPONSES,
+        response_model=JobState,
+        max_body_size=LONGEST_BODY,
+    )
+    @needs(Permission.APPROVE)
+    async def push(request: Request, number: Number, body: PushBody, key: Key) -> Response:
+        """Push an approved proposal now, unless the service pushes by itself; a refusal (409) gives the reason."""
+        visit: Visit = request.state.visit
+        visit.target = f"proposal {number}"
+        return _job_answer(core, visit, await core.push(number, key, visit.principal.name))
+
+
+def _job_answer(core: CoreLine, visit: Visit, answer: Answer) -> Response:
+    if answer.job:
+        visit.target += f", job {answer.job}"
+    visit.replayed = answer.outcome == "done" and bool(answer.text)
+    sent = answered(core, answer)
+    if visit.replayed:
+        sent.headers[REPLAYED] = "true"
+    return sent

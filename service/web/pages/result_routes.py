@@ -12,9 +12,9 @@ from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
-from abbe.service.web.pages.compare import compare_screen
 from abbe.service.web.pages.context import PageContext, find_or_none
 from abbe.service.web.pages.results import solution_lines
+from abbe.service.web.pages.runs import compare_screen
 from abbe.service.web.pages.volume import NODES, VolumeQuery, volume_screen
 from abbe.service.web.pages.whatif import whatif_screen
 

@@ -23,11 +23,10 @@ from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.pages import times
 from abbe.service.web.pages.context import PageContext, can_be_stored, find_or_none
-from abbe.service.web.pages.proposals import MOST, promise, proposal_screen, sign
+from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
 from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, run_list, run_screen
-from abbe.service.web.pages.table import outcome_texts
 from abbe.service.web.problems import problem
 
 _DARK = re.compile(r"@media screen and \(prefers-color-scheme:dark\)\{:root\{([^}]*)\}\}")

@@ -9,8 +9,7 @@ import pytest
 
 from abbe.models.discovery.answer import Localization, Significance
 from abbe.service.campaign_data.decimation import picked
-from abbe.service.demo.demo_hidden import HiddenDemo
-from abbe.service.demo.demo_hidden_text import hidden_json, judged, truth_lines
+from abbe.service.demo.demo_hidden import HiddenDemo, hidden_json, judged, truth_lines
 from abbe.service.discovery.new_measurement import NewMeasurement
 from abbe.service.domain.finding import EffectFound, Finding, GapUm
 from abbe.service.effects.model_book import _usual

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from abbe.service.rendering.plots.curves import Comparison, comparison_plot
-from abbe.service.rendering.plots.facets import lobing_plot, surface_plot
-from abbe.service.rendering.plots.isometric import VIEW, Paper, ViewWindow, depth
+from abbe.service.rendering.plots.isometric import VIEW, Paper, ViewWindow, depth, lobing_plot, surface_plot
 from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot, level_lines
 from abbe.service.rendering.plots.volume import deformed_grid
 

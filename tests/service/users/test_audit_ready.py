@@ -19,7 +19,7 @@ import typer
 from abbe.service.audit.book import AuditBook
 from abbe.service.audit.chain import follow
 from abbe.service.cli import run
-from abbe.service.cli.administration.audited import record_all
+from abbe.service.cli.administration.audit import record_all
 from abbe.service.cli.common import print_table
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError

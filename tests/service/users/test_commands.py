@@ -10,9 +10,8 @@ import pytest
 import typer
 
 from abbe.service.cli import run
-from abbe.service.cli.administration.audited import commands, outcome_of, record_all
+from abbe.service.cli.administration.audit import CHANGES, READS, RECORDS_ITSELF, commands, is_recorded, outcome_of, record_all
 from abbe.service.cli.app import app
-from abbe.service.cli.declared import CHANGES, READS, RECORDS_ITSELF, is_recorded
 from abbe.service.storage.store import Store
 from tests.service.users.conftest import PHRASE
 

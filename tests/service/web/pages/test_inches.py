@@ -25,10 +25,9 @@ from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, Run
 from abbe.service.web import frame, language
 from abbe.service.web.frame import Frame
 from abbe.service.web.page import environment
-from abbe.service.web.pages.compare import pictures
-from abbe.service.web.pages.live import script_texts
+from abbe.service.web.pages.new import script_texts
 from abbe.service.web.pages.rehearsal import CAMPAIGN
-from abbe.service.web.pages.runs import run_document
+from abbe.service.web.pages.runs import pictures, run_document
 from abbe.service.web.pages.whatif import forecast
 from abbe.service.web.units import INCH, METRIC
 from tests.pages_world import Served, as_user

@@ -20,9 +20,8 @@ from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.fleet import FleetFigure, MachineLine
 from abbe.service.storage.store import Store
 from abbe.service.web.app import create_app
-from abbe.service.web.pages.devices import device_screen
 from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line
-from abbe.service.web.pages.fleet import FleetLine, FleetQuery, fleet_csv, fleet_lines
+from abbe.service.web.pages.plant_screens import FleetLine, FleetQuery, device_screen, fleet_csv, fleet_lines
 from tests.pages_world import Served
 from tests.service.web.pages.test_screens import as_user
 

@@ -1,0 +1,138 @@
+"""`abbe alarm`, `abbe fleet`, `abbe trend`: what the scheduled checks of one machine or of all have found."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from abbe.service.cli.common import JsonOption, MachineOption, print_json, print_table
+
+alarm = typer.Typer(help="Alarms of the scheduled checks.", no_args_is_help=True)
+
+MachineFile = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
+
+
+@alarm.command("list")
+def list_alarms(
+    machine: MachineFile,
+    every: Annotated[bool, typer.Option("--all", help="Also those that are over and acknowledged.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
+    from abbe.service.cli.common import open_store
+    from abbe.service.config import load_machine
+    from abbe.service.verification.alarms import alarm_doc, alarms_of, open_alarms
+
+    loaded = load_machine(machine)
+    with open_store(loaded.database_url) as store:
+        name = loaded.machine.name
+        docs = [alarm_doc(one) for one in (reversed(alarms_of(store, name)) if every else open_alarms(store, name))]
+    if as_json:
+        print_json({"alarms": docs})
+        return
+    if not docs:
+        typer.echo(f"no alarm of {name} is open")
+        return
+    keys = ("alarm", "state", "recipe", "raised_utc", "acknowledged_by", "text", "outcome")
+    print_table(("no", *keys[1:]), [tuple(str(doc[key]) for key in keys) for doc in docs])
+
+
+@alarm.command("acknowledge")
+def acknowledge(
+    machine: MachineFile,
+    number: Annotated[int, typer.Argument(metavar="ALARM", help="Number of an alarm; abbe alarm list shows them.")],
+    name: Annotated[
+        str, typer.Option("--as", metavar="NAME", help="Who has seen the alarm. Default: the account.", show_default=False)
+    ] = "",
+) -> None:
+    """Note that a person has seen an alarm. It stays active until a check clears it."""
+    from abbe.service.cli.common import open_store
+    from abbe.service.compensation.proposals import login
+    from abbe.service.config import load_machine
+    from abbe.service.verification.alarms import acknowledge as work
+
+    loaded = load_machine(machine)
+    with open_store(loaded.database_url) as store:
+        done = work(store, loaded.machine.name, number, name.strip() or login())
+    typer.echo(f"alarm {number} is {done.word}: seen by {done.acknowledged_by} at {done.acknowledged_utc}")
+
+
+def fleet(
+    db: Annotated[
+        str | None, typer.Option("--store", "--db", metavar="URL", help="Database that the services write to.", show_default=False)
+    ] = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List every machine of a database: state, last check with figures and U, next due, and which limit comes first."""
+    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.clock import SystemClock
+    from abbe.service.scheduler.fleet import HEADINGS, as_doc, row
+    from abbe.service.scheduler.fleet import fleet as lines_of
+    from abbe.service.storage.store import Store
+
+    url = database_url(db, machine)
+    open_store(url).close()  # a missing file is one line of error and is not created
+    with Store.open(url) as store:
+        lines = lines_of(store, SystemClock().utc())
+    if as_json:
+        print_json(as_doc(lines))
+    elif not lines:
+        typer.echo("no machine is in this database yet: abbe serve, or abbe measure")
+    else:
+        print_table(HEADINGS, [row(one) for one in lines])
+
+
+def trend(
+    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
+    after: Annotated[
+        str | None,
+        typer.Option(
+            "--after",
+            metavar="UTC",
+            help="Only checks after this, e.g. a repair; default: the last kept push.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
+    from abbe.service.cli.common import reader_of
+    from abbe.service.queries.reader import json_value
+    from abbe.service.queries.results import trends
+    from abbe.service.verification.trend_table import HEADINGS, chart, row
+    from abbe.service.verification.verified_by import measure_now
+
+    since = _utc(after)
+    with reader_of(machine) as reader:
+        found = trends(reader, reader.machine, since)
+    if as_json:
+        print_json({"schema": 1, "chart": chart()} | json_value(found))
+        return
+    known = found.verified
+    if not known.holds:
+        typer.echo(f"{known.text}: {measure_now(str(machine))}" if known.state == "unverified" else known.text)
+    if not found.figures and known.changes:
+        typer.echo(f"no check of {found.machine} has figures since the table in force came: --after shows those before it")
+        return
+    if not found.figures:
+        typer.echo(f"no check of {found.machine} has figures yet: abbe serve, or abbe serve --once")
+        return
+    print_table(HEADINGS, [row(one) for one in found.figures])
+
+
+def _utc(text: str | None) -> datetime | None:
+    from datetime import UTC
+
+    from abbe.service.errors import ConfigError
+
+    if text is None:
+        return None
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(f"--after {text!r} is not a date or time", "write e.g. 2026-11-21 or 2026-11-21T03:00:00Z") from None
+    return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
