@@ -18,7 +18,7 @@ from abbe.public.picture import Picture
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import TableRefused
 from abbe.service.identification.solve import ProgressText, solve_runs
-from abbe.service.identification.solve_report import Assessment, assess, solution_doc, solution_verdict
+from abbe.service.identification.solve_report import Assessment, assess, solution_of, solution_verdict
 from abbe.service.rendering.document_page import write_document
 from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.plots.tables import motion_bands
@@ -140,7 +140,7 @@ class Solution:
             The file name has another ending, or the file cannot be written.
         """
         made = datetime.now(UTC).isoformat(timespec="seconds")
-        result = SolutionResult(solution_doc(self._found), account=self._found)
+        result = SolutionResult(solution_of(self._found), account=self._found)
         write_document(solution_report(None, self.campaign, result, made, Rules()), Path(target))
 
     def __repr__(self) -> str:

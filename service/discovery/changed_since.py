@@ -102,9 +102,8 @@ def _before_of(store: Store, record: SolutionRecord) -> _Before:
 def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
     """Table of each run of a solution; those of the solution itself if its runs have none."""
     used = set(record.run_ids)
-    starts = [r.start_doc for r in store.runs.all(record.campaign_id) if r.id in used]
-    tables = [start.get("imported", start).get("table") or {} for start in starts]
-    return [RunTable.from_document(table) for table in (tables if any(tables) else tables_of(record.doc))]
+    tables = [r.start.table for r in store.runs.all(record.campaign_id) if r.id in used]
+    return tables if any(table.document for table in tables) else [RunTable.from_document(table) for table in tables_of(record.doc)]
 
 
 def _acting(tables: Sequence[RunTable]) -> int | None:

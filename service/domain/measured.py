@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.owner import Owner
+from abbe.service.domain.run_start import RunEnd, RunStart
 
 RUNNING = "running"
 INCOMPLETE = "incomplete"
@@ -59,6 +60,16 @@ class RunRecord(RunFacts):
     start_doc: Doc
     end_doc: Doc | None
     owner: Owner
+
+    @property
+    def start(self) -> RunStart:
+        """The start document, parsed."""
+        return RunStart.from_document(self.start_doc)
+
+    @property
+    def end(self) -> RunEnd:
+        """The end document, parsed."""
+        return RunEnd.from_document(self.end_doc)
 
     @property
     def visible_status(self) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.measured import CampaignRecord, RunRecord
+from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.rendering.document import Document
 from abbe.service.report.later_changes import with_later_changes
@@ -101,7 +102,8 @@ def _measured(store: Store, name: str) -> Measured:
     if runs:
         ends = [r.ended_utc for r in runs if r.ended_utc]
         facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
-    solution = next((SolutionResult(s.doc, s.id) for s in reversed(store.solutions.all(record.id)) if "mean_over_volume" in s.doc), None)
+    solved = next((s for s in reversed(store.solutions.all(record.id)) if "mean_over_volume" in s.doc), None)
+    solution = None if solved is None else SolutionResult(stored_solution(solved.doc, solved.id), solved.id)
     campaign = from_store(store, name)
     table = table_remarks(store, campaign.site.name, campaign.runs)
     return Measured(campaign, facts, [_state(r) for r in runs], solution, table)

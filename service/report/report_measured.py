@@ -13,6 +13,7 @@ from abbe.models.solvers.observations import nominal_reading
 from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.domain.run import Run
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment
 from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
@@ -23,7 +24,7 @@ from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.rendering.plots.residuals import residual_plot
 from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
-from abbe.service.report.report_parts import Doc, Rules
+from abbe.service.report.report_parts import Rules
 from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
 from abbe.service.runs.coverage import not_judged
@@ -38,9 +39,9 @@ NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine
 
 @dataclass(frozen=True)
 class SolutionResult:
-    """A solution's document. ``number``: of a stored solution; ``account``: of a new one, the source of its pictures."""
+    """A solution. ``number``: of a stored one; ``account``: of a new one, the source of its pictures."""
 
-    doc: Doc
+    solution: SolutionFile
     number: int | None = None
     account: Assessment | None = None
 
@@ -133,69 +134,67 @@ def _verification(runs: Sequence[Run], rules: Rules) -> tuple[list[ReportFigure]
         return [], None
 
 
-def _solution(solution: SolutionResult | None) -> Evaluated:
-    if solution is None:
+def _solution(result: SolutionResult | None) -> Evaluated:
+    if result is None:
         return Evaluated(not_observable=["error motions of the machine: this campaign has no stored solution (abbe solve)"])
-    doc = solution.doc
-    known = doc["uncertainty"]
-    worst = known["worst_point"]
-    place = ", ".join(f"{v:.0f}" for v in worst["at_mm"])
-    size = float(np.linalg.norm(worst["deviation_um"]))
-    note = str(doc["mean_over_volume_note"])
-    name = solution.name[:1].upper() + solution.name[1:]
+    solution, worst = result.solution, result.solution.uncertainty.worst_point
+    place = ", ".join(f"{v:.0f}" for v in worst.at_mm)
+    size = float(np.linalg.norm(worst.deviation_um))
+    note = solution.mean_over_volume_note
+    name = result.name[:1].upper() + result.name[1:]
     statement = (
-        f"{name}: {known['frame']}. At the worst known point ({place}) mm the deviation is {plain(size)} µm, and its 95 % "
-        f"region reaches {plain(worst['expanded_vector_um'])} µm. {note[:1].upper()}{note[1:]}."
+        f"{name}: {solution.uncertainty.frame}. At the worst known point ({place}) mm the deviation is {plain(size)} µm, and its 95 % "
+        f"region reaches {plain(worst.expanded_vector_um)} µm. {note[:1].upper()}{note[1:]}."
     )
-    figures = _parameters(doc, f"Linear errors, mean over the volume ({solution.name}, {doc['model']})")
+    figures = _parameters(solution, f"Linear errors, mean over the volume ({result.name}, {solution.model})")
     rows = [ParameterRow(f.symbol, f.value, f.u, f.unit) for f in figures]
-    drawn = solution.account is None  # otherwise the section of the parameters draws them
+    drawn = result.account is None  # otherwise the section of the parameters draws them
     return Evaluated(
         figures=figures,
         pictures=[Picture(f"{name}: linear errors with U.", [svg]) for svg in uncertainty_bars(rows)] if drawn else [],
-        remarks=[*doc["flags"]],
-        not_observable=[*doc["not_observable"]],
+        remarks=[*solution.flags],
+        not_observable=[*solution.not_observable],
         statements=[statement],
     )
 
 
-def _parameters(doc: Doc, group: str) -> list[ReportFigure]:
+def _parameters(solution: SolutionFile, group: str) -> list[ReportFigure]:
     """Scales, squareness and lost motion; parameters that are not observable by themselves carry a note."""
     figures = []
-    for name, p in doc["mean_over_volume"].items():
+    for name, p in solution.mean_over_volume.items():
         text, unit = ("scale error", "µm/m") if name[0] == "E" else ("squareness", "µrad")
-        status = doc.get("motions", {}).get(name, {}).get("status")
-        hidden = f"; {HIDDEN_NOTE}" if status == "not observable" else ""
-        figures.append(ReportFigure(group, name, text + hidden, p["value"] * 1e6, p["u"] * 1e6, unit, "joint solution"))
-    for name, p in doc.get("parameters", {}).items():
+        motion = solution.motions.get(name)
+        hidden = f"; {HIDDEN_NOTE}" if motion is not None and motion.status == "not observable" else ""
+        figures.append(ReportFigure(group, name, text + hidden, p.value * 1e6, p.u * 1e6, unit, "joint solution"))
+    for name, lost in solution.parameters.items():
         if name.startswith("backlash_"):
             text = "lost motion, not compensated"
-            figures.append(ReportFigure(group, name.replace("_", " "), text, p["value"] * 1e3, p["u"] * 1e3, "µm", "joint solution"))
+            figures.append(ReportFigure(group, name.replace("_", " "), text, lost.value * 1e3, lost.u * 1e3, "µm", "joint solution"))
     return figures
 
 
 def _solution_verdict(solution: SolutionResult | None) -> tuple[Sign, str, str]:
-    if solution is None:
+    verdict = None if solution is None else solution.solution.verdict
+    if verdict is None:
         return "open", "Not judged", NOT_JUDGED
-    verdict = solution.doc["verdict"]
-    word = str(verdict["word"])
-    return SOLUTION_SIGNS[word], word[:1].upper() + word[1:], str(verdict["text"])
+    return SOLUTION_SIGNS[verdict.word], verdict.word[:1].upper() + verdict.word[1:], verdict.text
 
 
 def _made(solution: SolutionResult | None) -> dict[str, str] | None:
     if solution is None:
         return None
-    doc, number = solution.doc, "" if solution.number is None else f"{solution.number}, "
-    return {str(k): str(v) for k, v in doc["versions"].items()} | {"solution": f"{number}inputs SHA-256 {doc['inputs']['digest']}"}
+    number = "" if solution.number is None else f"{solution.number}, "
+    programs = solution.solution.versions.model_dump(exclude_none=True)
+    return {k: str(v) for k, v in programs.items()} | {"solution": f"{number}inputs SHA-256 {solution.solution.inputs.digest}"}
 
 
 def _same_as(solution: SolutionResult | None) -> dict[str, str]:
-    same = [] if solution is None else solution.doc.get("same_as") or []
+    same = [] if solution is None else solution.solution.same_as or []
     return {"Same readings and model as": f"solution {', '.join(map(str, same))}"} if same else {}
 
 
 def _sections(solution: SolutionResult | None) -> list[Section]:
-    return [] if solution is None or solution.account is None else solution_sections(solution.account, solution.doc)
+    return [] if solution is None or solution.account is None else solution_sections(solution.account, solution.solution)
 
 
 def _residuals(solution: SolutionResult | None) -> list[Section]:
@@ -205,7 +204,7 @@ def _residuals(solution: SolutionResult | None) -> list[Section]:
 def _budget(solution: SolutionResult | None) -> list[Section]:
     if solution is None:
         return []
-    rows = [(b["words"], plain(b["u_um"], 2), f"{b['share']:.0%}") for b in solution.doc["uncertainty"]["budget"]]
+    rows = [(b.words, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.solution.uncertainty.budget]
     title = "Uncertainty budget of the predicted deviation, rms over the volume"
     return [Section(title, [TextTable(("Source", "u in µm", "Share"), rows)])]
 

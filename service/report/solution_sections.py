@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from abbe.models.compensation.additive import SCALE_NOTE, mean_linear
 from abbe.models.geometry.bases import term_values
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
+from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment, noise_lines, outlier_lines, residual_lines, worst_line
 from abbe.service.identification.solve_verdict import layout_line
 from abbe.service.rendering.document import Block, Lines, Picture, Section, TextTable
@@ -37,10 +37,10 @@ PLANES = ((0, 1, 2), (0, 2, 1))
 """Axes across and up of each slice, and the axis that stands in the middle of its stroke."""
 
 
-def solution_sections(found: Assessment, doc: dict[str, Any]) -> list[Section]:
+def solution_sections(found: Assessment, solution: SolutionFile) -> list[Section]:
     """Sections of a solution, printed before the figures of the report.
 
-    ``doc``: its `abbe.service.identification.solve_report.solution_doc`, with tables and Monte Carlo if requested.
+    ``solution``: the same as stored, with tables and Monte Carlo if requested.
     """
     shares = [MotionShare(m.name, m.share, m.status) for m in found.observability.motions]
     return [
@@ -48,7 +48,7 @@ def solution_sections(found: Assessment, doc: dict[str, Any]) -> list[Section]:
         Section("Error motions", _motions(found)),
         Section("What these runs tell of each error motion", _observability(found, shares)),
         Section("Uncertainty in the volume", _volume(found)),
-        *_tables(doc),
+        *_tables(solution),
     ]
 
 
@@ -119,11 +119,13 @@ def _volume(found: Assessment) -> list[Block]:
     ]
 
 
-def _tables(doc: dict[str, Any]) -> list[Section]:
-    checked = (doc.get("monte_carlo") or {}).get("text", "")
-    out = [Section("Monte Carlo trials", [checked])] if checked else []
-    if rows := doc.get("tables"):
-        cells = [(t["kind"], str(t["entries"]), *(stated(t[k], t[f"u_{k}"]) for k in ("rms_um", "q95_um", "max_um"))) for t in rows]
+def _tables(solution: SolutionFile) -> list[Section]:
+    out = [] if solution.monte_carlo is None else [Section("Monte Carlo trials", [solution.monte_carlo.text])]
+    if solution.tables:
+        cells = [
+            (t.kind, str(t.entries), stated(t.rms_um, t.u_rms_um), stated(t.q95_um, t.u_q95_um), stated(t.max_um, t.u_max_um))
+            for t in solution.tables
+        ]
         text = (
             f"Errors of distances over the inner 80 % of the strokes that are left, µm, with {U_OF}. What is unknown of this machine is in "
             "every row."

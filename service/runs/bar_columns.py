@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from abbe.drivers.api import BarSample
 from abbe.drivers.flags import bar_is_valid, on_path
-from abbe.service.domain.document import Doc
 from abbe.service.domain.run import Columns
+from abbe.service.domain.run_start import CommandedPath, RunEnd, RunStart
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.clocks import Edges
 
@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 DURATION_TOLERANCE = 0.01
 
 
-def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
+def sync_edges(samples: Sequence[BarSample], start: RunStart) -> Edges | None:
     """Edges of the sync line in a run; None if no sample has it set."""
     at = [k for k, sample in enumerate(samples) if on_path(sample.status)]
     if not at:
@@ -31,7 +31,7 @@ def sync_edges(samples: Sequence[BarSample], start: Doc) -> Edges | None:
     first, last = at[0], at[-1]
     begins = first > 0 and samples[first - 1].seq + 1 == samples[first].seq
     ends = last + 1 < len(samples) and samples[last].seq + 1 == samples[last + 1].seq
-    return Edges(samples[first].device_us, samples[last].device_us, 1.0 / float(start["rate_hz"]), begins and ends)
+    return Edges(samples[first].device_us, samples[last].device_us, 1.0 / start.rate_hz, begins and ends)
 
 
 def starts_in_stream(samples: Sequence[BarSample]) -> bool:
@@ -40,17 +40,17 @@ def starts_in_stream(samples: Sequence[BarSample]) -> bool:
     return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
 
 
-def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, complete: bool = True, rate: float = 1.0) -> Columns:
+def bar_columns(samples: Sequence[BarSample], start: RunStart, end: RunEnd, *, complete: bool = True, rate: float = 1.0) -> Columns:
     """Turn the samples of one path into columns.
 
     Parameters
     ----------
     samples : sequence of BarSample
         All samples of the run, also those before and after the path.
-    start : dict
-        Start document (`abbe.service.runs.columns`).
-    end : dict or None
-        End document; None for an interrupted run, which keeps its existing columns.
+    start : RunStart
+        With its path.
+    end : RunEnd
+        Empty for an interrupted run, which keeps its existing columns.
     complete : bool
         Whether the path ran to its end, so that durations can be checked.
     rate : float
@@ -66,22 +66,21 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     MeasurementFault
         No sample lies on the path, or feed, path and duration contradict each other.
     """
-    path, rate_hz = start["path"], float(start["rate_hz"])
-    feed_mm_s = path["feed_mm_min"] / 60.0
-    points = np.asarray(path["points_mm"], dtype=np.float64).reshape(-1, 3)
+    path, rate_hz, feed_mm_s = start.commanded, start.rate_hz, start.commanded.feed_mm_s
     along = [sample for sample in samples if on_path(sample.status)]
     device_us = np.array([sample.device_us for sample in along], dtype=np.int64)
-    if complete and end is not None and "path_end_us" in end:
-        _check_durations(device_us, end, _length_mm(points) / feed_mm_s, rate_hz)
-    along_s = _time_along_path(samples, along, device_us, end if complete else None, (rate_hz, rate))
-    counts = _counts(points, path.get("measured"), feed_mm_s * along_s)
+    path_us = end.path_us if complete else None
+    if path_us is not None:
+        _check_durations(device_us, path_us, float(path.arc_mm[-1]) / feed_mm_s, rate_hz)
+    along_s = _time_along_path(samples, along, device_us, path_us, (rate_hz, rate))
+    counts = _counts(path, feed_mm_s * along_s)
     along, device_us, along_s = [s for s, yes in zip(along, counts, strict=True) if yes], device_us[counts], along_s[counts]
     count = len(along)
     return Columns(
         t_s=_start_s(start, end) + along_s,
-        q_mm=_position(points, feed_mm_s * along_s),
-        feed_mm_min=np.full(count, float(path["feed_mm_min"])),
-        direction=np.full(count, float(path["direction"])),
+        q_mm=_position(path.points_mm, feed_mm_s * along_s),
+        feed_mm_min=np.full(count, path.feed_mm_min),
+        direction=np.full(count, float(path.direction)),
         deviation_mm=np.array([sample.reading_nm * 1e-6 for sample in along], dtype=np.float64),
         valid=np.array([bar_is_valid(sample.status) for sample in along], dtype=np.bool_),
         further={
@@ -92,18 +91,19 @@ def bar_columns(samples: Sequence[BarSample], start: Doc, end: Doc | None, *, co
     )
 
 
-def _start_s(start: Doc, end: Doc | None) -> float:
-    for document, key in ((end, "path_start_us"), (start, "path_start_us"), (start.get("clock"), "ctrl_us")):
-        if document and document.get(key) is not None:
-            return float(document[key] - start["ctrl0_us"]) * 1e-6
-    return float(start["setup"].get("t_set_s", 0.0))
+def _start_s(start: RunStart, end: RunEnd) -> float:
+    """Start of the path on the campaign's clock, s: as the best of the documents states it."""
+    for stated_us in (end.path_start_us, start.path_start_us, start.clock_us):
+        if stated_us is not None:
+            return start.since_zero_s(stated_us)
+    return float(start.setup.get("t_set_s", 0.0))
 
 
 def _time_along_path(
     samples: Sequence[BarSample],
     along: Sequence[BarSample],
     device_us: npt.NDArray[np.int64],
-    end: Doc | None,
+    path_us: tuple[int, int] | None,
     rates: tuple[float, float],
 ) -> Array:
     if not along:
@@ -112,15 +112,15 @@ def _time_along_path(
     since_first_s = (device_us - device_us[0]) * 1e-6 * rates[1]
     first = samples.index(along[0])
     start_was_lost = along[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else along[0].seq != 0
-    if start_was_lost and end is not None and end.get("path_end_us"):
+    if start_was_lost and path_us is not None:
         # The first edge fell into a gap of the stream: use the other edge of the path.
-        duration_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
+        duration_s = (path_us[1] - path_us[0]) * 1e-6
         return np.asarray(duration_s - half_period_s - since_first_s[-1] + since_first_s)
     return np.asarray(since_first_s + half_period_s)
 
 
-def _check_durations(device_us: npt.NDArray[np.int64], end: Doc, planned_s: float, rate_hz: float) -> None:
-    controller_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
+def _check_durations(device_us: npt.NDArray[np.int64], path_us: tuple[int, int], planned_s: float, rate_hz: float) -> None:
+    controller_s = (path_us[1] - path_us[0]) * 1e-6
     if device_us.size == 0:
         raise MeasurementFault("no ball-bar sample has the sync input set", "check the cable from the controller's path output to the bar")
     device_s = float(device_us[-1] - device_us[0]) * 1e-6 + 1.0 / rate_hz
@@ -137,16 +137,12 @@ def _check_durations(device_us: npt.NDArray[np.int64], end: Doc, planned_s: floa
         )
 
 
-def _length_mm(points: Array) -> float:
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def _counts(points: Array, measured: Sequence[int] | None, arc_mm: Array) -> npt.NDArray[np.bool_]:
+def _counts(path: CommandedPath, arc_mm: Array) -> npt.NDArray[np.bool_]:
     """Mask of the readings between the first and last measured point; feed-in and feed-out stay in the raw samples only."""
-    if measured is None:
+    if path.measured is None:
         return np.ones(arc_mm.size, dtype=np.bool_)
-    arc = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
-    return np.asarray((arc_mm >= arc[measured[0]]) & (arc_mm <= arc[measured[1]]), dtype=np.bool_)
+    first_mm, last_mm = path.counted_mm
+    return np.asarray((arc_mm >= first_mm) & (arc_mm <= last_mm), dtype=np.bool_)
 
 
 def _position(points: Array, arc_mm: Array) -> Array:

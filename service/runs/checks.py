@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -20,6 +21,7 @@ _OF_OTHERS = ("C", "K", "Pa", "hPa", "N", "kN", "Nm", "V", "mV", "A", "W", "kW",
 UNITS = frozenset({*_OF_MOTION, *_OF_OTHERS})
 PLAIN = frozenset(("seq", "count", "no", "index", "id", "flag", "ratio", "status", "quality", "valid"))
 """Suffixes of columns without a unit."""
+Parsed = TypeVar("Parsed", bound=BaseModel)
 MAX_BYTES = 512 * 2**20
 
 
@@ -47,8 +49,8 @@ def read_json(path: Path) -> Doc:
     return value
 
 
-def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
-    """Check a document against a model of `abbe.service.domain.run_file`; ``path`` is named in errors.
+def check(path: Path, document: Doc, model: type[Parsed]) -> Parsed:
+    """Parse a document as a model of `abbe.service.domain.run_file`; ``path`` is named in errors.
 
     Raises
     ------
@@ -57,17 +59,18 @@ def check(path: Path, document: Doc, model: type[BaseModel]) -> None:
     """
     try:
         # Through JSON, so that a list counts as a tuple, as in the file; json.dumps passes NaN, which the model refuses.
-        model.model_validate_json(json.dumps(document))
+        found = model.model_validate_json(json.dumps(document))
     except ValidationError as err:
         raise _format_error(path, err) from None
     try:
         json.dumps(document, allow_nan=False)
     except ValueError:
         _check_finite(path, document)  # the NaN is in a key outside the format
+    return found
 
 
-def check_run(path: Path, document: Doc) -> None:
-    """Check a run file, its columns row by row; ``path`` is named in errors.
+def check_run(path: Path, document: Doc) -> RunFile:
+    """Parse a run file after checking its columns row by row; ``path`` is named in errors.
 
     Raises
     ------
@@ -78,7 +81,7 @@ def check_run(path: Path, document: Doc) -> None:
         keys = document.get(part)
         for key in keys if isinstance(keys, dict) else ():
             _check_unit(path, f"{part}.{key}", key, model, units_needed=part == "columns")
-    check(path, document, RunFile)
+    found = check(path, document, RunFile)
     columns = {key: values for key, values in document["columns"].items() if values is not None}
     length = len(columns["t_s"])
     for key, values in columns.items():
@@ -90,6 +93,7 @@ def check_run(path: Path, document: Doc) -> None:
             raise FileFormatError(
                 f"{path}: columns.t_s, row {row + 1}: expected at least {times[row - 1]}, got {times[row]}", "time never runs back"
             )
+    return found
 
 
 def _check_unit(path: Path, place: str, key: str, model: type[BaseModel], *, units_needed: bool) -> None:

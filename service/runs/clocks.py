@@ -18,6 +18,7 @@ from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, fit_clock
 from abbe.models.arrays import F1
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord
+from abbe.service.domain.run_start import RunEnd
 
 U_DELAY_S = 2e-3
 """Standard uncertainty of a link's least delay, which arrivals do not show: 0 to 7 ms in the adapter and the operating system."""
@@ -49,7 +50,7 @@ class Edges:
     whole: bool = True
 
 
-def run_clock(chunks: Sequence[ChunkRecord], end: Doc | None, edges: Edges) -> RunClock:
+def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunClock:
     """Rate of the box's clock against the controller's, from the sync line or the arrivals, whichever has the smaller uncertainty.
 
     A drift below `SURE` standard uncertainties is not corrected; ``u_rate`` covers it.
@@ -57,9 +58,10 @@ def run_clock(chunks: Sequence[ChunkRecord], end: Doc | None, edges: Edges) -> R
     found = _fits(chunks, end, edges.period_s)
     doc: Doc = {}
     tries: list[tuple[float, float, str]] = []
-    if edges.whole and end is not None and end.get("path_end_us") and edges.last_us > edges.first_us:
+    path_us = end.path_us
+    if edges.whole and path_us is not None and edges.last_us > edges.first_us:
         seen_s = (edges.last_us - edges.first_us) * 1e-6 + edges.period_s
-        run_s = (end["path_end_us"] - end["path_start_us"]) * 1e-6
+        run_s = (path_us[1] - path_us[0]) * 1e-6
         tries.append((run_s / seen_s, float(np.sqrt(1.0 / 6.0)) * edges.period_s / seen_s, "sync line"))
     if isinstance(found, tuple):
         tries.append((*relative_rate(*found), "arrivals"))
@@ -74,10 +76,10 @@ def run_clock(chunks: Sequence[ChunkRecord], end: Doc | None, edges: Edges) -> R
     return RunClock(used, u, doc | {"corrected_ppm": (used - 1.0) * 1e6})
 
 
-def _fits(chunks: Sequence[ChunkRecord], end: Doc | None, period_s: float) -> tuple[ClockFit, ClockFit] | str:
+def _fits(chunks: Sequence[ChunkRecord], end: RunEnd, period_s: float) -> tuple[ClockFit, ClockFit] | str:
     """Fits of the box's and the controller's clock to this computer's; a text if a clock jumped, empty with too few pairs."""
     box = np.array([(c.last_device_us * 1e-6, c.last_host_s) for c in chunks], dtype=np.float64).reshape(-1, 2)
-    cnc = np.array((end or {}).get("clock_pairs", []), dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
+    cnc = np.array(end.clock_pairs, dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
     for name, pairs in (("ball-bar's box", box), ("controller", cnc)):
         if len(pairs) < LEAST_PAIRS:
             return ""
@@ -91,18 +93,19 @@ def _fit(pairs: Any, grid_s: float) -> ClockFit:
     return fit_clock(pairs[:, 0], pairs[:, 1], u_delay_s=U_DELAY_S, grid_s=grid_s)
 
 
-def _compared(fits: tuple[ClockFit, ClockFit], end: Doc | None, edges: Edges) -> Doc:
+def _compared(fits: tuple[ClockFit, ClockFit], end: RunEnd, edges: Edges) -> Doc:
     """Edges by the arrivals minus edges by the controller, ms of controller time.
 
     Positive: the arrivals date the edge later than the controller does, so by them the path began (or ended) earlier.
     """
     doc: Doc = {"box_drift_ppm": fits[0].drift_ppm, "controller_drift_ppm": fits[1].drift_ppm}
-    if not end or not end.get("path_end_us") or not edges.whole:
+    path_us = end.path_us
+    if path_us is None or not edges.whole:
         return doc
     half = 0.5 * edges.period_s
     at: F1 = np.array([edges.first_us * 1e-6 - half, edges.last_us * 1e-6 + half])
     there, u = across(*fits, at)
-    off = there - np.array([end["path_start_us"], end["path_end_us"]]) * 1e-6
+    off = there - np.array(path_us) * 1e-6
     u = np.hypot(u, edges.period_s / np.sqrt(12.0))
     doc |= {"sync_start_ms": float(off[0]) * 1e3, "sync_end_ms": float(off[1]) * 1e3, "u_sync_ms": float(u.max()) * 1e3}
     if (np.abs(off) > SURE * u).any():

@@ -1,25 +1,6 @@
 """Read stored runs: the only place where raw samples become columns.
 
-Start document:
-
-- ``setup`` and ``machine`` of the exchange format, and ``ctrl0_us``, the zero of the campaign clock in controller time;
-- of a ball-bar run ``rate_hz`` and ``path`` {``feed_mm_min``, ``direction``, ``points_mm``}; ``points_mm`` begins at the machine's position
-  at the start of the path;
-- ``path.measured``: first and last point of ``points_mm`` between which readings count; without it all count;
-- ``path.pieces`` (run, to_mm) and ``path.offset_mm`` of a path that was interrupted and resumed (`abbe.service.sequences.resume_plan`):
-  ``points_mm`` is the rest of the path, and the readings of the interrupted runs belong to it up to those lengths.
-
-A ball-bar run whose ``setup`` states the number of ``samples`` per reading was read at standstill, point by point. It has no ``path``, and
-its records are stored like those of a laser run.
-
-End document:
-
-- ``path_start_us`` and ``path_end_us`` of a ball-bar run, in controller time. Without an end document, the start of the path is
-  ``path_start_us`` of the start document, else ``clock.ctrl_us``, else ``t_set_s`` of the set-up;
-- ``path_start_us``, ``good_us`` and ``box_boot_id`` of an interrupted run: how far it came at constant feed;
-- ``clock_pairs``: controller time (us) and arrival (host s) of statuses, which check the sync line (`abbe.service.runs.clocks`); ``timing``
-  of the result holds the outcome;
-- ``mounted_us``: mounting of cup or laser in controller time, after the start document was written.
+`abbe.service.domain.run_start` describes the documents beside the samples.
 """
 
 from __future__ import annotations
@@ -33,18 +14,19 @@ import numpy as np
 from abbe.drivers.flags import bar_is_valid
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord, RunRecord
-from abbe.service.domain.run import Columns, Run, RunTable, RunTiming, parsed_setup
+from abbe.service.domain.run import Columns, Run, RunTiming, parsed_setup
+from abbe.service.domain.run_start import RunEnd, RunStart
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
 from abbe.service.runs.bar_columns import bar_columns, starts_in_stream, sync_edges
 from abbe.service.runs.clocks import RunClock, run_clock
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.laser_columns import laser_columns
-from abbe.service.runs.pieces import ReadProgress, counted_columns, pieces_of, progress_of
+from abbe.service.runs.pieces import ReadProgress, counted_columns, progress_of
 from abbe.service.storage.store import Store
 
 
-def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
+def bar_point_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
     """Convert the records of a point-by-point ball-bar test to columns: one row per point, the mean of its samples.
 
     Parameters
@@ -52,8 +34,8 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
     records : sequence of dict
         ``ctrl_us`` (controller time, after the axes had settled), ``target_mm``, ``direction``, ``feed_mm_min``, and for every sample
         ``device_us``, ``reading_nm``, ``status``; in order.
-    start : dict
-        Start document.
+    start : RunStart
+        The zero of the clock.
 
     Returns
     -------
@@ -62,7 +44,7 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
         sample.
     """
     return Columns(
-        t_s=np.array([(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records], dtype=np.float64),
+        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
         q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
         feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
         direction=np.array([one["direction"] for one in records], dtype=np.float64),
@@ -102,7 +84,7 @@ def load_run(store: Store, id_or_label: int | str) -> Run:
 def whole_run(store: Store, record: RunRecord) -> Run:
     """A run with its pieces; raises like `load_run`."""
     run = single_run(record, store.chunks.of_run(record.id))
-    pieces = pieces_of(record.start_doc)
+    pieces = record.start.pieces
     if not pieces:
         return with_state(run, record)
     broken = [(store.runs.find(p.run), p.to_mm) for p in pieces]
@@ -114,7 +96,7 @@ def whole_run(store: Store, record: RunRecord) -> Run:
     if troubles and not run.timing.trouble:
         timing["trouble"] = troubles[0]
     columns = Columns.concatenated([*parts, run.columns])
-    return with_state(replace(run, columns=columns, timing=RunTiming.from_document(timing)), record, broken[0][0].start_doc)
+    return with_state(replace(run, columns=columns, timing=RunTiming.from_document(timing)), record, broken[0][0].start)
 
 
 def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
@@ -139,7 +121,7 @@ def path_progress(store: Store, run: int) -> ReadProgress | None:
         found = None  # an unreadable run does not count
     if found is not None:
         return found
-    earlier = pieces_of(record.start_doc)
+    earlier = record.start.pieces
     return path_progress(store, earlier[-1].run) if earlier else None
 
 
@@ -156,18 +138,18 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
     imported = _imported(record, chunks)
     if imported is not None:
         return replace(Run.from_document(imported), ended_utc=record.ended_utc or "")
-    start = record.start_doc
     try:
-        columns, timing = _measured(record, chunks)
+        start = record.start
+        columns, timing = _measured(record, start, chunks)
         return Run(
             campaign=record.campaign,
             run_id=record.label,
             test=record.test,
             role=record.role,
-            machine=start["machine"],
-            setup=parsed_setup(record.test, _setup(start, record.end_doc)),
+            machine=start.machine,
+            setup=parsed_setup(record.test, _setup(start, record.end)),
             columns=columns,
-            table=RunTable.from_document(start.get("table")),  # a solution is meaningful only together with the active table
+            table=start.table,  # a solution is meaningful only together with the active table
             timing=RunTiming.from_document(timing),
             ended_utc=record.ended_utc or "",
         )
@@ -183,12 +165,9 @@ def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:
     return None if imported is None else dict(imported) | {"columns": unpack_columns(chunks)}  # the key keeps its place
 
 
-def _setup(start: Doc, end: Doc | None) -> Doc:
+def _setup(start: RunStart, end: RunEnd) -> Doc:
     """The set-up with its mounting time."""
-    setup: Doc = start["setup"]
-    if not end or "mounted_us" not in end:
-        return setup
-    return setup | {"t_set_s": (end["mounted_us"] - start["ctrl0_us"]) * 1e-6}
+    return start.setup if end.mounted_us is None else start.setup | {"t_set_s": start.since_zero_s(end.mounted_us)}
 
 
 def pack_columns(columns: Doc) -> list[dict[str, Any]]:
@@ -202,17 +181,17 @@ def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
     return {record["name"]: record["values"] for record in records}
 
 
-def _measured(record: RunRecord, chunks: Sequence[ChunkRecord]) -> tuple[Columns, Doc]:
+def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord]) -> tuple[Columns, Doc]:
     """The columns and the ``timing`` document."""
-    if record.test.startswith("ballbar") and "samples" not in record.start_doc.get("setup", {}):
+    if record.test.startswith("ballbar") and not start.point_by_point:
         bar_chunks = _of(chunks, BAR_CHANNEL, BAR_CODEC)
         samples = [sample for chunk in bar_chunks for sample in decode_bar(chunk.payload)]
-        edges, complete = sync_edges(samples, record.start_doc), record.status == "complete"
-        clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end_doc, edges)
-        return bar_columns(samples, record.start_doc, record.end_doc, complete=complete, rate=clock.rate), clock.doc
+        edges, complete = sync_edges(samples, start), record.status == "complete"
+        clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end, edges)
+        return bar_columns(samples, start, record.end, complete=complete, rate=clock.rate), clock.doc
     records = [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
     make = bar_point_columns if record.test.startswith("ballbar") else laser_columns
-    return make(records, record.start_doc), {}
+    return make(records, start), {}
 
 
 def _of(chunks: Sequence[ChunkRecord], channel: str, codec: str) -> list[ChunkRecord]:

@@ -11,12 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.run import BarSetup, Run, RunState
+from abbe.service.domain.run_start import RunStart
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.runs.helix_axis import about_axis, circle_axis, helix_axis
-from abbe.service.runs.pieces import arc_of
 
 LEAST = 0.9
 """Least share of the commanded path for a judgement: the missing part may contain the largest deviation."""
@@ -30,12 +29,12 @@ GAP_STEPS, GAP_SHARE = 3.0, 0.15
 or of a turn, leave the path between them unread."""
 
 
-def with_state(run: Run, record: RunRecord, begun: Doc | None = None) -> Run:
+def with_state(run: Run, record: RunRecord, begun: RunStart | None = None) -> Run:
     """Add the ``state`` of a stored run that is incomplete or has not read enough of its path.
 
-    ``begun``: start document of the run that began the path, if this one resumed it.
+    ``begun``: start of the run that began the path, if this one resumed it.
     """
-    share = _of_path(run, begun or record.start_doc)
+    share = _of_path(run, begun or record.start)
     status = record.visible_status
     if status == COMPLETE and (share is None or share >= LEAST):
         return run
@@ -74,20 +73,15 @@ def check_judged(run: Run) -> None:
         raise MeasurementFault(f"run {run.run_id}: {why}", "measure it again, or go on with it: abbe measure MACHINE.toml --resume")
 
 
-def _of_path(run: Run, start: Doc) -> float | None:
+def _of_path(run: Run, start: RunStart) -> float | None:
     """Share of the commanded path length, or of the planned standstills."""
     if run.is_sealed:
         return None
-    valid, path = run.columns.valid, start.get("path")
-    if path:
-        points = path["points_mm"]
-        last = path["measured"][1] if path.get("measured") else len(points) - 1
-        first = path["measured"][0] if path.get("measured") else 0
-        arc = arc_of(points)
-        whole = float(path.get("offset_mm", 0.0)) + float(arc[last] - arc[first])
-        return _share(_read_mm(run.columns.q_mm[valid], path["feed_mm_min"] / 60.0 / float(start.get("rate_hz", 1.0))), whole)
-    planned = start.get("standstills")
-    return None if not planned else _share(float(valid.sum()), float(planned))
+    valid, path = run.columns.valid, start.path
+    if path is None:
+        return _share(float(valid.sum()), float(start.standstills)) if start.standstills else None
+    first_mm, last_mm = path.counted_mm
+    return _share(_read_mm(run.columns.q_mm[valid], path.feed_mm_s / start.rate_hz), path.offset_mm + last_mm - first_mm)
 
 
 def _of_setup(run: Run) -> float | None:

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,6 @@ from abbe.service.explain import nearest, short_repr
 from abbe.service.runs.checks import check, read_json
 
 NOT_GIVEN = "no uncertainty given in the errors file"
-_KINDS: Mapping[str, type[BaseModel]] = MappingProxyType(
-    {"polynomial": formats.Polynomial, "table": formats.Tabulated, "legendre": formats.LegendreSeries, "bspline": formats.Spline}
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +56,26 @@ def read_errors(path: Path) -> KnownErrors:
     """
     if not path.exists():
         raise FileFormatError(f"{path}: no such file", "give a file with error functions (abbe-errors/1)")
-    document = read_json(path)
-    check(path, document, formats.ErrorsFile)
+    found = check(path, read_json(path), formats.ErrorsFile)
     functions = {}
-    for key, one in document["motions"].items():
+    for key, one in found.motions.items():
         try:
             functions[key] = axis_function(one)
         except ValueError as err:
             raise FileFormatError(
                 f"{path}: motions.{key}: {err}", "correct the function; docs/how-to/errors.md describes the kinds"
             ) from None
-    motions = ErrorMotions(functions, {name: document["squareness_rad"][name] for name in SQUARENESS})
-    covariance, text = _covariance(path, document.get("covariance"), motions)
-    return KnownErrors(motions, covariance, text, document.get("not_observable") or [], _unused(path, document))
+    motions = ErrorMotions(functions, {name: getattr(found.squareness_rad, name) for name in SQUARENESS})
+    covariance, text = _covariance(path, None if found.covariance is None else _further(found.covariance), motions)
+    return KnownErrors(motions, covariance, text, [_further(one) for one in found.not_observable], _unused(path, found))
 
 
-def axis_function(one: Mapping[str, Any]) -> AxisFunction:
+def _further(part: BaseModel) -> dict[str, Any]:
+    """Keys of a part outside the format."""
+    return part.model_extra or {}
+
+
+def axis_function(one: formats.ErrorFunction) -> AxisFunction:
     """The function that one entry of ``motions`` describes.
 
     Raises
@@ -83,13 +83,13 @@ def axis_function(one: Mapping[str, Any]) -> AxisFunction:
     ValueError
         The function is impossible: positions that do not increase, decreasing knots, no coefficient.
     """
-    if one["kind"] == "polynomial":
-        return Polynomial(one["coefficients"], one["origin_mm"])
-    if one["kind"] == "legendre":
-        return Legendre(one["coefficients"], one["stroke_mm"])
-    if one["kind"] == "bspline":
-        return BSpline(one["knots_mm"], one["coefficients"], one["degree"])
-    return Table(one["position_mm"], one["value"], one["interpolation"])
+    if isinstance(one, formats.Polynomial):
+        return Polynomial(np.array(one.coefficients), one.origin_mm)
+    if isinstance(one, formats.LegendreSeries):
+        return Legendre(np.array(one.coefficients), one.stroke_mm)
+    if isinstance(one, formats.Spline):
+        return BSpline(np.array(one.knots_mm), np.array(one.coefficients), one.degree)
+    return Table(np.array(one.position_mm), np.array(one.value), one.interpolation)
 
 
 def _covariance(path: Path, given: Mapping[str, Any] | None, motions: ErrorMotions) -> tuple[tuple[tuple[str, ...], F2] | None, str]:
@@ -154,16 +154,16 @@ def _runs(key: str, indices: list[int]) -> list[str]:
     return [" to ".join(f"{key}.{k}" for k in run) for run in ends]
 
 
-def _unused(path: Path, document: Mapping[str, Any]) -> list[str]:
+def _unused(path: Path, found: formats.ErrorsFile) -> list[str]:
     """One line for each unknown key, except below ``not_observable``."""
-    places: list[tuple[str, Mapping[str, Any], Iterable[str]]] = [("", document, formats.ErrorsFile.model_fields)]
-    places.append(("squareness_rad.", document["squareness_rad"], SQUARENESS))
-    places += [(f"motions.{key}.", one, _KINDS[one["kind"]].model_fields) for key, one in document["motions"].items()]
-    places.append(("covariance.", document.get("covariance") or {}, ("parameters", "matrix")))
+    parts: list[tuple[str, BaseModel, Iterable[str]]] = [("", found, type(found).model_fields)]
+    parts.append(("squareness_rad.", found.squareness_rad, SQUARENESS))
+    parts += [(f"motions.{key}.", one, type(one).model_fields) for key, one in found.motions.items()]
+    parts += [] if found.covariance is None else [("covariance.", found.covariance, ("parameters", "matrix"))]
     return [
         f"{path}: key '{place}{key}' is not used ({nearest(key, valid)})"
-        for place, part, valid in places
-        for key in part
+        for place, part, valid in parts
+        for key in _further(part)
         if key not in valid
     ]
 

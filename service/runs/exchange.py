@@ -17,7 +17,6 @@ from abbe.service.errors import FileFormatError
 from abbe.service.runs.checks import check, check_run, read_json
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns, run_document, single_run, whole_run
-from abbe.service.runs.pieces import pieces_of
 from abbe.service.storage.store import Store
 
 CAMPAIGN_FILE = "campaign.json"
@@ -50,25 +49,24 @@ def read_folder(folder: Path) -> Folder:
     if folder.exists() and not folder.is_dir():
         raise FileFormatError(f"{folder} is a file, expected a folder", f"give the folder that holds {CAMPAIGN_FILE} and its run files")
     campaign = read_json(head)
-    check(head, campaign, CampaignFile)
+    parsed = check(head, campaign, CampaignFile)
     runs = []
-    for number, entry in enumerate(campaign["runs"], start=1):
-        path = folder / entry["file"]
+    for number, entry in enumerate(parsed.runs, start=1):
+        path = folder / entry.file
         run = read_json(path)
-        check_run(path, run)
-        for key, wanted in (
-            ("run_id", entry["run_id"]),
-            ("test", entry["test"]),
-            ("role", entry["role"]),
-            ("campaign", campaign["campaign"]),
+        read = check_run(path, run)
+        for key, wanted, got in (
+            ("run_id", entry.run_id, read.run_id),
+            ("test", entry.test, read.test),
+            ("role", entry.role, read.role),
+            ("campaign", parsed.campaign, read.campaign),
         ):
-            if run[key] != wanted:
-                raise FileFormatError(f"{path}: {key}: expected {wanted!r} as in {CAMPAIGN_FILE}, runs[{number}], got {run[key]!r}")
+            if got != wanted:
+                raise FileFormatError(f"{path}: {key}: expected {wanted!r} as in {CAMPAIGN_FILE}, runs[{number}], got {got!r}")
         runs.append(run)
     errors = None
-    errors_file = campaign["current_model"].get("errors")
-    if errors_file is not None:
-        path = folder / errors_file
+    if parsed.current_model.errors is not None:
+        path = folder / parsed.current_model.errors
         errors = read_json(path)
         check(path, errors, ErrorsFile)
     return Folder(campaign, runs, errors)
@@ -125,17 +123,16 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
 
 def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path) -> None:
     entries, setups = [], dict[str, Doc]()
-    joined = {piece.run for run in runs if run.status == COMPLETE for piece in pieces_of(run.start_doc)}
+    joined = {piece.run for run in runs if run.status == COMPLETE for piece in run.start.pieces}
     for run in runs:
         if run.id in joined:
             continue  # its readings are part of the resumed run: a measurement must not count twice
         chunks = store.chunks.of_run(run.id)
-        document = run_document(whole_run(store, run) if run.status == COMPLETE else single_run(run, chunks), run, chunks)
-        entry = run.start_doc.get("entry") or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
+        read = whole_run(store, run) if run.status == COMPLETE else single_run(run, chunks)
+        entry = run.start.entry or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
-        setup = document["setup"]
-        setups.setdefault(setup["setup_id"], {"kind": run.test.partition("_")[0], "t_set_s": setup["t_set_s"]})
-        _write_json(folder / entry["file"], document)
+        setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
+        _write_json(folder / entry["file"], run_document(read, run, chunks))
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
     if record.doc.get("errors") is not None:
         _write_json(folder / record.doc["imported"]["current_model"]["errors"], record.doc["errors"])
@@ -154,11 +151,9 @@ def _campaign_document(store: Store, record: CampaignRecord, entries: list[Doc],
 
 
 def _imported(entry: Doc, run: Doc) -> ImportedRun:
-    columns = run["columns"]
-    start_doc = {"setup": run["setup"], "machine": run["machine"], "entry": entry, "imported": run | {"columns": None}}
-    return ImportedRun(
-        run["run_id"], run["test"], run["role"], start_doc, len(columns["t_s"]), JSON_CODEC, encode_json(pack_columns(columns))
-    )
+    read, payload = Run.from_document(run), encode_json(pack_columns(run["columns"]))
+    start_doc = {"setup": read.setup.document, "machine": read.machine, "entry": entry, "imported": run | {"columns": None}}
+    return ImportedRun(read.run_id, read.test, read.role, start_doc, len(read.columns), JSON_CODEC, payload)
 
 
 def _safe(label: str) -> str:

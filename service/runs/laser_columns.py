@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from abbe.drivers.flags import beam_is_gone
-from abbe.service.domain.document import Doc
 from abbe.service.domain.run import Columns
+from abbe.service.domain.run_start import RunStart
 
 MM_PER_COUNT = 1e-7
 """The displacement counts tenths of a nanometre."""
 
 
-def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
+def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
     """Convert laser records to columns.
 
     Parameters
@@ -23,8 +23,8 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
     records : sequence of dict
         ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
         ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: no reading at that standstill.
-    start : dict
-        Start document (`abbe.service.runs.columns`).
+    start : RunStart
+        Its set-up states the beam.
 
     Returns
     -------
@@ -34,9 +34,9 @@ def laser_columns(records: Sequence[dict[str, Any]], start: Doc) -> Columns:
         their places.
     """
     first = records[0] if records else {}
-    beam = start["setup"]["nominal_beam"]
+    beam = start.setup["nominal_beam"]
     return Columns(
-        t_s=np.array([(one["ctrl_us"] - start["ctrl0_us"]) * 1e-6 for one in records], dtype=np.float64),
+        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
         q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
         feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
         direction=np.array([one["direction"] for one in records], dtype=np.float64),

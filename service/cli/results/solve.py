@@ -183,13 +183,15 @@ def _write_report(
 ) -> None:
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
+    from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.rendering.document_page import write_document
     from abbe.service.report.report import rules_of, solution_report
     from abbe.service.report.report_measured import SolutionResult
 
+    solution = SolutionFile.read(doc)
     rules = rules_of(None if machine is None else load_machine(machine).machine)
     made = SystemClock().utc().isoformat(timespec="seconds")
-    write_document(solution_report(store, campaign, SolutionResult(doc, doc.get("solution_id"), summary), made, rules), target)
+    write_document(solution_report(store, campaign, SolutionResult(solution, solution.solution_id, summary), made, rules), target)
 
 
 def _print(summary: Assessment, solution: SolutionFile) -> None:

@@ -7,6 +7,7 @@ from abbe.drivers.api import Condition, LaserReading
 from abbe.models.machine import Machine
 from abbe.service.campaigns import listen
 from abbe.service.campaigns.listen import Heard, planned_readings, row_times
+from abbe.service.domain.run_start import RunStart
 from abbe.service.runs.laser_columns import MM_PER_COUNT, laser_columns
 from abbe.service.runs.observations import run_data
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
@@ -93,7 +94,7 @@ async def listened(recipe, lost, monkeypatch):
     monkeypatch.setattr(listen, "_at_start", there)
     recorder, said = Recorder(), []
     end = await listen.listen_to(Devices(heard), recorder, plan, said.append)
-    return plan, laser_columns(recorder.records, {"setup": plan.setup, "ctrl0_us": 0}).to_document(), end, said
+    return plan, laser_columns(recorder.records, RunStart.from_document({"setup": plan.setup})).to_document(), end, said
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -134,7 +135,7 @@ async def test_where_the_first_reading_is_missing_the_others_count_from_the_firs
         )
         about = {"ctrl_us": 1_000_000 * k, "status": COMPENSATED, "signal_permille": 900, "air_temp_c": 20.0, "air_pressure_pa": 101325.0}
         records.append(told | about | {"target_mm": list(one.target_mm), "direction": one.direction, "feed_mm_min": 0.0})
-    columns = laser_columns(records, {"setup": plan.setup, "ctrl0_us": 0}).to_document()
+    columns = laser_columns(records, RunStart.from_document({"setup": plan.setup})).to_document()
     assert columns["valid"][0] == 0
     run = {"run_id": "r", "test": plan.test, "setup": plan.setup, "columns": columns}
     assert np.abs(run_data(run_of(run)).deviation_mm).max() < 1e-6
