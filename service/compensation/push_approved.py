@@ -22,7 +22,7 @@ from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.run import Run
-from abbe.service.domain.service_records import AlarmEntryRecord
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
@@ -30,7 +30,7 @@ from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import STOPPED
-from abbe.service.verification.alarm_states import NO_ALARM, AlarmKind
+from abbe.service.verification.alarm_states import NO_ALARM
 
 WAIT_S = 600.0
 """How long to wait for a machine on which the rollback is blocked; then the service reports it and retries."""

@@ -27,6 +27,7 @@ from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import SimulatorProcess, running_simulators
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import ignore_progress
+from abbe.service.domain.service_records import AlarmKind
 from abbe.service.errors import AbbeError, StoreError
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import solution_doc
@@ -35,7 +36,6 @@ from abbe.service.sequences.recipes.campaigns import identification, verificatio
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.users.people import People
-from abbe.service.verification.alarm_states import AlarmKind
 from abbe.service.verification.alarms import alarms_of
 from abbe.service.verification.verify import COVERAGE, figure_rows, figures
 

@@ -3,9 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.owner import Owner
+
+
+class AlarmKind(StrEnum):
+    """Kind of a line. The first four change the alarm itself, the others record the service's work on it."""
+
+    RAISED = "raised"
+    HELD = "held"
+    ACKNOWLEDGED = "acknowledged"
+    CLEARED = "cleared"
+    BEGUN = "begun"
+    MEASURED = "measured"
+    DISCOVERED = "discovered"
+    PROPOSED = "proposed"
+    FAILED = "failed"
+    ENDED = "ended"
+    PUSHING = "pushing"
+    PUSHED = "pushed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +34,7 @@ class AlarmEntryRecord:
     machine: str
     alarm: int
     seq: int
-    kind: str
+    kind: AlarmKind
     doc: Doc
     utc: str
 

@@ -31,8 +31,10 @@ from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import size_text, verdict_of
 from abbe.service.discovery.linear_change import drift_text
+from abbe.service.domain.document import Doc
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.service_records import AlarmKind
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import REMEDIES, current
 from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
@@ -42,7 +44,7 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import TRIES, Alarm, AlarmKind, Doc, next_step
+from abbe.service.verification.alarm_states import TRIES, Alarm, next_step
 
 BESIDE = 0.5
 """Largest share of the tables' promised gain that may need another remedy; above it that remedy comes first."""

@@ -14,6 +14,7 @@ from abbe.service.errors import NotStored, StoreError
 from abbe.service.queries.reader import Reader, as_stored, finite, of_row, read_as, storable
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, pack_bar
 from abbe.service.runs.columns import IMPORTED_CHANNEL, run_document, whole_run
+from abbe.service.sequences.journal import Trouble, not_written, troubles
 from abbe.service.storage.repositories.pages import visible_status
 from abbe.service.storage.store import Store
 
@@ -53,11 +54,17 @@ class RunSummary(RunFacts):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignDetail(CampaignSummary):
-    """A campaign with its runs in the order of measurement, and the numbers of its solutions and discoveries."""
+    """A campaign with its runs in the order of measurement, and the numbers of its solutions and discoveries.
+
+    ``incidents``: of the links while it was measured, None for an imported campaign; ``incidents_not_written``: those that the database
+    did not get in time.
+    """
 
     runs: list[RunSummary]
     solutions: list[int]
     discoveries: list[int]
+    incidents: list[Trouble] | None
+    incidents_not_written: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +104,9 @@ def campaign(reader: Reader, number: int) -> CampaignDetail:
     solutions, discoveries = (
         [one["id"] for one in reader.store.pages.page(kind, filters, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
     )
-    return of_row(CampaignDetail, row, runs=runs, solutions=solutions, discoveries=discoveries)
+    journal = reader.store.checkpoints.of_campaign(number)
+    known = {"incidents": troubles(journal) if journal else None, "incidents_not_written": not_written(journal)}
+    return of_row(CampaignDetail, row, runs=runs, solutions=solutions, discoveries=discoveries, **known)
 
 
 def runs(reader: Reader, filters: Mapping[str, str | None], cursor: int | None, limit: int) -> tuple[list[RunSummary], int | None]:

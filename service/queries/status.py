@@ -8,17 +8,16 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal, Protocol
 
-from pydantic import TypeAdapter
-
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import AlarmKind
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.results import latest_checks
 from abbe.service.queries.timetable import NextDue, next_due
-from abbe.service.verification.alarm_states import folded, is_open
-from abbe.service.verification.alarms import alarm_doc
+from abbe.service.storage.store import Store
+from abbe.service.verification.alarm_states import Alarm, Signal, folded, is_open
 from abbe.service.verification.verified_by import VerifiedBy, strange_table, verified_by
 
 LATEST = 10
@@ -36,19 +35,31 @@ class BrokerStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OpenAlarm:
-    """An alarm that is active or not acknowledged. ``signals``: figures that raised it; ``outcome``: actions so far."""
+class AlarmWork:
+    """One step of the service's work on an alarm."""
+
+    kind: AlarmKind
+    utc: datetime
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmSummary:
+    """An alarm for people. ``signals``: figures of the last check that raised or held it; ``outcome``: latest result of the work on it."""
 
     alarm: int
-    state: Literal["raised", "acknowledged", "cleared"]
+    state: Literal["raised", "acknowledged", "cleared", "closed"]
     recipe: str
     schedule: str
     text: str
-    signals: list[dict[str, str | float | None]]
+    signals: Sequence[Signal]
+    verification: int
     raised_utc: datetime
     acknowledged_by: str = ""
+    acknowledged_utc: datetime | None = None
     cleared_utc: datetime | None = None
     outcome: str = ""
+    work: Sequence[AlarmWork] = ()
     proposal: int | None = None
 
 
@@ -81,12 +92,9 @@ class Status(Activity):
     revision: str
     next_due: list[NextDue]
     mqtt: BrokerStatus
-    alarms: list[OpenAlarm] = field(default_factory=list)
+    alarms: list[AlarmSummary] = field(default_factory=list)
     last: list[Verification]
     verified: VerifiedBy
-
-
-_ALARM = TypeAdapter(OpenAlarm)
 
 
 class CoreState(Protocol):
@@ -181,7 +189,7 @@ class StatusReader:
             attention=attention,
             next_due=[next_due(schedule, slot_utc, now) for schedule, slot_utc in upcoming],
             mqtt=await self._mqtt(),
-            alarms=[_ALARM.validate_python(alarm_doc(one)) for one in reversed(folded(entries)) if is_open(one)],
+            alarms=summaries(folded(entries)),
             last=last,
             verified=known,
         )
@@ -191,3 +199,37 @@ class StatusReader:
             return BrokerStatus(configured=False)
         core, waiting = self._core, await asyncio.to_thread(self.reader.store.outbox.count)
         return BrokerStatus(configured=True, broker=self._broker, connected=core.mqtt_connected, waiting=waiting, dropped=core.mqtt_dropped)
+
+
+def alarms(store: Store, machine: str, *, every: bool = False) -> list[AlarmSummary]:
+    """Alarms of a machine, newest first: those that are active or not acknowledged, or all of them."""
+    return summaries(folded(store.alarms.entries(machine)), every=every)
+
+
+def summaries(found: Sequence[Alarm], *, every: bool = False) -> list[AlarmSummary]:
+    """Alarms, given oldest first, as people see them: newest first, only the open ones or all."""
+    return [_alarm(one) for one in reversed(found) if every or is_open(one)]
+
+
+def _alarm(one: Alarm) -> AlarmSummary:
+    proposed = one.last(AlarmKind.PROPOSED)
+    return AlarmSummary(
+        alarm=one.number,
+        state=one.word,
+        recipe=one.recipe,
+        schedule=one.schedule,
+        text=one.text,
+        signals=one.signals,
+        verification=one.verification,
+        raised_utc=datetime.fromisoformat(one.raised_utc),
+        acknowledged_by=one.acknowledged_by,
+        acknowledged_utc=_time(one.acknowledged_utc),
+        cleared_utc=_time(one.cleared_utc),
+        outcome=one.outcome,
+        work=[AlarmWork(kind=s.kind, utc=datetime.fromisoformat(s.utc), text=str(s.doc.get("text", ""))) for s in one.work],
+        proposal=None if proposed is None else proposed.doc.get("proposal"),
+    )
+
+
+def _time(utc: str) -> datetime | None:
+    return datetime.fromisoformat(utc) if utc else None

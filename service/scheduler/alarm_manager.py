@@ -17,7 +17,7 @@ from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Needs, Schedule
-from abbe.service.domain.service_records import AlarmEntryRecord
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler import record
@@ -27,7 +27,7 @@ from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind, folded, next_step
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, evaluate_alarm, last_seq
 
 log = structlog.get_logger("abbe.alarm")
@@ -223,7 +223,7 @@ class AlarmManager(RetryingStore):
 
         def append() -> AlarmEntryRecord:
             seq = 0 if number is None else last_seq(self._store.alarms.entries(self._machine), number) + 1
-            return self._store.alarms.append(self._machine, number, seq, str(kind), doc, messages)
+            return self._store.alarms.append(self._machine, number, seq, kind, doc, messages)
 
         entry = await self._write(append)
         if messages:

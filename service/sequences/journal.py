@@ -8,7 +8,6 @@ suspension), ``incident`` (a link failed, or recovered), ``ended``. ``docs/decis
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -82,14 +81,9 @@ class Trouble:
     code: str
     times: int = 0
     errors: int = 0
-    ends: Counter[str] = field(default_factory=Counter)
+    ends: dict[str, int] = field(default_factory=dict)
     runs: list[str] = field(default_factory=list)
     last: str = ""
-
-    def doc(self) -> dict[str, Any]:
-        """As JSON object."""
-        more = {"times": self.times, "errors": self.errors, "ends": dict(self.ends), "runs": self.runs, "last": self.last}
-        return {"link": self.link, "device": self.device, "code": self.code} | more
 
 
 def troubles(journal: Iterable[CheckpointRecord]) -> list[Trouble]:
@@ -104,12 +98,12 @@ def troubles(journal: Iterable[CheckpointRecord]) -> list[Trouble]:
             if doc["phase"] == DETECTED:
                 trouble.times += 1
             elif doc["phase"] == OUTCOME:
-                trouble.ends[str(doc["state"])] += 1
+                trouble.ends[str(doc["state"])] = trouble.ends.get(str(doc["state"]), 0) + 1
                 trouble.errors += int(doc.get("times", 1))
             if doc["run"] not in trouble.runs:
                 trouble.runs.append(str(doc["run"]))
     for trouble in found.values():
-        if (missing := trouble.times - trouble.ends.total()) > 0:
+        if (missing := trouble.times - sum(trouble.ends.values())) > 0:
             trouble.ends[UNKNOWN] = missing
     return list(found.values())
 

@@ -9,28 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from typing import Any, Protocol
+from typing import Literal
 
-Doc = dict[str, Any]
-
-
-class AlarmKind(StrEnum):
-    """Kind of a line. The first four change the alarm itself, the others record the service's work on it."""
-
-    RAISED = "raised"
-    HELD = "held"
-    ACKNOWLEDGED = "acknowledged"
-    CLEARED = "cleared"
-    BEGUN = "begun"
-    MEASURED = "measured"
-    DISCOVERED = "discovered"
-    PROPOSED = "proposed"
-    FAILED = "failed"
-    ENDED = "ended"
-    PUSHING = "pushing"
-    PUSHED = "pushed"
-
+from abbe.service.domain.document import Doc
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 
 OF_WORK = (
     AlarmKind.BEGUN,
@@ -46,35 +28,6 @@ TRIES = 2
 """Failures of a step, or unfinished campaigns, after which a person takes over."""
 NO_ALARM = 0
 """Number under which pushes without an alarm are recorded."""
-
-
-class AlarmLine(Protocol):
-    """An entry of the store."""
-
-    @property
-    def alarm(self) -> int:
-        """Number of the alarm."""
-        ...
-
-    @property
-    def seq(self) -> int:
-        """Number of the line."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """Kind of the line."""
-        ...
-
-    @property
-    def doc(self) -> Doc:
-        """Document of the line."""
-        ...
-
-    @property
-    def utc(self) -> str:
-        """Time of the line, UTC."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,16 +63,6 @@ class FiredRule:
 
 
 @dataclass(frozen=True, slots=True)
-class AlarmStep:
-    """One line about the work on an alarm."""
-
-    kind: AlarmKind
-    doc: Doc
-    utc: str
-    seq: int
-
-
-@dataclass(frozen=True, slots=True)
 class Alarm:
     """An alarm after all its lines. ``signals``: of the last check that raised or held it; ``first``: of the check that raised it."""
 
@@ -127,8 +70,8 @@ class Alarm:
     recipe: str
     schedule: str
     raised_utc: str
-    first: tuple[Doc, ...]
-    signals: tuple[Doc, ...]
+    first: tuple[Signal, ...]
+    signals: tuple[Signal, ...]
     text: str
     verification: int
     last_seq: int
@@ -138,16 +81,16 @@ class Alarm:
     acknowledged_by: str = ""
     acknowledged_utc: str = ""
     cleared_utc: str = ""
-    work: tuple[AlarmStep, ...] = field(default=())
+    work: tuple[AlarmEntryRecord, ...] = field(default=())
 
     @property
-    def word(self) -> str:
+    def word(self) -> Literal["raised", "acknowledged", "cleared", "closed"]:
         """``raised``, ``acknowledged``, ``cleared`` (not acknowledged) or ``closed``."""
         if self.active:
             return "acknowledged" if self.acknowledged_by else "raised"
         return "closed" if self.acknowledged_by else "cleared"
 
-    def last(self, *kinds: AlarmKind) -> AlarmStep | None:
+    def last(self, *kinds: AlarmKind) -> AlarmEntryRecord | None:
         """The last line of one of these kinds."""
         return next((s for s in reversed(self.work) if s.kind in kinds), None)
 
@@ -166,11 +109,11 @@ def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
     return AlarmKind.CLEARED if not found.signals and found.verdict == "pass" else AlarmKind.HELD
 
 
-def folded(lines: Iterable[AlarmLine]) -> list[Alarm]:
+def folded(lines: Iterable[AlarmEntryRecord]) -> list[Alarm]:
     """All alarms from their lines, oldest first. Lines of an alarm that was never raised are ignored."""
     found: dict[int, Alarm] = {}
     for line in lines:
-        if line.kind == AlarmKind.RAISED:
+        if line.kind is AlarmKind.RAISED:
             if line.alarm not in found and line.alarm != NO_ALARM:
                 found[line.alarm] = _raised(line)
         elif line.alarm in found:
@@ -178,9 +121,9 @@ def folded(lines: Iterable[AlarmLine]) -> list[Alarm]:
     return [found[number] for number in sorted(found)]
 
 
-def _raised(line: AlarmLine) -> Alarm:
+def _raised(line: AlarmEntryRecord) -> Alarm:
     d = line.doc
-    signals = tuple(d["signals"])
+    signals = _signals(d)
     return Alarm(
         line.alarm,
         d["recipe"],
@@ -196,16 +139,20 @@ def _raised(line: AlarmLine) -> Alarm:
     )
 
 
-def _followed(alarm: Alarm, line: AlarmLine) -> Alarm:
-    d, kind = line.doc, AlarmKind(line.kind)
+def _signals(doc: Doc) -> tuple[Signal, ...]:
+    return tuple(Signal(**one) for one in doc["signals"])
+
+
+def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:
+    d, kind = line.doc, line.kind
     alarm = replace(alarm, last_seq=line.seq, changed_utc=line.utc)
     if kind is AlarmKind.ACKNOWLEDGED:
         return alarm if alarm.acknowledged_by else replace(alarm, acknowledged_by=d["name"], acknowledged_utc=line.utc)
     if kind in OF_WORK:
-        return replace(alarm, work=(*alarm.work, AlarmStep(kind, d, line.utc, line.seq)))
+        return replace(alarm, work=(*alarm.work, line))
     if not alarm.active:
         return alarm
-    alarm = replace(alarm, signals=tuple(d["signals"]), text=d["text"], verification=d["verification"], held_seq=line.seq)
+    alarm = replace(alarm, signals=_signals(d), text=d["text"], verification=d["verification"], held_seq=line.seq)
     return replace(alarm, active=False, cleared_utc=line.utc) if kind is AlarmKind.CLEARED else alarm
 
 

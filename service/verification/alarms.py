@@ -11,11 +11,11 @@ import numpy as np
 from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, jumps, mean_of
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
-from abbe.service.domain.service_records import AlarmEntryRecord
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
-from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open
+from abbe.service.verification.alarm_states import Alarm, FiredRule, Signal, after_check, folded
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
 from abbe.service.verification.verify import judge
 
@@ -97,31 +97,6 @@ def alarms_of(store: Store, machine: str) -> list[Alarm]:
     return folded(store.alarms.entries(machine))
 
 
-def open_alarms(store: Store, machine: str) -> list[Alarm]:
-    """Alarms that are active or not acknowledged, newest first."""
-    return [one for one in reversed(alarms_of(store, machine)) if is_open(one)]
-
-
-def alarm_doc(one: Alarm) -> Doc:
-    """JSON value of an alarm for page, MQTT and commands."""
-    return {
-        "alarm": one.number,
-        "state": one.word,
-        "recipe": one.recipe,
-        "schedule": one.schedule,
-        "text": one.text,
-        "signals": list(one.signals),
-        "verification": one.verification,
-        "raised_utc": one.raised_utc,
-        "acknowledged_by": one.acknowledged_by,
-        "acknowledged_utc": one.acknowledged_utc or None,
-        "cleared_utc": one.cleared_utc or None,
-        "outcome": one.outcome,
-        "work": [{"kind": str(s.kind), "utc": s.utc, "text": str(s.doc.get("text", ""))} for s in one.work],
-        "proposal": None if (step := one.last(AlarmKind.PROPOSED)) is None else step.doc.get("proposal"),
-    }
-
-
 def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
     """Record that a person acknowledged an alarm.
 
@@ -166,7 +141,7 @@ def evaluate_alarm(store: Store, machine: str, recipe: str, records: Sequence[Ve
     begins, now = series_begins(store, machine), active_alarm(store, machine, recipe)
     compare = None
     if now is not None and (begins is None or begins < datetime.fromisoformat(now.raised_utc)):
-        compare = {d["figure"]: (d["baseline"], d["baseline_u"]) for d in now.first if d["kind"] == "jump"}
+        compare = {s.figure: (s.baseline, s.baseline_u) for s in now.first if s.baseline is not None and s.baseline_u is not None}
     found = found_in(records, AlarmTerms(recipe, begins, warn_days, compare))
     return AlarmCheck(after_check(now, found), now, found)
 

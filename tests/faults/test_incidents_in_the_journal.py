@@ -95,7 +95,9 @@ async def test_show_tells_a_campaigns_incidents_and_how_they_ended(place: Place)
     assert re.search(rf"controller +DRV-002 +1 +recovered 1 +run {run} test", shown.stdout)
     told = json.loads((await asyncio.to_thread(CliRunner().invoke, app, ["show", "c", "--db", place.url, "--json"])).stdout)
     assert [(one["code"], one["times"], one["ends"]) for one in told["incidents"]] == [("DRV-002", 1, {"recovered": 1})]
-    assert told["runs"] == [{"number": run, "run_id": "test", "test": "ballbar_helix", "status": "complete"}]
+    assert [(one["number"], one["run_id"], one["test"], one["status"]) for one in told["runs"]] == [
+        (run, "test", "ballbar_helix", "complete")
+    ]
 
 
 async def test_a_cable_that_is_pulled_is_noted_with_its_run_and_as_not_over(place: Place) -> None:

@@ -26,6 +26,7 @@ from abbe.service.core.board import Board
 from abbe.service.devices.session import open_session
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import AlarmKind
 from abbe.service.domain.verification import CheckResult
 from abbe.service.errors import StoreError
 from abbe.service.jobs.check import run_check
@@ -43,7 +44,7 @@ from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import Alarm, AlarmKind
+from abbe.service.verification.alarm_states import Alarm
 from abbe.service.verification.alarms import acknowledge, alarms_of
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims
@@ -142,8 +143,8 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         shop.sims.ask("drift", axis="X", um_per_m=120.0)
         (raised,) = await until(shop.alarms)
         assert raised.word == "raised"
-        assert {s["figure"] for s in raised.signals} >= {"helix_rms_um"}
-        assert all(s["expanded"] > 0 for s in raised.signals)
+        assert {s.figure for s in raised.signals} >= {"helix_rms_um"}
+        assert all(s.expanded > 0 for s in raised.signals)
 
         # nobody has asked for it: the full campaign, what is missing, the tables
         await until(lambda: shop.alarms()[0].last(AlarmKind.PROPOSED, AlarmKind.ENDED, AlarmKind.FAILED))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,12 +32,14 @@ def show_audit(
     as_json: JsonOption = False,
 ) -> None:
     """Show the newest records, oldest first."""
+    from abbe.service.queries.people import audit as records
+    from abbe.service.queries.reader import json_value
     from abbe.service.secrets import visible
 
     with open_store(database_url(db, machine)) as store:
-        found = store.audit.events(last)
+        found = records(store, last)
     if as_json:
-        print_json([asdict(record) for record in found])
+        print_json([json_value(record) for record in found])
         return
     # A line break in a target must not look like another record: tables alone would keep it.
     rows = [tuple(map(visible, (str(r.id), r.utc[:19], r.who, r.action, r.target, r.outcome))) for r in found]

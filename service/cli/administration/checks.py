@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, MachineOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, open_store, print_json, print_table
 
 alarm = typer.Typer(help="Alarms of the scheduled checks.", no_args_is_help=True)
 
@@ -22,22 +22,24 @@ def list_alarms(
     as_json: JsonOption = False,
 ) -> None:
     """Alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
-    from abbe.service.cli.common import open_store
     from abbe.service.config import load_machine
-    from abbe.service.verification.alarms import alarm_doc, alarms_of, open_alarms
+    from abbe.service.queries.reader import json_value
+    from abbe.service.queries.status import alarms
 
     loaded = load_machine(machine)
     with open_store(loaded.database_url) as store:
-        name = loaded.machine.name
-        docs = [alarm_doc(one) for one in (reversed(alarms_of(store, name)) if every else open_alarms(store, name))]
+        found = alarms(store, loaded.machine.name, every=every)
     if as_json:
-        print_json({"alarms": docs})
+        print_json({"alarms": [json_value(one) for one in found]})
         return
-    if not docs:
-        typer.echo(f"no alarm of {name} is open")
+    if not found:
+        typer.echo(f"no alarm of {loaded.machine.name} is open")
         return
-    keys = ("alarm", "state", "recipe", "raised_utc", "acknowledged_by", "text", "outcome")
-    print_table(("no", *keys[1:]), [tuple(str(doc[key]) for key in keys) for doc in docs])
+    rows = [
+        (str(one.alarm), one.state, one.recipe, f"{one.raised_utc:%Y-%m-%d %H:%M:%S}", one.acknowledged_by, one.text, one.outcome)
+        for one in found
+    ]
+    print_table(("no", "state", "recipe", "raised (UTC)", "acknowledged by", "text", "outcome"), rows)
 
 
 @alarm.command("acknowledge")
@@ -49,7 +51,6 @@ def acknowledge(
     ] = "",
 ) -> None:
     """Note that a person has seen an alarm. It stays active until a check clears it."""
-    from abbe.service.cli.common import open_store
     from abbe.service.compensation.proposals import login
     from abbe.service.config import load_machine
     from abbe.service.verification.alarms import acknowledge as work
@@ -68,10 +69,10 @@ def fleet(
     as_json: JsonOption = False,
 ) -> None:
     """List every machine of a database: state, last check with figures and U, next due, and which limit comes first."""
-    from abbe.service.cli.common import database_url, open_store
+    from abbe.service.cli.common import database_url
     from abbe.service.clock import SystemClock
-    from abbe.service.scheduler.fleet import HEADINGS, as_doc, row
-    from abbe.service.scheduler.fleet import fleet as lines_of
+    from abbe.service.queries.fleet import HEADINGS, as_doc, row
+    from abbe.service.queries.fleet import fleet as lines_of
     from abbe.service.storage.store import Store
 
     url = database_url(db, machine)

@@ -36,10 +36,13 @@ def add_user(name: Name, role: RoleArgument, db: DbOption = None, machine: Machi
 @user.command("list")
 def list_users(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """List users with their roles."""
+    from abbe.service.queries.people import users
+    from abbe.service.queries.reader import json_value
+
     with _people(db, machine) as (_, store):
-        found = store.people.all()
+        found = users(store)
     if as_json:
-        print_json([{"name": u.name, "role": u.role, "disabled_utc": u.disabled_utc, "created_utc": u.created_utc} for u in found])
+        print_json([json_value(one) for one in found])
         return
     rows = [(u.name, u.role, u.created_utc[:19], (u.disabled_utc or "")[:19]) for u in found]
     print_table(("name", "role", "since (UTC)", "disabled (UTC)"), rows)
@@ -96,14 +99,16 @@ def new_token(
 @token.command("list")
 def list_tokens(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """List tokens: user, scopes, expiry."""
+    from abbe.service.queries.people import tokens
+    from abbe.service.queries.reader import json_value
+
     with _people(db, machine) as (_, store):
-        found = store.people.tokens()
-    rows = [(owner.name, t.name, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t, owner in found]
-    headings = ("user", "token", "begins with", "scopes", "until (UTC)", "revoked (UTC)")
+        found = tokens(store)
     if as_json:
-        print_json([dict(zip(("user", "token", "prefix", "scopes", "expires_utc", "revoked_utc"), row, strict=True)) for row in rows])
+        print_json([json_value(one) for one in found])
         return
-    print_table(headings, rows)
+    rows = [(t.user, t.token, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t in found]
+    print_table(("user", "token", "begins with", "scopes", "until (UTC)", "revoked (UTC)"), rows)
 
 
 @token.command("revoke")

@@ -3,50 +3,60 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, run_or_campaign
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    database_url,
+    open_store,
+    print_json,
+    print_table,
+    reader,
+    run_or_campaign,
+)
 
 if TYPE_CHECKING:
-    from abbe.service.domain.measured import CampaignRecord, ChunkRecord, RunRecord
+    from abbe.service.domain.measured import ChunkRecord, RunRecord
+    from abbe.service.queries.measured import CampaignDetail
     from abbe.service.sequences.journal import Trouble
     from abbe.service.storage.store import Store
 
 
-def show_campaign(store: Store, campaign: CampaignRecord, *, as_json: bool) -> None:
+def show_campaign(store: Store, number: int, *, as_json: bool) -> None:
     """Print a campaign: one line for each run, one for each kind of incident and how it ended."""
-    from abbe.service.sequences.journal import not_written, troubles
+    from abbe.service.queries.measured import campaign
+    from abbe.service.queries.reader import json_value
 
-    runs, journal = store.runs.all(campaign.id), store.checkpoints.of_campaign(campaign.id)
-    found, lost = troubles(journal), not_written(journal)
-    who = {"number": campaign.id, "campaign": campaign.name, "machine": store.machines.get(campaign.machine_id).name}
-    who |= {"created_utc": campaign.created_utc}
+    found = campaign(reader(store), number)
     if as_json:
-        states = [{"number": one.id, "run_id": one.label, "test": one.test, "status": one.visible_status} for one in runs]
-        print_json(who | {"runs": states, "incidents": [one.doc() for one in found], "incidents_not_written": lost})
+        print_json(json_value(found))
         return
-    print_table(("key", "value"), [(key, str(value)) for key, value in who.items()], title=f"campaign {campaign.name}")
-    rows = [(str(one.id), one.label, one.test, one.visible_status, one.reason) for one in runs]
+    head = [(name, str(getattr(found, name))) for name in ("number", "name", "machine", "created_utc")]
+    print_table(("key", "value"), head, title=f"campaign {found.name}")
+    rows = [(str(one.number), one.run_id, one.test, one.status, one.reason) for one in found.runs]
     print_table(("number", "run", "test", "status", "reason"), rows, title="runs")
-    if journal:  # an imported campaign has no journal
-        _incidents(found, lost)
+    _print_incidents(found)
 
 
-def _incidents(found: list[Trouble], lost: int) -> None:
-    if found:
+def _print_incidents(found: CampaignDetail) -> None:
+    if found.incidents is None:
+        return
+    if found.incidents:
         heads = ("link", "code", "times", "how it ended", "runs", "latest")
-        print_table(heads, [_row(one) for one in found], title=f"incidents of the links: {sum(one.times for one in found)}")
+        times = sum(one.times for one in found.incidents)
+        print_table(heads, [_row(one) for one in found.incidents], title=f"incidents of the links: {times}")
     else:
         typer.echo("no incident of a link")
-    if lost:
-        typer.echo(f"{lost} incidents could not be written: the database was locked or gone")
+    if found.incidents_not_written:
+        typer.echo(f"{found.incidents_not_written} incidents could not be written: the database was locked or gone")
 
 
 def _row(one: Trouble) -> tuple[str, ...]:
-    doc: dict[str, Any] = one.doc()
-    ends = ", ".join(f"{state} {count}" for state, count in doc["ends"].items())
+    ends = ", ".join(f"{state} {count}" for state, count in one.ends.items())
     return (one.link, one.code, str(one.times), ends, ", ".join(one.runs), one.last)
 
 
@@ -90,7 +100,7 @@ def show(
     with open_store(database_url(db, machine)) as store:
         record = run_or_campaign(store, run)
         if not isinstance(record, RunRecord):
-            show_campaign(store, record, as_json=as_json)
+            show_campaign(store, record.id, as_json=as_json)
             return
         chunks = store.chunks.of_run(record.id)
         facts = json_value(run_summary(record, store.machines.get(store.campaigns.find(record.campaign_id).machine_id).name))

@@ -17,7 +17,7 @@ from sqlalchemy.exc import IntegrityError
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import Doc
 from abbe.service.domain.owner import Owner, this_process
-from abbe.service.domain.service_records import AlarmEntryRecord, HeartbeatRecord, OutboxRecord, ReplyRecord, SlotRecord
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind, HeartbeatRecord, OutboxRecord, ReplyRecord, SlotRecord
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
 from abbe.service.storage.repository import (
@@ -115,7 +115,7 @@ class Alarms(Repository):
     """Alarms of machines."""
 
     def append(
-        self, machine: str, alarm: int | None, seq: int, kind: str, doc: Doc, messages: Sequence[tuple[str, Doc]] = ()
+        self, machine: str, alarm: int | None, seq: int, kind: AlarmKind, doc: Doc, messages: Sequence[tuple[str, Doc]] = ()
     ) -> AlarmEntryRecord:
         """Append an entry to an alarm, with the messages for the broker: both or neither survive a power cut.
 
@@ -125,8 +125,6 @@ class Alarms(Repository):
             None: the next alarm of this machine. 0 collects entries that belong to no alarm.
         seq : int
             One more than the last entry that the caller has read, so that a decision on stale data is refused.
-        kind : str
-            One of `abbe.service.verification.alarm_states`.
         messages : sequence of (topic, document)
             Each document gets the number of the alarm.
 

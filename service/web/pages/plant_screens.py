@@ -19,7 +19,7 @@ from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.measured import CampaignRecord
 from abbe.service.domain.utc import utc_text
-from abbe.service.scheduler.fleet import FleetFigure, MachineStatus, machine_statuses
+from abbe.service.queries.fleet import FleetFigure, MachineStatus, machine_statuses
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.journal import Trouble, troubles
 from abbe.service.storage.store import Store

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sqlalchemy import func, select
 
-from abbe.service.scheduler.fleet import fleet
+from abbe.service.queries.fleet import fleet
 from abbe.service.storage.store import Store
 from abbe.service.storage.tables import chunks, runs
 from abbe.service.verification.trend_table import trends

@@ -25,7 +25,7 @@ from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.service_records import AlarmEntryRecord
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.jobs.at_start import push_is_open
 from abbe.service.jobs.investigate import InvestigationContext as Investigation
@@ -39,7 +39,7 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView, reconciled
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, utc
@@ -148,7 +148,7 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
 
 @pytest.fixture
 async def running(bench: Bench) -> AsyncIterator[Bench]:
-    bench.store.alarms.append("mill-7", None, 0, "raised", RAISED, [])
+    bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, RAISED, [])
     async with asyncio.TaskGroup() as tasks:
         timetable = tasks.create_task(bench.scheduler.run())
         yield bench
@@ -209,7 +209,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
             raise
 
     running.investigate = deaf
-    running.store.alarms.append("mill-7", 1, running.alarm().last_seq + 1, "held", RAISED, [])
+    running.store.alarms.append("mill-7", 1, running.alarm().last_seq + 1, AlarmKind.HELD, RAISED, [])
     await running.until(lambda: running.alarm().work[-1].kind is AlarmKind.BEGUN)
     assert (await running.steer("abort"))[0] == "done"  # at once: nothing of the work looks at the control
     await running.until(lambda: len(running.jobs("done: failed")) == 2)
@@ -476,7 +476,7 @@ async def test_what_is_open_by_the_journal(bench: Bench) -> None:
 
 async def test_after_a_kill_the_next_start_says_it_by_the_journal(bench: Bench) -> None:
     doc = {"proposal": 4, "approval": 9, "text": "proposal 4 is being pushed"}  # as releases before this one wrote it
-    bench.store.alarms.append("mill-7", NO_ALARM, 0, "pushing", doc, [])
+    bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, doc, [])
     await bench.journal(*KEPT)
     await bench.desk.due()
     last = bench.lines()[-1].doc

@@ -18,18 +18,20 @@ from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import AlarmKind
 from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.journal import GENESIS
+from abbe.service.queries.status import alarms
 from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import CheckJobs, carry_out
 from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, AlarmKind
-from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, open_alarms, series_begins
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm
+from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, series_begins
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
 
 START = utc(2026, 3, 1, 5)
@@ -173,13 +175,13 @@ async def test_raised_held_acknowledged_cleared_with_messages_and_audit(bench: B
     )
     assert await bench.check(LinkDown("laser", "read", "gone")) == ""  # its own alarm, and none of the trend's
     assert (await bench.check(result(2, 24.0))).startswith("alarm 1 held")
-    (one,) = open_alarms(bench.store, "mill-7")
-    assert (one.word, [s["kind"] for s in one.signals]) == ("raised", ["limit", "jump"])
+    (one,) = alarms(bench.store, "mill-7")
+    assert (one.state, [s.kind for s in one.signals]) == ("raised", ["limit", "jump"])
     assert acknowledge(bench.store, "mill-7", 1, "otto").word == "acknowledged"
     with pytest.raises(StoreError, match="was acknowledged by otto"):
         acknowledge(bench.store, "mill-7", 1, "anna")
     assert (await bench.check(result(3, 9.1))).startswith("alarm 1 cleared")
-    assert open_alarms(bench.store, "mill-7") == []
+    assert alarms(bench.store, "mill-7") == []
     assert bench.told() == [("ALM-001", 1), ("DRV-002", 0), ("ALM-002", 1)]
     assert [(r.target, r.outcome) for r in bench.store.audit.events()] == [("mill-7, alarm 1", "raised"), ("mill-7, alarm 1", "cleared")]
 
@@ -221,7 +223,7 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
     bench.store.pushes.append(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq
-    bench.store.alarms.append("mill-7", 1, last + 1, "pushed", {"word": "kept", "proposal": 1, "text": "proposal 1 kept"})
+    bench.store.alarms.append("mill-7", 1, last + 1, AlarmKind.PUSHED, {"word": "kept", "proposal": 1, "text": "proposal 1 kept"})
     follow_up = await bench.desk.due()
     assert follow_up is not None
     assert (follow_up.name, follow_up.schedule.recipe, follow_up.job) == ("daily (after push)", "quick-check", None)
@@ -236,7 +238,7 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
 
 async def test_a_push_that_the_service_did_not_survive_is_said_and_not_begun_again(url: str) -> None:
     with Store.open(url) as store:
-        store.alarms.append("mill-7", NO_ALARM, 0, "pushing", {"proposal": 7, "approval": 1, "text": "proposal 7 is being pushed"})
+        store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, {"proposal": 7, "approval": 1, "text": "proposal 7 is being pushed"})
         bench = Bench(store, url, push=True)
         assert await bench.follow_up() == ""
         begun, ended = store.alarms.entries("mill-7")
@@ -248,13 +250,13 @@ async def test_a_push_that_the_service_did_not_survive_is_said_and_not_begun_aga
 
 
 def test_a_line_on_old_knowledge_is_refused(bench: Bench) -> None:
-    bench.store.alarms.append("mill-7", None, 0, "raised", {})
-    bench.store.alarms.append("mill-7", 1, 1, "held", {})
+    bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, {})
+    bench.store.alarms.append("mill-7", 1, 1, AlarmKind.HELD, {})
     with pytest.raises(StoreError, match="alarm 1 of mill-7 was changed by somebody else"):
-        bench.store.alarms.append("mill-7", 1, 1, "cleared", {})
-    assert bench.store.alarms.append("mill-7", NO_ALARM, 0, "pushing", {}).alarm == NO_ALARM
-    assert bench.store.alarms.append("mill-7", None, 0, "raised", {}).alarm == 2
-    assert bench.store.alarms.append("mill-8", None, 0, "raised", {}).alarm == 1
+        bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CLEARED, {})
+    assert bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, {}).alarm == NO_ALARM
+    assert bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, {}).alarm == 2
+    assert bench.store.alarms.append("mill-8", None, 0, AlarmKind.RAISED, {}).alarm == 1
     assert [e.kind for e in bench.store.alarms.entries("mill-7")] == ["raised", "held", "pushing", "raised"]
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.service.verification.alarm_states import Alarm, AlarmKind, FiredRule, Signal, after_check, folded, is_open, next_step
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.verification.alarm_states import Alarm, FiredRule, Signal, after_check, folded, is_open, next_step
 
 RECIPE = "quick-check"
 SIGNAL = Signal("helix_rms_um", "limit", 8.8, 0.2, 7.0, "helix rms 8.8 ± 0.2 µm (U, k = 2) is above its limit of 7 µm")
@@ -19,20 +20,11 @@ UNSURE = FiredRule(True, "cannot tell")
 NOT_MEASURED = FiredRule(False, "cannot tell")
 
 
-@dataclass(frozen=True)
-class Line:
-    alarm: int
-    seq: int
-    kind: str
-    doc: dict[str, Any]
-    utc: str
-
-
 @dataclass
 class Book:
     """Lines as the store keeps them, and what a check or a person adds."""
 
-    lines: list[Line] = field(default_factory=list)
+    lines: list[AlarmEntryRecord] = field(default_factory=list)
 
     @property
     def alarms(self) -> list[Alarm]:
@@ -45,14 +37,14 @@ class Book:
     def add(self, number: int | None, kind: AlarmKind, **doc: Any) -> None:
         number = number or max((line.alarm for line in self.lines), default=0) + 1
         seq = max((line.seq for line in self.lines if line.alarm == number), default=-1) + 1
-        self.lines.append(Line(number, seq, str(kind), doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
+        self.lines.append(AlarmEntryRecord(0, "mill-7", number, seq, kind, doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
 
     def check(self, found: FiredRule) -> AlarmKind | None:
         now = self.active
         kind = after_check(now, found)
         if kind is not None:
             doc = {"recipe": RECIPE, "schedule": "often", "verification": len(self.lines), "text": found.text}
-            self.add(None if now is None else now.number, kind, signals=[s.text for s in found.signals], **doc)
+            self.add(None if now is None else now.number, kind, signals=[asdict(s) for s in found.signals], **doc)
         return kind
 
     def acknowledge(self, name: str = "otto") -> None:
@@ -132,7 +124,11 @@ def test_a_restart_anywhere_finds_the_same(acts: list[FiredRule | str], cut: int
 
 
 def test_lines_that_cannot_follow_are_left_out() -> None:
-    stray = [Line(0, 0, "pushed", {"text": "no alarm asked for it"}, "t"), Line(7, 0, "held", {}, "t"), Line(7, 1, "acknowledged", {}, "t")]
+    stray = [
+        AlarmEntryRecord(0, "mill-7", 0, 0, AlarmKind.PUSHED, {"text": "no alarm asked for it"}, "t"),
+        AlarmEntryRecord(0, "mill-7", 7, 0, AlarmKind.HELD, {}, "t"),
+        AlarmEntryRecord(0, "mill-7", 7, 1, AlarmKind.ACKNOWLEDGED, {}, "t"),
+    ]
     assert folded(stray) == []
 
 

@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import Connection, event
 
 from abbe.service.domain.results import VerificationRecord
-from abbe.service.scheduler.fleet import fleet
+from abbe.service.queries.fleet import fleet
 from abbe.service.storage.store import Store
 from abbe.service.verification.trend_table import trends
 from tests.experiments.bench.history_case import START, History, build

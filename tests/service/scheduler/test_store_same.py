@@ -16,7 +16,7 @@ from abbe.service.domain.owner import Owner
 from abbe.service.domain.people import TokenRecord
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import NewVersion
-from abbe.service.domain.service_records import SlotRecord
+from abbe.service.domain.service_records import AlarmKind, SlotRecord
 from abbe.service.errors import AbbeError
 from abbe.service.storage.repositories.pages import LISTINGS
 from abbe.service.storage.repository import Repository
@@ -207,7 +207,7 @@ def watched(ask: Any) -> None:
         ask.verifications.counts("none"),
     )
     for seq in (0, 0, 1):
-        ask.alarms.append("mill-7", None if seq == 0 else 1, seq, "raised", DOC, [("a/alarm", {"code": "ALM-001"})])
+        ask.alarms.append("mill-7", None if seq == 0 else 1, seq, AlarmKind.RAISED, DOC, [("a/alarm", {"code": "ALM-001"})])
     ask.alarms.entries("mill-7"), ask.alarms.entries("MILL-7")
     for name in ("mill-7", "MILL-7", "mill-7"):
         ask.heartbeats.put(name, DOC | {"name": name})
@@ -270,7 +270,11 @@ def refused(ask: Any) -> None:
         ask.tables.add(77, None, b"", 0, DOC),
     )
     ask.discoveries.add_step(1, 0, "BEGUN", DOC), ask.models.add(NewVersion("mill-7", None, DOC))
-    ask.alarms.append("mill-7", 1, 1, "held", DOC), ask.verifications.add(77, None, "pass", DOC), ask.checkpoints.add(77, "begun", DOC)
+    (
+        ask.alarms.append("mill-7", 1, 1, AlarmKind.HELD, DOC),
+        ask.verifications.add(77, None, "pass", DOC),
+        ask.checkpoints.add(77, "begun", DOC),
+    )
     (
         ask.proposals.approve(ProposalApproval(proposal_id=77, name="Anna", login="anna", digest="d" * 64, expiry="then")),
         ask.discoveries.add(77, "ab" * 32, DOC),

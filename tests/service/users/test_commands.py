@@ -107,7 +107,7 @@ def test_users_by_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert abbe("user", "password", "met", stdin=PHRASE + " 2\n")[0] == 0
     token = abbe("user", "token", "new", "met", "ci", "--scope", "read", "--scope", "solve", "--days", "2")[1].strip()
     assert token.startswith("abbe_")
-    assert json.loads(abbe("user", "token", "list", "--json")[1])[0]["scopes"] == "read, solve"
+    assert json.loads(abbe("user", "token", "list", "--json")[1])[0]["scopes"] == ["read", "solve"]
     assert abbe("user", "token", "revoke", "met", "ci")[0] == 0
     assert abbe("user", "role", "met", "viewer")[0] == abbe("user", "disable", "met")[0] == abbe("user", "enable", "met")[0] == 0
     assert [u["role"] for u in json.loads(abbe("user", "list", "--json")[1])] == ["admin", "viewer"]

@@ -25,13 +25,13 @@ from abbe.service.plant.gather import Gatherer, PlantFacts
 from abbe.service.plant.mtconnect import Agent
 from abbe.service.plant.opcua.space import picture_of
 from abbe.service.push.journal import StoreBook
+from abbe.service.queries.fleet import MachineStatus, machine_statuses
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusReader
 from abbe.service.rendering.document import Document
 from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler import record
-from abbe.service.scheduler.fleet import MachineStatus, machine_statuses
 from abbe.service.storage.store import Store
 from abbe.service.verification.verified_by import STRANGE_TABLE, VerifiedBy, verified_by
 from abbe.service.web.page import environment, render

@@ -15,9 +15,9 @@ import pytest
 
 from abbe.service.clock import SystemClock
 from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.queries.fleet import FleetFigure, MachineLine
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.scheduler.fleet import FleetFigure, MachineLine
 from abbe.service.storage.store import Store
 from abbe.service.web.app import create_app
 from abbe.service.web.pages.diagnostics import HIDDEN, blanked, blanked_doc, blanked_line

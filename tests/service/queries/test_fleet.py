@@ -21,7 +21,7 @@ from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.owner import Owner, this_process
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import HeartbeatRecord
-from abbe.service.scheduler.fleet import HEADINGS, MachineStatus, fleet, machine_statuses, row, state_of
+from abbe.service.queries.fleet import HEADINGS, MachineStatus, fleet, machine_statuses, row, state_of
 from abbe.service.scheduler.heartbeat import SILENT_AFTER, Heartbeat
 from abbe.service.storage.store import Store
 from tests.experiments.bench.history_case import START, History, build
