@@ -12,7 +12,7 @@ import scipy
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path, Places
-from abbe.models.effects.probe_paths import probe_paths
+from abbe.models.effects.self_test import probe_paths
 from abbe.models.functions.motions import ErrorMotions
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import Machine

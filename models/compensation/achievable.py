@@ -43,7 +43,7 @@ from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.solvers.assessment import motions_of
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability.parameters import observable_motions
+from abbe.models.solvers.observability.rank import observable_motions
 from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
 
 NODES = 7

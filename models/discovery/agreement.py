@@ -11,8 +11,8 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.case import CaseRun
-from abbe.models.discovery.noise import lone, unscaled
-from abbe.models.discovery.prediction import SolvedModel, free_columns, left_over
+from abbe.models.discovery.instrument_noise import lone, unscaled
+from abbe.models.discovery.solved_model import SolvedModel, free_columns, left_over
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.probability import f_above
 

@@ -113,7 +113,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class Unseen:
+class BlindSpot:
     """A blind spot of a campaign: ``what`` it cannot show, ``because`` of what, and the addition of run-format.md 5 that would show it."""
 
     what: str
@@ -186,5 +186,5 @@ class Discovery:
     beside: tuple[tuple[str, float], ...] = ()
     agreement: tuple[Agreement, ...] = ()
     unjudged: tuple[Unjudged, ...] = ()
-    unseen: tuple[Unseen, ...] = ()
+    unseen: tuple[BlindSpot, ...] = ()
     fitted: tuple[Fitted, ...] = ()

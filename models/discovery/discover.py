@@ -10,13 +10,12 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.finding import finding
-from abbe.models.discovery.noise import unscaled
-from abbe.models.discovery.prediction import predictions, solve
-from abbe.models.discovery.rivals import Rival, rivals_of
-from abbe.models.discovery.selection import Contest, Selection, dropped, selected, weighed
+from abbe.models.discovery.instrument_noise import unscaled
+from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
+from abbe.models.discovery.solved_model import predictions, solve
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance
 from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
 from abbe.models.effects.effect import Effect
@@ -28,6 +27,12 @@ GATE = 1.3
 """Readings below this multiple of the stick-slip speed are excluded from the mean ..."""
 MOST_GATED = 0.35
 """... unless they exceed this share of all readings."""
+Progress = Callable[[str, float], None]
+Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
+CLEAR = 1.0
+"""A rival replaces a name when it explains more by this chi-square, the margin that a new name also needs."""
+ROUNDS = 3
+"""Most repetitions of the search, each with noise and simulation refitted beside the findings."""
 
 
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
@@ -81,14 +86,6 @@ def _slow(problem: WhitenedProblem, axis: int, v_mm_s: float) -> F1:
 
 def _burst(problem: WhitenedProblem, t0_s: float, width_s: float) -> F1:
     return np.concatenate([(np.abs(p.at.t_s - t0_s) < 1.5 * width_s) * float(p.kind == "bar") for p in problem.paths])
-
-
-Progress = Callable[[str, float], None]
-Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
-CLEAR = 1.0
-"""A rival replaces a name when it explains more by this chi-square, the margin that a new name also needs."""
-ROUNDS = 3
-"""Most repetitions of the search, each with noise and simulation refitted beside the findings."""
 
 
 def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | None = None) -> Discovery:

@@ -11,18 +11,15 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.agreement import agreements
 from abbe.models.discovery.answer import Discovery, Gap, Localization, NamedEffect, NextTest, Verdict
-from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.candidate_bank import Pick
+from abbe.models.discovery.experiment.additions import blind_spots
 from abbe.models.discovery.experiment.design import SuspectEffect, propose
-from abbe.models.discovery.experiment.unnamed import propose_unnamed
 from abbe.models.discovery.generic.unnamed_structures import is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
-from abbe.models.discovery.localization import locate
-from abbe.models.discovery.prediction import SolvedModel, left_over, predictions
-from abbe.models.discovery.rivals import EXCLUDED, Rival
-from abbe.models.discovery.selection import Selection
-from abbe.models.discovery.signal_localization import localize_signal
-from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, structures
-from abbe.models.discovery.unseen import unseen
+from abbe.models.discovery.localization import localize_signal, locate
+from abbe.models.discovery.selection import EXCLUDED, Rival, Selection
+from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
+from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Family
@@ -52,6 +49,26 @@ OFFSET = "offset"
 """Prefix of forms whose first column is a constant: the start value of a sensor is no part of the swing."""
 TIME_TRUE_TO_FORM = 0.3
 """Relative standard uncertainty of a time constant: of several time constants, a short campaign shows the quick ones."""
+RESIDUE_SHARE = 0.001
+"""A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
+SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
+"""Stick-slip and vibration are residues below this share of the strongest mean effect, whatever the axis. A smooth effect leaves less
+that looks like scatter than one with corners or waves (a true stick-slip had 1.0 % of a pitch error)."""
+AXIS_SHARE = 0.02
+AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
+"""Effects at the reversals of one axis differ by their form only: below `AXIS_SHARE` the weaker is a residue of the stronger."""
+ROUGH = (*AT_TURNS, "cyclic_error")
+"""Effects with corners or waves."""
+KIN_SHARE = 0.03
+CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
+LAG = ("contour_lag", "servo_mismatch")
+SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
+"""Effects on the same clock, over the same positions, or lags of drives: the residue of one, off by a sixth (3 % squared), resembles
+another. Counted on 345 cases (lags on 150 others): ten false names at 0.2 to 2.9 % of the strong one, one true name at 9 %."""
+COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
+"""A name with less evidence than this share of another's, and this overlap of their signals, is a residue of the other."""
+STARTS = 2000.0
+"""Starts compared in a campaign; bounds the p-value of the best."""
 
 
 def true_to_form(name: str, family: Family) -> float:
@@ -121,24 +138,6 @@ def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2
 # Names that are only residues of a stronger effect, whose true form differs from its formula.
 
 
-RESIDUE_SHARE = 0.001
-"""A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
-SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
-"""Stick-slip and vibration are residues below this share of the strongest mean effect, whatever the axis. A smooth effect leaves less
-that looks like scatter than one with corners or waves (a true stick-slip had 1.0 % of a pitch error)."""
-AXIS_SHARE = 0.02
-AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
-"""Effects at the reversals of one axis differ by their form only: below `AXIS_SHARE` the weaker is a residue of the stronger."""
-ROUGH = (*AT_TURNS, "cyclic_error")
-"""Effects with corners or waves."""
-KIN_SHARE = 0.03
-CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
-LAG = ("contour_lag", "servo_mismatch")
-SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
-"""Effects on the same clock, over the same positions, or lags of drives: the residue of one, off by a sixth (3 % squared), resembles
-another. Counted on 345 cases (lags on 150 others): ten false names at 0.2 to 2.9 % of the strong one, one true name at 9 %."""
-
-
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
     """Names that the form of a stronger effect explains.
 
@@ -193,12 +192,6 @@ def _together(a: str, b: str) -> bool:
         return True
     directions = [key[1] for key in (a, b) if len(key) == 3 and key[1] in "XYZ"]
     return len(directions) == 2 and directions[0] == directions[1]
-
-
-COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
-"""A name with less evidence than this share of another's, and this overlap of their signals, is a residue of the other."""
-STARTS = 2000.0
-"""Starts compared in a campaign; bounds the p-value of the best."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +254,7 @@ def finding(
         beside=tuple((u.label, u.evidence) for u in unnamed) if is_named else (),
         agreement=agreement,
         unjudged=unjudged,
-        unseen=unseen(case) if verdict == "none" else (),
+        unseen=blind_spots(case) if verdict == "none" else (),
     )
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Agreement, Localization
 from abbe.models.discovery.case import Case, CaseRun
+from abbe.models.discovery.instrument_noise import CLEARLY
 from abbe.models.discovery.localization import locate
-from abbe.models.discovery.noise import CLEARLY
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.machine import AXES
 from abbe.models.probability import f_above

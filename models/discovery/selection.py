@@ -1,20 +1,28 @@
-"""Forward selection of missing effects with backward steps and a price for every parameter and label tried (discovery.md 4.6)."""
+"""Forward selection of missing effects with backward steps and a price for every parameter and label tried (discovery.md 4.6).
+
+A candidate's non-linear parameters are refined between the starts of its grid before it is compared (`refined`). Every other name is tried
+in the place of a chosen one, against the same readings (`rivals_of`, discovery.md 4.9).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+import scipy
 
 from abbe.models.arrays import F2
-from abbe.models.discovery.candidates import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of
+from abbe.models.discovery.candidate_bank import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of, with_values
 from abbe.models.discovery.generic.unnamed_structures import generic_rivals
-from abbe.models.discovery.refine import refined
 from abbe.models.discovery.whitened_problem import WhitenedProblem
-from abbe.models.effects.effect import Effect
+from abbe.models.effects.effect import Effect, Parameter
 
+SWEEPS = 2
+EVALUATIONS = 9
+NEAR = 0.02
+"""A structure without a name is refined within this share of its parameters' range."""
 MOST_EFFECTS = 5
 SHORTLIST = 6
 THRESHOLD = 4.0
@@ -32,6 +40,53 @@ UNNAMED_LABELS = 40
 """Kinds of structure without a name that are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """A freedom of form of a chosen effect pays this share of the price of its parameters, plus this."""
+EXCLUDED = 12.0
+"""A rival that explains less by this much chi-square, after its price, is excluded."""
+TRIED = 8
+KIN = 0.02
+"""Rivals that explain all but this share of the evidence are not excluded: a curved form of one resembles the other."""
+
+
+def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
+    """Best values near those of ``pick`` (one parameter after the other, between the neighbouring starts), and the gain there."""
+    best = gain_of(problem, pick, rows)
+    if not pick.effect.shape:
+        return pick, best
+    for sweep in range(sweeps if len(pick.effect.shape) > 1 else 1):
+        before = best
+        for parameter in pick.effect.shape:
+            pick, best = _along(parameter, pick, best, lambda p: gain_of(problem, p, rows), shrink=0.5**sweep)
+        if best - before < 0.3:
+            break
+    return pick, best
+
+
+def _along(parameter: Parameter, pick: Pick, best: float, gain: Callable[[Pick], float], shrink: float) -> tuple[Pick, float]:
+    value = pick.values[parameter.name]
+    low, high = _neighbours(parameter, value)
+    if pick.unnamed:  # its starts are the peaks of a scan, not a grid
+        reach = NEAR * (parameter.high - parameter.low)
+        low, high = max(low, value - reach), min(high, value + reach)
+    low, high = value + (low - value) * shrink, value + (high - value) * shrink
+    if not high > low:
+        return pick, best
+    logs = low > 0.0 and high / low > 1.5
+
+    def at(x: float) -> Pick:
+        return with_values(pick, {**pick.values, parameter.name: float(np.exp(x)) if logs else float(x)})
+
+    bounds = (np.log(low), np.log(high)) if logs else (low, high)
+    found = scipy.optimize.minimize_scalar(
+        lambda x: -gain(at(x)), bounds=bounds, method="bounded", options={"maxiter": EVALUATIONS, "xatol": 1e-4 * (bounds[1] - bounds[0])}
+    )
+    return (at(found.x), -float(found.fun)) if -found.fun > best else (pick, best)
+
+
+def _neighbours(parameter: Parameter, value: float) -> tuple[float, float]:
+    """The starts next to a value, or the bounds of the parameter."""
+    below = [s for s in parameter.starts if s < value * (1 - 1e-9) - 1e-12]
+    above = [s for s in parameter.starts if s > value * (1 + 1e-9) + 1e-12]
+    return max(below, default=parameter.low), min(above, default=parameter.high)
 
 
 @dataclass(frozen=True)
@@ -220,3 +275,48 @@ def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
         gain = gain_of(contest.problem, pick, others(contest.problem, picks, i))
         out.append(Selection(pick, gain, gain - contest.price(pick)))
     return out
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A name that could replace another, and its lack of chi-square (after price)."""
+
+    pick: Pick
+    deficit: float
+    share: float
+
+
+def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
+    """Names that the readings do not exclude in place of pick ``i``, the nearest first; variants of the same name are not rivals."""
+    picks = [f.pick for f in found]
+    rows = others(contest.problem, picks, i)
+    own = found[i]
+    without = [p.label for p in picks]
+    out = []
+    for candidate in contest.shortlist(rows, without, TRIED):
+        if candidate.pick.unnamed or _nested(candidate.pick, own.pick) or candidate.gain < 0.3 * own.gain:
+            continue
+        pick, gain = refined(contest.problem, candidate.pick, rows)
+        pick, gain, score = _formed(contest, pick, rows, gain)
+        rival = Rival(pick, own.score - score, gain / own.gain)
+        if rival.deficit < EXCLUDED or rival.share > 1.0 - KIN:
+            out.append(rival)
+    return sorted(out, key=lambda r: r.deficit)
+
+
+def _nested(a: Pick, b: Pick) -> bool:
+    """Whether one is a variant of the other: backlash and position-dependent backlash of one axis."""
+    return a.key == b.key and (a.effect.name == b.effect.variant_of or b.effect.name == a.effect.variant_of)
+
+
+def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:
+    """A rival with the freedoms of form that are worth their price, as for the chosen name."""
+    score = gain - contest.price(pick)
+    for form in pick.effect.forms:
+        more = replace(pick, forms=(*pick.forms, form))
+        with_form = gain_of(contest.problem, more, rows)
+        if with_form - gain < FORM_LEAST * gain:  # the same rule as for the chosen name
+            continue
+        if with_form - contest.price(more) > score:
+            pick, gain, score = more, with_form, with_form - contest.price(more)
+    return pick, gain, score

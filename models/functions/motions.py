@@ -7,17 +7,50 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.axis_function import AxisFunction, axes_positions, interval
 from abbe.models.functions.line_fit import straight_line
-from abbe.models.functions.quadrature import nodes
 from abbe.models.functions.table import Table
 from abbe.models.machine import AXES
 
 PASSES = 2
 """The first takes the line away, the second what rounding left of it."""
+ROTATIONS = ("A", "B", "C")
+REVERSE = "@reverse"
+SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
+"""Axis, component and sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/explanation/conventions.md)."""
+_SLOPES = {"EXY": ("C0Y", -1.0), "EXZ": ("B0Z", 1.0), "EYZ": ("A0Z", -1.0), "EYX": ("C0Y", -1.0), "EZX": ("B0Z", 1.0), "EZY": ("A0Z", -1.0)}
+"""What the slope of a straightness adds to which squareness (angle of +a and +b less 90 degrees, math.md 1)."""
+_TURNS = {"EYX": (2, 1.0), "EZX": (1, -1.0), "EZY": (0, 1.0)}
+"""The frame turns about this axis when the slope of the datum's own straightness goes into squareness."""
+
+
+def nodes(stroke_mm: tuple[float, float], breaks_mm: F1, count: int) -> tuple[F1, F1]:
+    """Gauss-Legendre nodes and weights over a stroke, piece by piece.
+
+    Parameters
+    ----------
+    stroke_mm : (smaller, larger)
+    breaks_mm : array
+        Where pieces meet, in any order; those outside the stroke do not matter.
+    count : int
+        Nodes per piece: integrals of polynomials up to degree 2 count - 1 are exact.
+
+    Returns
+    -------
+    two arrays, shape (pieces * count,)
+        Positions and weights in mm; the weights add up to the length of the stroke.
+    """
+    lo, hi = stroke_mm
+    inner = np.unique(breaks_mm[(breaks_mm > lo) & (breaks_mm < hi)])
+    edges = np.concatenate([[lo], inner, [hi]])
+    u, w = legendre.leggauss(count)
+    half = 0.5 * np.diff(edges)[:, None]
+    middle = 0.5 * (edges[1:] + edges[:-1])[:, None]
+    return (middle + half * u).ravel(), (half * w).ravel()
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,18 +160,6 @@ def _inside(function: AxisFunction, stroke_mm: ArrayLike) -> tuple[float, float]
     if stroke[0] < lo - slack or stroke[1] > hi + slack:
         raise ValueError(f"stroke {stroke[0]:g} to {stroke[1]:g} mm goes beyond the function's domain, {lo:g} to {hi:g} mm")
     return float(np.clip(stroke[0], lo, hi)), float(np.clip(stroke[1], lo, hi))
-
-
-ROTATIONS = ("A", "B", "C")
-REVERSE = "@reverse"
-SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
-"""Axis, component and sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/explanation/conventions.md)."""
-
-_SLOPES = {"EXY": ("C0Y", -1.0), "EXZ": ("B0Z", 1.0), "EYZ": ("A0Z", -1.0), "EYX": ("C0Y", -1.0), "EZX": ("B0Z", 1.0), "EZY": ("A0Z", -1.0)}
-"""What the slope of a straightness adds to which squareness (angle of +a and +b less 90 degrees, math.md 1)."""
-
-_TURNS = {"EYX": (2, 1.0), "EZX": (1, -1.0), "EZY": (0, 1.0)}
-"""The frame turns about this axis when the slope of the datum's own straightness goes into squareness."""
 
 
 def motion_names(axis: str) -> tuple[str, ...]:

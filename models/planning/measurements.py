@@ -1,11 +1,14 @@
-"""Measurements a plan chooses from: set-up, positions and expected record of each.
+"""What a campaign can use and do: instruments with the minutes of their set-ups, and all collision-free measurements with their records.
 
-The service's sequences move to the same positions (a test keeps both in step); here they are reduced to the needs of the solver's design.
+Measurements are helices, edge lines and body diagonals. Collision-free means: the whole path lies inside the strokes less a clearance;
+hemispheres open towards the spindle, so that it never comes beyond the cup (`opening`); laser paths stay inside the strokes. The service's
+sequences move to the same positions (a test keeps both in step); here they are reduced to the needs of the solver's design.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import permutations, product
 
 import numpy as np
 
@@ -13,10 +16,13 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
-from abbe.models.planning.instruments import Instruments
+from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.observations import RunData, Test
+from abbe.models.solvers.priors import U_WAVELENGTH
+from abbe.models.uncertainty.inputs import StatedInputs
 
+BAR_LENGTHS_MM = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
+"""Bars that exist as a bar with extensions."""
 Point = tuple[float, float, float]
 RAPID_MM_MIN = 6000.0
 BAR_FEED_MM_MIN = 2000.0
@@ -28,6 +34,85 @@ CLEARANCE_MM = 10.0
 BAR_VALUES = 400
 """Block averages that one ball-bar run gives the solution."""
 _FINE = 8
+BAR_CLEARANCE_MM = 5.0
+"""Hemispheres keep this distance from the ends of the strokes: approach, lost motion and cup offset need some."""
+EDGES = (0.1, 0.5, 0.9)
+"""Relative places of laser lines across the two other axes."""
+ORDERS = tuple("".join(p) for p in permutations("XYZ"))
+SHORTEST_TOOL_MM = 1.0
+"""A shorter tool does not show the side of the spindle."""
+OBLIQUE = 0.5
+"""Second longest component of a tool over its longest, from which on the spindle's direction is doubtful."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetupMinutes:
+    """How long a person needs for each set-up, minutes: typical figures, to be replaced by one's own.
+
+    Attributes
+    ----------
+    cup : put up cup and bar at a new centre.
+    bar : hang another bar in at the same cup. Another direction with the same bar takes no set-up at all.
+    line : align the laser along an edge.
+    diagonal : align laser and flat mirror along a body diagonal. Another step order on the same mirror takes no set-up at all.
+    """
+
+    cup: float = 3.0
+    bar: float = 1.5
+    line: float = 5.0
+    diagonal: float = 8.0
+
+    def __post_init__(self) -> None:
+        """Refuse negative times."""
+        if not all(0 <= v < float("inf") for v in (self.cup, self.bar, self.line, self.diagonal)):
+            raise ValueError("set-up minutes: every time must be 0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class Instruments:
+    """What there is to measure with, and how well it reads.
+
+    Attributes
+    ----------
+    bar_lengths_mm : tuple of float
+        Nominal lengths of the ball-bars at hand; empty: no ball-bar.
+    laser : bool
+        Whether there is a laser with a flat mirror.
+    bar_noise_mm, laser_noise_mm : float
+        Standard deviation of one reading.
+    floor_mm : float
+        Smallest uncertainty of an averaged value: what smooth error functions do not follow (as in the joint solution).
+    u_bar_length_mm : float
+        Standard uncertainty of each bar's calibrated length.
+    u_wavelength : float
+        Relative standard uncertainty of the laser's wavelength, common to all laser runs.
+    setup : SetupMinutes
+        How long set-ups take.
+    max_feed_mm_min : float
+        Fastest feed of any measurement on the machine.
+    inputs : StatedInputs
+        How well temperatures of bars and scales are known; default: as in the budget of a solution.
+    """
+
+    bar_lengths_mm: tuple[float, ...] = BAR_LENGTHS_MM
+    laser: bool = True
+    bar_noise_mm: float = 0.5e-3
+    laser_noise_mm: float = 0.3e-3
+    floor_mm: float = 0.3e-3
+    u_bar_length_mm: float = 2e-3
+    u_wavelength: float = U_WAVELENGTH
+    setup: SetupMinutes = field(default_factory=SetupMinutes)
+    max_feed_mm_min: float = 6000.0
+    inputs: StatedInputs = field(default_factory=StatedInputs)
+
+    def __post_init__(self) -> None:
+        """Refuse what no instrument has, in one line."""
+        noise = (self.bar_noise_mm, self.laser_noise_mm)
+        sizes = (*self.bar_lengths_mm, *noise, self.u_bar_length_mm, self.u_wavelength, self.max_feed_mm_min)
+        if not all(0 < v < float("inf") for v in sizes) or not 0 <= self.floor_mm < float("inf"):
+            raise ValueError("instruments: lengths, noise, uncertainties and feed must be positive numbers")
+        if not self.bar_lengths_mm and not self.laser:
+            raise ValueError("instruments: neither a ball-bar nor a laser")
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,3 +257,92 @@ def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: f
         length_calibrated=True,
         test="helix",
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """Where hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why that may be wrong; empty where the tool states it."""
+
+    axis: int
+    side: int
+    warning: str = ""
+
+    @property
+    def text(self) -> str:
+        """For example +Z."""
+        return f"{'+' if self.side > 0 else '-'}{AXES[self.axis]}"
+
+
+def opening(machine: Machine, vertical: int = 2) -> Opening:
+    """Side on which the spindle is, seen from the cup: against the tool, which reaches from the spindle to the ball.
+
+    Without a known tool: the upper side of the vertical axis, which is right for a vertical spindle.
+    """
+    longest = int(np.argmax(np.abs(machine.tool_mm)))
+    sizes = np.sort(np.abs(machine.tool_mm))
+    if sizes[2] < SHORTEST_TOOL_MM:
+        reason = f"hemispheres open along +{AXES[vertical]}, the vertical axis: without tool_mm nothing says where the spindle is"
+        return Opening(vertical, 1, f"{reason}; if it is horizontal, state tool_mm in the machine file, else it may meet the cup")
+    found = Opening(longest, -1 if machine.tool_mm[longest] > 0 else 1)
+    if sizes[1] < OBLIQUE * sizes[2]:
+        return found
+    tool = ", ".join(f"{v:g}" for v in machine.tool_mm)
+    warning = (
+        f"hemispheres open along {found.text}, against the longest part of tool_mm ({tool}): it is oblique, look where the spindle goes"
+    )
+    return Opening(found.axis, found.side, warning)
+
+
+def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple[Measurement, ...]:
+    """All measurements that the planner may choose from, helices first.
+
+    Parameters
+    ----------
+    vertical : int
+        Index of the vertical axis: hemispheres open along it if the tool does not show the side of the spindle (`opening`).
+
+    Raises
+    ------
+    ValueError
+        Nothing fits into the strokes.
+    """
+    found: list[Measurement] = []
+    spindle = opening(machine, vertical)
+    for radius in sorted(tools.bar_lengths_mm):
+        found += [HelixTest(c, radius, axis=spindle.axis, opens=spindle.side) for c in helix_centres(machine, radius, spindle)]
+    if tools.laser and (machine.length_mm > 4 * CLEARANCE_MM).all():
+        found += [LineTest(a, (u, v)) for a in range(3) for u, v in product(EDGES, repeat=2)]
+        found += [DiagonalTest(d, order) for d in DIAGONALS for order in (*ORDERS, "")]
+    if not found:
+        raise ValueError("planner: no helix of the bars at hand and no laser path fits into the strokes")
+    return tuple(found)
+
+
+def _room(machine: Machine, radius_mm: float, spindle: Opening) -> tuple[F1, F1]:
+    """Lowest and highest cup place (whole mm) at which the hemisphere of a radius stays inside the strokes."""
+    below, above = np.full(3, radius_mm + BAR_CLEARANCE_MM), np.full(3, radius_mm + BAR_CLEARANCE_MM)
+    (below if spindle.side > 0 else above)[spindle.axis] = BAR_CLEARANCE_MM
+    return np.ceil(machine.stroke_mm[:, 0] + below), np.floor(machine.stroke_mm[:, 1] - above)
+
+
+def bars_that_fit(machine: Machine, tools: Instruments, test: HelixTest) -> tuple[float, ...]:
+    """Bars whose whole hemisphere about the cup of a helix stays inside the strokes."""
+    fit = []
+    for radius in tools.bar_lengths_mm:
+        lo, hi = _room(machine, radius, Opening(test.axis, test.opens))
+        if (lo <= test.centre_mm).all() and (test.centre_mm <= hi).all():
+            fit.append(radius)
+    return tuple(fit)
+
+
+def helix_centres(machine: Machine, radius_mm: float, spindle: Opening) -> tuple[Point, ...]:
+    """Cup places (whole mm) at which the whole hemisphere of a radius stays inside the strokes."""
+    lo, hi = _room(machine, radius_mm, spindle)
+    if (hi < lo).any():
+        return ()
+    places = []
+    for a in range(3):
+        room = hi[a] - lo[a]
+        n = 1 if room < 0.2 * radius_mm else 2 if room < 0.7 * radius_mm else 3
+        places.append([float(v) for v in np.round(np.linspace(lo[a], hi[a], n) if n > 1 else [0.5 * (lo[a] + hi[a])])])
+    return tuple((x, y, z) for x, y, z in product(*places))

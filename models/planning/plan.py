@@ -13,17 +13,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.models.planning.candidates import candidates, opening
-from abbe.models.planning.goal import COVERAGE, Goal, limit, minutes_needed, shortest
-from abbe.models.planning.information import PlanningProblem, field_rows, problem, scale_temperature_mm2, uncertainty_mm
-from abbe.models.planning.instruments import Instruments
-from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, expected_run
-from abbe.models.planning.search import Chosen, Search
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, Instruments, Measurement, candidates, expected_run, opening
+from abbe.models.planning.problem import PlanningProblem, field_rows, problem, scale_temperature_mm2, uncertainty_mm
+from abbe.models.planning.search import COVERAGE, Chosen, Goal, Search, limit, minutes_needed, shortest
 from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 
 # Sentences about the blind spots of a planned campaign, before anything is measured.
+
+__all__ = ["Plan", "PlanStep", "laid_out", "plan_campaign", "uncertainty_mm"]
+PLAN_ORDER = 8
+"""Legendre order of the error motions a plan is judged with; orders above 6 fade in the prior."""
+INNER_SHARE = 0.8
+REPORT_NODES = 5
+PASSES = 8
 
 
 def not_observable(what: PlanningProblem, runs: Iterable[RunData]) -> tuple[str, ...]:
@@ -49,15 +53,6 @@ def not_observable(what: PlanningProblem, runs: Iterable[RunData]) -> tuple[str,
             f"({tool}) mm, but do with another. All of this holds for this tool length only."
         )
     return (*out, *(a.text for a in found.advice))
-
-
-__all__ = ["Plan", "PlanStep", "laid_out", "plan_campaign", "uncertainty_mm"]
-
-PLAN_ORDER = 8
-"""Legendre order of the error motions a plan is judged with; orders above 6 fade in the prior."""
-INNER_SHARE = 0.8
-REPORT_NODES = 5
-PASSES = 8
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
-"""Choice of measurements for the available minutes: greedy by gain per minute, then exchange passes.
+"""Choice of measurements for the available minutes: greedy by gain per minute, then exchanges; minutes for a wanted uncertainty.
 
 The criterion is I-optimal: the variance of the predicted, rigid-motion-free deviation over the inner volume, as a power mean over the
-nodes that leans on the worst node (power 1 would be the plain mean, an infinite power the worst node alone). What no choice of
-measurements changes (temperature of the scales) is left out of it.
+nodes that leans on the worst node (power 1 is the plain mean, an infinite power the worst node). It leaves out what no choice of
+measurements changes (temperature of the scales).
 """
 
 from __future__ import annotations
@@ -15,10 +15,17 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
-from abbe.models.planning.candidates import bars_that_fit
-from abbe.models.planning.information import PlanningProblem, factor, field_rows, mounting_information
-from abbe.models.planning.instruments import SetupMinutes
-from abbe.models.planning.measurements import HelixTest, LineTest, Measurement, machine_seconds
+from abbe.models.planning.measurements import HelixTest, LineTest, Measurement, SetupMinutes, bars_that_fit, machine_seconds
+from abbe.models.planning.problem import (
+    BAR_SCALE,
+    LASER_SCALE,
+    PlanningProblem,
+    factor,
+    field_rows,
+    mounting_information,
+    scale_temperature_mm2,
+    uncertainty_mm,
+)
 
 POWER = 4.0
 """Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
@@ -30,6 +37,12 @@ LOOK_AT_ALL = 4
 
 Chosen = dict[str, tuple[Measurement, ...]]
 """Mounting to its tests, in the order in which they were chosen."""
+COVERAGE = 2.0
+"""U = 2 u."""
+LONGEST_MIN = 480.0
+"""Longest plan, one day's work: beyond it the answer is the limit."""
+_FOREVER = 1e6
+_KNOWN = 1e12
 
 
 def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, before: tuple[Measurement, ...]) -> float:
@@ -194,3 +207,82 @@ def _without_one(chosen: Chosen) -> list[Chosen]:
         if len(tests) > 1:
             out.append({k: (v[:-1] if k == name else v) for k, v in chosen.items()})
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """Result for a wanted expanded uncertainty.
+
+    Attributes
+    ----------
+    wanted_mm : float
+        Largest U = 2 u of the deviation vector in the inner volume.
+    reached : bool
+        Whether the plan reaches it.
+    minutes_needed : float or None
+        Minutes after which it is reached; None: not within `LONGEST_MIN`.
+    limit_mm : float
+        U that every measurement the planner knows, repeated without end, and the temperature of the scales would leave: no plan comes
+        below it.
+    limit_by : str
+        Main contribution to the limit, as text.
+    """
+
+    wanted_mm: float
+    reached: bool
+    minutes_needed: float | None
+    limit_mm: float
+    limit_by: str
+
+
+def limit(search: Search, rows: F2) -> tuple[float, str]:
+    """Expanded uncertainty (mm) that endless repetition of everything would leave at the worst node, and what makes most of it."""
+    what, total = search.what, np.zeros((search.what.size, search.what.size))
+    for test in search.candidates:
+        total += search.mounting((test,))
+    information, stated = np.eye(what.size) + _FOREVER * total, scale_temperature_mm2(what, rows)
+    scales = np.array([n.startswith("bar_length_") or n in (LASER_SCALE, BAR_SCALE) for n in what.names])
+    whole = uncertainty_mm(information, rows, stated)[0]
+    readings = uncertainty_mm(information, rows)[0]
+    unseen = uncertainty_mm(information + np.diag(np.where(scales, _KNOWN, 0.0)), rows)[0]
+    shares = {
+        "the temperature of the machine's scales, which no measurement tells for another day": whole**2 - readings**2,
+        "the calibration of the bars, their temperature and the laser's wavelength": readings**2 - unseen**2,
+        "combinations of error motions that none of these measurements sees": unseen**2,
+    }
+    return COVERAGE * whole, max(shares, key=lambda name: shares[name])
+
+
+def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, passes: int) -> tuple[Chosen, bool]:
+    """The shortest plan found that reaches the goal within the budget, or the best plan for the budget and False."""
+    first = minutes_needed(search, rows, wanted_mm, {}, budget_min)
+    if first is None:
+        chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)
+        return chosen, bool(chosen) and _enough(search, rows, chosen, wanted_mm)
+    chosen = search.exchange(search.best_fill(first), first, passes)
+    if not _enough(search, rows, chosen, wanted_mm):  # the criterion leans on the worst node, it is not the worst node
+        chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)
+        return chosen, _enough(search, rows, chosen, wanted_mm)
+    while True:
+        tighter = 0.93 * search.total_min(chosen)
+        trial = search.exchange(search.best_fill(tighter), tighter, passes)
+        if not trial or not _enough(search, rows, trial, wanted_mm):
+            return chosen, True
+        chosen = trial
+
+
+def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen, longest_min: float = LONGEST_MIN) -> float | None:
+    """Minutes at which going on from a plan reaches the goal; None: not within the longest time."""
+    chosen = dict(start)
+    while True:
+        left = longest_min - search.total_min(chosen)
+        test = search.best_addition(chosen, left)
+        if test is None:
+            return None
+        chosen[test.mounting] = (*chosen.get(test.mounting, ()), test)
+        if _enough(search, rows, chosen, wanted_mm):
+            return search.total_min(chosen)
+
+
+def _enough(search: Search, rows: F2, chosen: Chosen, wanted_mm: float) -> bool:
+    return COVERAGE * uncertainty_mm(search.information(chosen), rows, scale_temperature_mm2(search.what, rows))[0] <= wanted_mm

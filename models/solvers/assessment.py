@@ -18,23 +18,21 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.cures import CampaignLayout
 from abbe.models.solvers.observability.hidden import Advice, HiddenGroup, picture
-from abbe.models.solvers.observability.parameters import (
+from abbe.models.solvers.observability.rank import (
+    CampaignColumns,
     Correlation,
+    Knowledge,
     MotionStatus,
+    ObservedInformation,
     ParameterStatus,
+    campaign_columns,
+    compressed,
     correlations,
     hidden_free,
     hidden_terms,
     motions,
-    parameters,
-)
-from abbe.models.solvers.observability.rank import (
-    CampaignColumns,
-    Knowledge,
-    ObservedInformation,
-    campaign_columns,
-    compressed,
     observed_information,
+    parameters,
     stated_knowledge,
 )
 from abbe.models.solvers.observability.volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume

@@ -21,8 +21,7 @@ from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, b
 from abbe.models.solvers.identifiability import Identifiability, combinations_of, taking_part
 from abbe.models.solvers.information import KINDS, total
 from abbe.models.solvers.least_squares import ParameterEstimate
-from abbe.models.solvers.observability.parameters import hidden_free
-from abbe.models.solvers.observability.rank import campaign_columns, compressed, observed_information, stated_knowledge
+from abbe.models.solvers.observability.rank import campaign_columns, compressed, hidden_free, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns
 from abbe.models.solvers.priors import Priors

@@ -99,7 +99,7 @@ def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
     """Displacement errors by the printed formulas (7) and (8), three of four diagonals (Wang; math.md 5.1).
 
     The coefficients of (4) to (8) are lost in the print and rebuilt in math.md 5.1. Angular errors and mirror tilt enter as false errors
-    (`abbe.models.papers.wang.angular`, `abbe.models.papers.wang.mirror.tilt_bias_eq7`).
+    (`abbe.models.papers.wang.squareness`, `abbe.models.papers.wang.model.tilt_bias_eq7`).
 
     Parameters
     ----------

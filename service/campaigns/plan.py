@@ -15,10 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
-from abbe.models.planning.goal import COVERAGE
-from abbe.models.planning.instruments import BAR_LENGTHS_MM, Instruments, SetupMinutes
-from abbe.models.planning.measurements import DiagonalTest, HelixTest, Measurement, feed_mm_min
+from abbe.models.planning.measurements import BAR_LENGTHS_MM, DiagonalTest, HelixTest, Instruments, Measurement, SetupMinutes, feed_mm_min
 from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, PlanStep, plan_campaign
+from abbe.models.planning.search import COVERAGE
 from abbe.service.config import read_toml
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import ConfigError

@@ -13,7 +13,7 @@ from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import Progress, discover
 from abbe.models.discovery.finding import gaps_of
 from abbe.models.discovery.lack import Floor
-from abbe.models.discovery.prediction import left_over, predictions, solve
+from abbe.models.discovery.solved_model import left_over, predictions, solve
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.effect import Effect
 from abbe.models.probability import chi2_above

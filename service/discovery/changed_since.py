@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from abbe.models.compensation.tables import smooth_of
-from abbe.models.discovery.changed.comparison import Change, Changed, changed_since
-from abbe.models.solvers.in_force import AppliedTables
+from abbe.models.discovery.changed_since import Change, Changed, changed_since
+from abbe.models.solvers.applied_tables import AppliedTables
 from abbe.models.uncertainty.known_field import KnownField
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import machine_digest

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from abbe.models.discovery.answer import Localization
-from abbe.models.discovery.unseen import LATE_S
+from abbe.models.discovery.experiment.additions import REPEAT_LATE_S
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS
 from abbe.service.domain.run import Run
@@ -81,7 +81,7 @@ def next_plan(
             by_hand.append(made)
             continue
         tests += made
-        after_s = LATE_S if add == "longer_session" else after_s
+        after_s = REPEAT_LATE_S if add == "longer_session" else after_s
     return NextPlan(CampaignPlan(name[0], tuple(tests)) if tests else None, tuple(by_hand), after_s)
 
 

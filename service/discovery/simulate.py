@@ -10,7 +10,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import CaseRun, Role
-from abbe.models.discovery.prediction import left_together, predictions, solve
+from abbe.models.discovery.solved_model import left_together, predictions, solve
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discover import DiscoveryJob
 from abbe.service.discovery.finding import noise_mm_of, rms

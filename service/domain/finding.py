@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from abbe.models.discovery.answer import Agreement, Fitted, Localization, NextTest, Unjudged, Unseen, Verdict
+from abbe.models.discovery.answer import Agreement, BlindSpot, Fitted, Localization, NextTest, Unjudged, Verdict
 from abbe.service.domain.discovery_file import FoundThinning
 from abbe.service.domain.packed_arrays import PackedCovariance, PackedReadings
 
@@ -215,7 +215,7 @@ class Finding:
     beside: tuple[Unnamed, ...] = ()
     agreement: tuple[Agreement, ...] = ()
     unjudged: tuple[Unjudged, ...] = ()
-    unseen: tuple[Unseen, ...] = ()
+    unseen: tuple[BlindSpot, ...] = ()
     fitted: tuple[Fitted, ...] = ()
     thinning: FoundThinning | None = None
     predictions: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

@@ -13,8 +13,7 @@ import numpy as np
 
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.effect import Effect
-from abbe.models.effects.probe_paths import probe_paths
-from abbe.models.effects.self_test import declaration_faults, signal_faults
+from abbe.models.effects.self_test import declaration_faults, probe_paths, signal_faults
 from abbe.service.effects.axis_test import SLOW_DRIFT
 from abbe.service.errors import EffectPluginBroken, EffectUnknown
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.compensation.tables import NineTables, smooth_of
-from abbe.models.solvers.in_force import AppliedTables
+from abbe.models.solvers.applied_tables import AppliedTables
 from abbe.models.solvers.joint import solve_joint
 from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign

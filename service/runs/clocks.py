@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.alignment.breaks import breaks
-from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, fit_clock, relative_rate
+from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, breaks, fit_clock, relative_rate
 from abbe.models.arrays import F1
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord

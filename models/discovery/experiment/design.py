@@ -17,7 +17,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import NextTest
 from abbe.models.discovery.baseline import Baseline, baseline_of
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.experiment.candidates import ExperimentOffer, offers
+from abbe.models.discovery.experiment.additions import ExperimentOffer, offers
 from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path, Places
 

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Localization
-from abbe.models.discovery.noise import Colour
-from abbe.models.discovery.signal_localization import localize_signal
-from abbe.models.discovery.variance.rough import gated_roughness, loud_windows
-from abbe.models.discovery.variance.spectrum import fast, line_of_axis
+from abbe.models.discovery.instrument_noise import Colour
+from abbe.models.discovery.localization import localize_signal
+from abbe.models.discovery.variance.spectrum import fast, gated_roughness, line_of_axis, loud_windows
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
@@ -27,6 +26,27 @@ from abbe.models.machine import AXES
 
 NEAR_MM, LOUD = 30.0, 3.0
 """Readings within this distance are of the same place; each counts up to this many standard deviations."""
+RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
+SIZES = np.geomspace(1.5, 60.0, 24)
+"""Typical sizes of outliers, in sigmas, to either side."""
+SPREAD = 0.4
+"""Relative standard deviation of the outliers' size."""
+SCALES = np.linspace(0.75, 1.1, 15)
+"""Noise of the good readings over the rms of all: free, or a wrong noise would look like outliers."""
+UM = 1e3
+NAME_PRICE = 7.0
+"""Paid on top of the number of things tried, as natural logarithm: noise alone gains this with a probability of about exp(-7)."""
+OFF, PLACE_Z = 3.5, 4.0
+"""Standard deviations from which a reading is an outlier, and from which those near it prove that the place is the cause, not the beam (of
+13 campaigns with lost beams none above 1.2, of three with a bump none below 4.2)."""
+LEAST_LASER = 60
+"""Least laser readings for estimating a rate of 1 in 100."""
+DRIVES = ("stick_slip", "vibration")
+OVERSHADOWS = 3.0
+"""Roughness of one axis shows a little along the others, a spectral line a little at low speed: a finding weaker by this factor counts as
+explained. As a consequence, a second vibration of less than about 0.6 of the first's size is not named."""
+SAW_P = 0.05
+CREEP_MM_S = 4.5
 
 
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
@@ -57,15 +77,6 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
 
 
 # A few outliers: a mixture of noise and a wider distribution against noise alone.
-
-
-RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
-SIZES = np.geomspace(1.5, 60.0, 24)
-"""Typical sizes of outliers, in sigmas, to either side."""
-SPREAD = 0.4
-"""Relative standard deviation of the outliers' size."""
-SCALES = np.linspace(0.75, 1.1, 15)
-"""Noise of the good readings over the rms of all: free, or a wrong noise would look like outliers."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +114,6 @@ def contaminated(rest: F1) -> Contaminated:
     mean = float(weight @ SIZES / weight.sum())
     u = float(np.sqrt(weight @ (SIZES - mean) ** 2 / weight.sum()))
     return Contaminated(best.gain, best.rate, best.size, max(u, 0.05 * best.size))
-
-
-UM = 1e3
-NAME_PRICE = 7.0
-"""Paid on top of the number of things tried, as natural logarithm: noise alone gains this with a probability of about exp(-7)."""
-OFF, PLACE_Z = 3.5, 4.0
-"""Standard deviations from which a reading is an outlier, and from which those near it prove that the place is the cause, not the beam (of
-13 campaigns with lost beams none above 1.2, of three with a bump none below 4.2)."""
-LEAST_LASER = 60
-"""Least laser readings for estimating a rate of 1 in 100."""
 
 
 @dataclass(frozen=True)
@@ -179,12 +180,6 @@ def extra_variance(
     return tuple(out)
 
 
-DRIVES = ("stick_slip", "vibration")
-OVERSHADOWS = 3.0
-"""Roughness of one axis shows a little along the others, a spectral line a little at low speed: a finding weaker by this factor counts as
-explained. As a consequence, a second vibration of less than about 0.6 of the first's size is not named."""
-
-
 def _overshadows(strong: VarianceFinding, weak: VarianceFinding) -> bool:
     """Whether ``strong`` explains ``weak``: it is stronger along the same axis, or much stronger along another."""
     return strong.name in DRIVES and (strong.key == weak.key or strong.evidence > OVERSHADOWS * weak.evidence)
@@ -237,10 +232,6 @@ def _vibration(
         size *= 0.5 * np.pi * np.e
         return [VarianceFinding("stick_slip", AXES[axis], size, size, {"v_c": v}, evidence, where)]
     return [VarianceFinding("vibration", AXES[axis], size, u, {"frequency_hz": line.frequency_hz}, evidence, where)]
-
-
-SAW_P = 0.05
-CREEP_MM_S = 4.5
 
 
 def _creep(axis: int, paths: tuple[Path, ...]) -> float | None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F3
-from abbe.models.effects.columns import PPM, of_body, rms
+from abbe.models.effects.columns import PPM, WITH_CONSTANT, of_body, rms, smooth
 from abbe.models.effects.effect import Effect, Form, Signal
 from abbe.models.effects.path import Path, Places
-from abbe.models.effects.smooth import WITH_CONSTANT, smooth
 from abbe.models.machine import AXES, levers_mm
 
 KEYS = tuple(f"E{turn}{axis}" for axis in AXES for turn in "ABC")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abbe.models.effects.columns import AXIS_KEYS, axis_of, rms
+from abbe.models.effects.columns import AXIS_KEYS, WITH_LINE, axis_of, finer_shifts, rms, shifts
 from abbe.models.effects.effect import Effect
-from abbe.models.effects.smooth import WITH_LINE, finer_shifts, shifts
 
 EFFECT = Effect(
     name="positioning_nonlinear",

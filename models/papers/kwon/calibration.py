@@ -1,7 +1,7 @@
 """Kinematic calibration: geometric parameters of every leg from commands and CMM points, the step that Kwon's paper leaves open.
 
 The paper supposes that errors of the kinematic parameters cause the position errors (4.2), and fits a surface to them. Here the 18
-parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.sensitivity`) together with the unknown
+parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.kinematics`) together with the unknown
 placement on the CMM, with a stated prior for each: what the points do not carry stays at its prior and is named. Points worse than stated
 and a prior that the points contradict are noticed, widened and said (`abbe.models.papers.kwon.calibration`).
 """
@@ -17,9 +17,7 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.rotation import rotation_matrix
 from abbe.models.papers.kwon.errors import NotSettled
 from abbe.models.papers.kwon.frames import best_fit_errors, best_fit_frame, checked_frame, from_frame, into_frame, rms
-from abbe.models.papers.kwon.geometry import LEGS, PER_LEG, Geometry, poses
-from abbe.models.papers.kwon.kinematics import forward, inverse, jacobian
-from abbe.models.papers.kwon.sensitivity import parameter_design, parameter_names
+from abbe.models.papers.kwon.kinematics import LEGS, PER_LEG, Geometry, forward, inverse, jacobian, parameter_design, parameter_names, poses
 from abbe.models.solvers.identifiability import Combination, Identifiability, analyse, project_out
 from abbe.models.solvers.least_squares import ParameterEstimate, solve_map
 
@@ -31,6 +29,14 @@ SPATIAL = 3
 """Coordinates of a point."""
 STRAY = 0.01
 """Probability that any point of a good set is called outlying."""
+FRAME_NAMES = ("shift x", "shift y", "shift z", "turn a", "turn b", "turn c")
+PARAMETERS = parameter_names()
+TOLERANCE_MM, TOLERANCE_RAD = 0.05, 0.5e-3
+CARRIED = 0.5
+ITERATIONS = 20
+SHOWN = 10
+SETTLED = 1e-6
+"""A step below this share of the standard uncertainty ends the iteration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +152,6 @@ def _prior_factor(y2: F1, s2: F1, variance: float) -> float:
 # Commands with their CMM points, and how such points depend on parameters and placement, in units of their uncertainty.
 
 
-FRAME_NAMES = ("shift x", "shift y", "shift z", "turn a", "turn b", "turn c")
-
-
 @dataclass(frozen=True)
 class PlaneReadings:
     """Commands and measured points; repeated visits are repeated rows.
@@ -227,15 +230,6 @@ def moved_frame(frame: F2, move: F1, pivot_mm: F1) -> F2:
     step[:3, :3] = rotation_matrix(move[None, 3:])[0]
     step[:3, 3] = pivot_mm + move[:3] - step[:3, :3] @ pivot_mm
     return frame @ step
-
-
-PARAMETERS = parameter_names()
-TOLERANCE_MM, TOLERANCE_RAD = 0.05, 0.5e-3
-CARRIED = 0.5
-ITERATIONS = 20
-SHOWN = 10
-SETTLED = 1e-6
-"""A step below this share of the standard uncertainty ends the iteration."""
 
 
 @dataclass(frozen=True)

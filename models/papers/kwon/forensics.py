@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, Exponents, regressors, term_name
+from abbe.models.papers.kwon.layout import CUBIC, IN_PLANE, Exponents, regressors, term_name
 
 INDEX = {term: i for i, term in enumerate(CUBIC)}
 LADDER: tuple[tuple[int, int], ...] = tuple((INDEX[(i, j, k + 1)], INDEX[(i, j, k)]) for i, j, k in CUBIC if (i, j, k + 1) in INDEX)

@@ -1,7 +1,11 @@
-"""Forward and inverse kinematics of the 3-PUU machine, its links and its Jacobian. Source: Kwon 2004 (1)-(11), math.md 6 with errata."""
+"""The translational 3-PUU machine: geometry (nominal or with errors per leg), forward and inverse kinematics, Jacobian, sensitivities.
+
+Source: Kwon 2004 (1)-(11), math.md 6 with errata.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -20,13 +24,155 @@ from abbe.models.papers.kwon.errors import (
     refuse,
     refuse_first,
 )
-from abbe.models.papers.kwon.geometry import Geometry, poses
 
+LEGS = 3
+THIRDS = np.array([0.0, 2.0 * np.pi / 3.0, 4.0 * np.pi / 3.0])
+PER_LEG = ("R", "r", "l", "thb", "thp", "dz")
+"""Parameters that may differ from leg to leg, in the letters of math.md 6."""
+FIELDS = {"R": "R_mm", "r": "r_mm", "l": "l_mm", "thb": "theta_b_rad", "thp": "theta_p_rad", "dz": "dz_mm"}
+COMMON = ("l_up_mm", "l_dw_mm", "theta_rad", "le_mm")
 Branch = Literal["outside", "folded"]
 """Base joint outside the platform joint (C + root, the machine as built) or inside it (C - root, the folded assembly)."""
-
 SINGULAR = 1e-6
 """Sine or cosine below which links count as horizontal or perpendicular: well above the rounding of a root (1e-8), 0.2 seconds of arc."""
+
+
+def _zeros() -> F1:
+    return np.zeros(LEGS)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Three linear drives on a base, three links of constant length, a platform that only translates (Kwon 2004, 2.1, Fig. 2).
+
+    Base frame: origin in the base plane at the middle of the drives, z up, drive 1 along +x. A drive moves its joint by ``lambda`` TOWARDS
+    the origin. Values of one leg may be given as one number for all legs.
+
+    Parameters
+    ----------
+    R_mm, r_mm, l_mm : float or array, shape (3,)
+        Base radius at lambda = 0, platform radius, link length between its joints.
+    l_up_mm, l_dw_mm, theta_rad : float
+        Lengths of the upper and lower joint brackets and their constant elevation (theta_up = theta_dw).
+    le_mm : float
+        Ball centre above the platform.
+    theta_b_rad, theta_p_rad : array, shape (3,)
+        Directions of the drives and of the platform's corners about z; 0, 120, 240 degrees when not given.
+    dz_mm : float or array, shape (3,)
+        Base joint above the base plane, + up.
+
+    Raises
+    ------
+    ValueError
+        A value is not finite, a shape does not fit, or a length that must be positive is not.
+    """
+
+    R_mm: F1
+    r_mm: F1
+    l_mm: F1
+    l_up_mm: float
+    l_dw_mm: float
+    theta_rad: float
+    le_mm: float
+    theta_b_rad: F1 = field(default_factory=THIRDS.copy)
+    theta_p_rad: F1 = field(default_factory=THIRDS.copy)
+    dz_mm: F1 = field(default_factory=_zeros)
+
+    def __post_init__(self) -> None:
+        """Spread single numbers over the legs and check once."""
+        for name in FIELDS.values():
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape not in ((), (LEGS,)):
+                raise ValueError(f"geometry: {name} must be one finite number or one for each of the 3 legs, got shape {value.shape}")
+            if not np.isfinite(value).all():
+                raise ValueError(f"geometry: {name} must be finite")
+            object.__setattr__(self, name, np.broadcast_to(value, (LEGS,)).copy())
+        for name in COMMON:
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != () or not np.isfinite(value):
+                raise ValueError(f"geometry: {name} must be one finite number for all legs, got shape {value.shape} or a value not finite")
+        if (self.R_mm <= 0).any() or (self.r_mm <= 0).any() or (self.l_mm <= 0).any():
+            raise ValueError("geometry: R_mm, r_mm and l_mm must be positive")
+
+    @property
+    def r_hat_mm(self) -> F1:
+        """Eq (7) for every leg: platform centre to upper joint in plan, shape (3,)."""
+        value: F1 = self.r_mm + self.l_up_mm * np.cos(self.theta_rad)
+        return value
+
+    @property
+    def reach_mm(self) -> F1:
+        """R - l_dw cos(theta): eq (8) at lambda = 0, shape (3,)."""
+        value: F1 = self.R_mm - self.l_dw_mm * np.cos(self.theta_rad)
+        return value
+
+    @property
+    def lift_mm(self) -> F1:
+        """(l_up + l_dw) sin(theta) + l_e + dz: height of the sphere centres, shape (3,)."""
+        value: F1 = (self.l_up_mm + self.l_dw_mm) * np.sin(self.theta_rad) + self.le_mm + self.dz_mm
+        return value
+
+    @property
+    def rails(self) -> F2:
+        """Unit vectors outwards along the rails, shape (3 legs, 3)."""
+        return _in_plan(self.theta_b_rad)
+
+    @property
+    def corners(self) -> F2:
+        """Unit vectors from the platform centre to its corners, shape (3 legs, 3)."""
+        return _in_plan(self.theta_p_rad)
+
+    def centres_mm(self, lambda_mm: F2) -> F3:
+        """Centres (-A, -B, lift) of the spheres on which the ball centre lies, shape (n, 3 legs, 3); (5), (6) of Kwon.
+
+        Parameters
+        ----------
+        lambda_mm : array, shape (n, 3)
+        """
+        lambda_hat = self.reach_mm - lambda_mm
+        centres: F3 = lambda_hat[..., None] * self.rails - self.r_hat_mm[:, None] * self.corners
+        centres[..., 2] = self.lift_mm
+        return centres
+
+    def with_errors(self, errors: dict[str, F1]) -> Geometry:
+        """Same machine with deviations (actual - nominal) added.
+
+        Parameters
+        ----------
+        errors : dict
+            From names of PER_LEG to one number or shape (3,), mm or rad.
+
+        Raises
+        ------
+        ValueError
+            A name is not one of PER_LEG.
+        """
+        unknown = [name for name in errors if name not in FIELDS]
+        if unknown:
+            raise ValueError(f"geometry: no parameter is called {unknown[0]!r}; known are {', '.join(PER_LEG)}")
+        return replace(self, **{FIELDS[name]: getattr(self, FIELDS[name]) + np.asarray(value) for name, value in errors.items()})
+
+
+def poses(name: str, value: F2) -> F2:
+    """Finite float64 array of shape (n, 3).
+
+    Raises
+    ------
+    ValueError
+        It has another shape or holds something that is not finite.
+    """
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != LEGS:
+        raise ValueError(f"{name}: expected numbers of shape (n, 3), got shape {array.shape}")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        more = f" and {bad.size - 1} more" if bad.size > 1 else ""
+        raise ValueError(f"{name}: row {bad[0]}{more}: every number must be finite")
+    return array
+
+
+def _in_plan(angle_rad: F1) -> F2:
+    return np.stack([np.cos(angle_rad), np.sin(angle_rad), np.zeros(LEGS)], axis=1)
 
 
 def forward(geometry: Geometry, lambda_mm: F2) -> F2:
@@ -257,3 +403,56 @@ def _above_centres(geometry: Geometry, lambda_mm: F2, p_mm: F2) -> F1:
         level: F1 = p_mm[:, 2] - centre[:, 0, 2]
         return level
     return np.asarray(((p_mm - centre[:, 0]) * _up(centre[:, 1:] - centre[:, :1])).sum(axis=1))
+
+
+def parameter_jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> dict[str, F3]:
+    """dP/d(parameter of a leg) at fixed commands, for every name of PER_LEG.
+
+    From l.l = l^2 for each leg: l.dP = l dl + l.b dR - l.p dr + lambda_hat l.t_b dthb - r_hat l.t_p dthp + l_z dz, with b, p the unit
+    vectors of rail and corner and t_b, t_p those turned by +90 degrees about z (math.md 6, there for theta_p = theta_b, so p = b).
+    An offset of the command is dR with the sign reversed; errors of theta, l_up, l_dw, l_e act through R, r and dz: no column of their own.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    lambda_mm : array, shape (n, 3)
+    p_mm : array, shape (n, 3), optional
+        Position that belongs to the commands; computed when not given.
+
+    Returns
+    -------
+    dict of arrays, shape (n, 3 coordinates, 3 legs), mm per mm or mm per rad
+
+    Raises
+    ------
+    ParallelSingularity
+        det[l1 l2 l3] = 0.
+    """
+    v = links(geometry, lambda_mm, forward(geometry, lambda_mm) if p_mm is None else p_mm)
+    b, p = geometry.rails, geometry.corners
+    lambda_hat = geometry.reach_mm - lambda_mm
+    pulls: dict[str, F2] = {
+        "R": (v * b).sum(axis=2),
+        "r": -(v * p).sum(axis=2),
+        "l": np.broadcast_to(geometry.l_mm, v.shape[:2]),
+        "thb": lambda_hat * (v * _turned(b)).sum(axis=2),
+        "thp": -geometry.r_hat_mm * (v * _turned(p)).sum(axis=2),
+        "dz": v[..., 2],
+    }
+    return {name: solve_links(v, pulls[name]) for name in PER_LEG}
+
+
+def parameter_names() -> tuple[str, ...]:
+    """Names of the 18 columns of `parameter_design`: R1 R2 R3 r1 .. dz3."""
+    return tuple(f"{name}{leg}" for name in PER_LEG for leg in (1, 2, 3))
+
+
+def parameter_design(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> F3:
+    """`parameter_jacobian` side by side, shape (n, 3 coordinates, 18)."""
+    parts = parameter_jacobian(geometry, lambda_mm, p_mm)
+    return np.concatenate([parts[name] for name in PER_LEG], axis=2)
+
+
+def _turned(unit: F2) -> F2:
+    """Turned by +90 degrees about z."""
+    return np.stack([-unit[:, 1], unit[:, 0], np.zeros(unit.shape[0])], axis=1)

@@ -1,24 +1,93 @@
-"""What a set of measured points can tell about a cubic surface: rank of the 20 monomials, planes, heights, terms that can be fitted."""
+"""The 20 cubic monomials of the response surface in the order of Kwon's (27), and what a set of measured points can tell about them.
+
+Rank of the monomials, planes and heights of the points, terms that can be fitted.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from abbe.models.arrays import F1, F2
-from abbe.models.papers.kwon.geometry import poses
-from abbe.models.papers.kwon.terms import CUBIC, Exponents, regressors
+from abbe.models.papers.kwon.kinematics import poses
 
-# Whether points lie on one plane or on two or three parallel ones: what a grid of commands gives, horizontal, tilted or upright.
+Exponents = tuple[int, int, int]
+CUBIC: tuple[Exponents, ...] = (
+    *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
+    *((1, 1, 1), (2, 1, 0), (2, 0, 1), (1, 2, 0), (1, 0, 2), (0, 2, 1), (0, 1, 2), (3, 0, 0), (0, 3, 0), (0, 0, 3)),
+)
+"""Exponents of X, Y, Z for beta_0 .. beta_19; beta_16 belongs to Y Z^2, the paper prints Z Y^2 twice (math.md 3, K (27))."""
 
-
+IN_PLANE: tuple[Exponents, ...] = tuple(
+    (i, j, 0) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2), (2, 1), (1, 2), (3, 0), (0, 3))
+)
+"""The ten monomials of X and Y."""
 MOST_PLANES = 3
 """Four planes carry a full cubic, fewer do not (math.md 6)."""
 NO_SLOPE = 1e-12
 """Below this a slope is the rounding of its computation."""
 STEEPEST = 1.0 + 1e-9
 """Planes are described along an axis that they face: no slope above 1. Every plane has such an axis."""
+RANK_TOLERANCE = 1e-3
+"""Singular values below this share of the largest do not count: a coefficient would be a thousand times worse than a reading."""
+FLATNESS = 5e-3
+"""How far points may be off a plane and still lie on it, by default: this share of the second largest half width of X, Y, Z (of a square
+of +-1 mm: 5 um). A stage of 1 um leaves commanded positions off their plane, and what so little height tells is worth nothing: an error
+that changes by 10 um per mm of height changes by 0.05 um over it."""
+
+
+def term_name(term: Exponents) -> str:
+    """As people write it: ``1``, ``X``, ``X Y^2``."""
+    parts = [f"{letter}^{k}" if k > 1 else letter for letter, k in zip("XYZ", term, strict=True) if k]
+    return " ".join(parts) or "1"
+
+
+def regressors(points_mm: F2, terms: tuple[Exponents, ...]) -> F2:
+    """Values of monomials at points: the matrix P_e that (28) needs (the paper prints [X, Y, Z] only, math.md 3, K (28)).
+
+    Parameters
+    ----------
+    points_mm : array, shape (n, 3)
+    terms : tuple of (i, j, k)
+
+    Returns
+    -------
+    array, shape (n, len(terms))
+    """
+    exponents = np.asarray(terms, dtype=np.int64).reshape(-1, 3)
+    powers = np.asarray(points_mm, dtype=np.float64)[:, None, :] ** np.arange(4)[:, None]
+    x, y, z = (powers[:, exponents[:, axis], axis] for axis in range(3))
+    values: F2 = x * y * z
+    return values
+
+
+def term_matrix(terms: tuple[Exponents, ...], shift_mm: F1, scale_mm: F1) -> F2:
+    """Matrix from coefficients of centred and scaled monomials to those of raw ones.
+
+    With u = (x - shift) / scale, a polynomial sum c_t u^t equals sum (M c)_s x^s over the same terms, for a set of terms that contains
+    every divisor of each of its terms (CUBIC, IN_PLANE and CUBIC up to a power of Z do).
+
+    Parameters
+    ----------
+    terms : tuple of (i, j, k)
+    shift_mm, scale_mm : arrays, shape (3,)
+
+    Returns
+    -------
+    array, shape (len(terms), len(terms))
+    """
+    row = {t: r for r, t in enumerate(terms)}
+    out = np.zeros((len(terms), len(terms)))
+    for column, term in enumerate(terms):
+        x, y, z = (polynomial.polypow([-c / s, 1.0 / s], k) for k, c, s in zip(term, shift_mm, scale_mm, strict=True))
+        for i, j, k in np.ndindex(x.size, y.size, z.size):
+            out[row[(i, j, k)], column] += x[i] * y[j] * z[k]
+    return out
+
+
+# Whether points lie on one plane or on two or three parallel ones: what a grid of commands gives, horizontal, tilted or upright.
 
 
 @dataclass(frozen=True)
@@ -110,14 +179,6 @@ def _levels(offset_mm: F1, tolerance_mm: float, count: int) -> tuple[float, ...]
     if len(groups) != count or any(g[-1] - g[0] > 2.0 * tolerance_mm for g in groups):
         return ()
     return tuple(float(g[0] if g[0] == g[-1] else 0.5 * (g[0] + g[-1])) for g in groups)
-
-
-RANK_TOLERANCE = 1e-3
-"""Singular values below this share of the largest do not count: a coefficient would be a thousand times worse than a reading."""
-FLATNESS = 5e-3
-"""How far points may be off a plane and still lie on it, by default: this share of the second largest half width of X, Y, Z (of a square
-of +-1 mm: 5 um). A stage of 1 um leaves commanded positions off their plane, and what so little height tells is worth nothing: an error
-that changes by 10 um per mm of height changes by 0.05 um over it."""
 
 
 @dataclass(frozen=True)

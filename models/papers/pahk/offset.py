@@ -17,7 +17,7 @@ from abbe.models.functions.line_fit import straight_line
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import lever_masks
 from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, parameter_signs
-from abbe.models.papers.pahk.tables import ParameterTables, Triple
+from abbe.models.papers.pahk.volume_map import ParameterTables, Triple
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Axes whose lines alpha, beta1, beta2 compare."""

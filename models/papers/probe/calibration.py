@@ -8,12 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.papers.probe.frame import direction, finite_vectors
-from abbe.models.papers.probe.lobing import LobingMap
+from abbe.models.papers.probe.model import LobingMap, direction, finite_vectors
 
 Indices = NDArray[np.intp]
 ROUNDING_RAD = 1e-9
 """Touches that should have the same angle differ by this much or less when only rounding parted them."""
+ABSORBED = ("nx", "ny", "nz", "1")
+"""Functions of the touching direction that the fit takes for centre and radius: a map is known only without its share of them."""
+ITERATIONS = 50
+STEP_MM = 1e-14
+SINGULAR = 1e-8
+EDGE_RAD = 1e-6
 
 
 def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROUNDING_RAD) -> LobingMap:
@@ -93,14 +98,6 @@ def _check_complete(circle: F1, longitude: F1, row: Indices, column: Indices) ->
             f"lobing map: it takes circles with the same longitudes; {circle.size} circles and {longitude.size} longitudes were found, "
             f"with {count[i, k]} touches at {where}"
         )
-
-
-ABSORBED = ("nx", "ny", "nz", "1")
-"""Functions of the touching direction that the fit takes for centre and radius: a map is known only without its share of them."""
-ITERATIONS = 50
-STEP_MM = 1e-14
-SINGULAR = 1e-8
-EDGE_RAD = 1e-6
 
 
 def master_sphere_pattern(circles: int = 5, longitudes: int = 20, step_rad: float = np.pi / 10) -> F2:

@@ -9,8 +9,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.monomials import monomials
-from abbe.models.papers.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm, tilt_axes
-from abbe.models.papers.wang.model import monomial_field
+from abbe.models.papers.wang.model import diagonal_beam, mirror_normal, monomial_field, step_readings_mm, tilt_axes
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.designs import Field, laser_rows, stacked
 

@@ -19,12 +19,13 @@ from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.identifiability import project_out
 from abbe.models.solvers.least_squares import singular_values
-from abbe.models.solvers.observability.parameters import Play, play
 from abbe.models.solvers.observability.rank import (
     CampaignColumns,
     Knowledge,
     ObservedInformation,
+    Play,
     campaign_columns,
+    play,
     stated_knowledge,
     with_knowledge,
 )
@@ -38,6 +39,17 @@ from abbe.models.solvers.priors import Priors
 ALONG = 1e-3
 """A line is along an axis, a diagonal across all of them, if no component (all components) of its direction is larger than this."""
 STEP_ORDERS = ("XYZ", "ZYX", *("".join(p) for p in permutations("XYZ") if p not in (("X", "Y", "Z"), ("Z", "Y", "X"))))
+LONGER_MM = 100.0
+ASIDE_MM = (100.0, 50.0)
+"""Virtual tools: additional length, and distance from the spindle's axis (math.md 4.6)."""
+READINGS, RUNS = 130, 10
+"""Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
+SHORTEST_BAR_MM = 10.0
+"""No ball-bar is shorter."""
+MARGIN = 0.1
+"""Share of the stroke that virtual runs keep off its ends."""
+SHOWN = 1e-7
+"""Trace (unit columns) from which a hidden combination counts as shown by an addition; hidden means below 1e-9."""
 
 
 @dataclass(frozen=True)
@@ -129,17 +141,6 @@ def on_opposite_edges(machine: Machine, axis: int, places: tuple[F1, ...]) -> bo
     """Whether two lines along an axis stand at least half the stroke apart in both other axes."""
     others = [k for k in range(3) if k != axis]
     return any((np.abs(a - b)[others] >= 0.5 * machine.length_mm[others]).all() for a in places for b in places)
-
-
-LONGER_MM = 100.0
-ASIDE_MM = (100.0, 50.0)
-"""Virtual tools: additional length, and distance from the spindle's axis (math.md 4.6)."""
-READINGS, RUNS = 130, 10
-"""Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
-SHORTEST_BAR_MM = 10.0
-"""No ball-bar is shorter."""
-MARGIN = 0.1
-"""Share of the stroke that virtual runs keep off its ends."""
 
 
 @dataclass(frozen=True)
@@ -312,10 +313,6 @@ def _with(runs: tuple[RunData, ...], tool_mm: F1, key: str) -> tuple[RunData, ..
         parts = {name: getattr(run, name)[at] for name in ("axes_mm", "deviation_mm", "sign", "t_s", "weight_n")}
         out.append(replace(run, label=f"{key} {run.label}", setup=f"{key} {run.setup}", tool_mm=tool_mm, **parts))
     return tuple(out)
-
-
-SHOWN = 1e-7
-"""Trace (unit columns) from which a hidden combination counts as shown by an addition; hidden means below 1e-9."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.papers.kwon.anova import anova_from_sums, critical_f
 from abbe.models.papers.kwon.forensics import (
     GridSums,
     ImpliedPlane,
@@ -20,10 +19,9 @@ from abbe.models.papers.kwon.forensics import (
     ladder_name,
     square_grid,
 )
-from abbe.models.papers.kwon.geometry import Geometry
-from abbe.models.papers.kwon.kinematics import forward, forward_as_printed, inverse, links, square_commands
-from abbe.models.papers.kwon.layout import layout
-from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE
+from abbe.models.papers.kwon.kinematics import Geometry, forward, forward_as_printed, inverse, links, square_commands
+from abbe.models.papers.kwon.layout import CUBIC, IN_PLANE, layout
+from abbe.models.papers.kwon.surface import anova_from_sums, critical_f
 from abbe.service.reference.comparison import Comparison, Erratum, stated
 from abbe.service.reference.papers import kwon_printed as paper
 from abbe.service.reference.printed import Computed, Given, Printed, agrees, computed_from, values

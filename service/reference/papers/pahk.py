@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.papers.pahk.squareness_only import best_assignment, squareness_diagonals_mm
+from abbe.models.papers.pahk.diagonals import best_assignment, squareness_diagonals_mm
 from abbe.models.papers.probe.calibration import ProbeCalibration, calibrate, master_sphere_pattern, without_absorbed
-from abbe.models.papers.probe.frame import direction
+from abbe.models.papers.probe.model import direction
 from abbe.service.reference.comparison import Comparison, Erratum, stated
 from abbe.service.reference.printed import Computed, Printed, printed, values
 from abbe.service.reference.text import minus

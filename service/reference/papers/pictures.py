@@ -8,7 +8,7 @@ from abbe.models.arrays import F1
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.notation.pahk import motions_from_pahk, pahk_machine, pahk_type
 from abbe.models.papers.kwon.forensics import square_grid
-from abbe.models.papers.kwon.terms import IN_PLANE, regressors
+from abbe.models.papers.kwon.layout import IN_PLANE, regressors
 from abbe.service.reference.paper_results import Paper
 from abbe.service.reference.papers import kwon_printed, pahk, yang_printed
 from abbe.service.reference.papers.kwon import in_plane, plane

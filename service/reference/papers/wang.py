@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from abbe.models.papers.wang.mirror import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
+from abbe.models.papers.wang.model import cosine_error, diagonal_beam, mirror_normal, projection_factors, reading_mm, tilt_axes
 from abbe.service.reference.comparison import Comparison, Erratum
 from abbe.service.reference.printed import Computed, Printed, printed
 

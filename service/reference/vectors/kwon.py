@@ -6,7 +6,6 @@ import re
 
 import numpy as np
 
-from abbe.models.papers.kwon.anova import anova_from_sums, critical_f
 from abbe.models.papers.kwon.forensics import (
     LADDER,
     coefficients_from_planes,
@@ -16,12 +15,18 @@ from abbe.models.papers.kwon.forensics import (
     square_grid,
 )
 from abbe.models.papers.kwon.frames import best_fit_errors, nearest_rotation, three_point_errors, three_point_frame
-from abbe.models.papers.kwon.geometry import PER_LEG, Geometry
-from abbe.models.papers.kwon.kinematics import forward, forward_as_printed, inverse, jacobian, square_commands
-from abbe.models.papers.kwon.layout import layout
-from abbe.models.papers.kwon.sensitivity import parameter_jacobian
-from abbe.models.papers.kwon.surface import fit_surface
-from abbe.models.papers.kwon.terms import IN_PLANE
+from abbe.models.papers.kwon.kinematics import (
+    PER_LEG,
+    Geometry,
+    forward,
+    forward_as_printed,
+    inverse,
+    jacobian,
+    parameter_jacobian,
+    square_commands,
+)
+from abbe.models.papers.kwon.layout import IN_PLANE, layout
+from abbe.models.papers.kwon.surface import anova_from_sums, critical_f, fit_surface
 from abbe.service.errors import FileFormatError
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import LAYOUT, VectorCase

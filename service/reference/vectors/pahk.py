@@ -12,8 +12,7 @@ from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine,
 from abbe.models.papers.pahk.diagonals import space_diagonals
 from abbe.models.papers.pahk.offset import OffsetSetup, as_measured, refer_to_origin
 from abbe.models.papers.pahk.random_errors import RandomErrors, parameter_jacobian, printed_eq5_mm, quadrature_mm
-from abbe.models.papers.pahk.tables import ParameterTables, Triple
-from abbe.models.papers.pahk.volume_map import Form, chain_deviation_mm
+from abbe.models.papers.pahk.volume_map import Form, ParameterTables, Triple, chain_deviation_mm
 from abbe.service.errors import FileFormatError
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import LAYOUT, VectorCase

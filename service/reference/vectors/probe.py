@@ -9,8 +9,7 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.papers.probe.calibration import calibrate
-from abbe.models.papers.probe.combined import combined_deviation_mm, printed_eq17_mm
-from abbe.models.papers.probe.frame import direction, direction_angles, probe_frame, to_probe
+from abbe.models.papers.probe.model import combined_deviation_mm, direction, direction_angles, printed_eq17_mm, probe_frame, to_probe
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import VectorCase
 

@@ -10,8 +10,14 @@ from abbe.models.arrays import F1, F2
 from abbe.models.functions.monomials import ErrorArrays, monomials
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.papers.wang.experiments import WangPlan, distance_errors_mm, interpolated_mm, problem, readings
-from abbe.models.papers.wang.mirror import diagonal_beam, mirror_normal, step_readings_mm
-from abbe.models.papers.wang.model import displacement_eq11, exact_positions_mm, monomial_field
+from abbe.models.papers.wang.model import (
+    diagonal_beam,
+    displacement_eq11,
+    exact_positions_mm,
+    mirror_normal,
+    monomial_field,
+    step_readings_mm,
+)
 from abbe.models.papers.wang.squareness import AcuteSquareness, diagonal_totals_eq12, squareness_eq13_printed
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.models.solvers.designs import ranks, shortest_solution

@@ -12,9 +12,18 @@ from abbe.models.functions.monomials import Kind, Monomial, monomials
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
-from abbe.models.papers.yang.ballbar import measured_mm, reading_eq6, reading_eq8
-from abbe.models.papers.yang.complete import delta_eq1, delta_exact, monomial_errors, monomial_field
-from abbe.models.papers.yang.conditioning import common_scale_trace_mm, conditioning, design_eq9, spread, two_radii_design
+from abbe.models.papers.yang.complete import delta_eq1, delta_exact, measured_mm, monomial_errors, monomial_field, reading_eq6, reading_eq8
+from abbe.models.papers.yang.conditioning import (
+    SixParameters,
+    ZConvention,
+    common_scale_trace_mm,
+    conditioning,
+    delta_eq2,
+    design_eq9,
+    fit_eq9,
+    spread,
+    two_radii_design,
+)
 from abbe.models.papers.yang.experiments import (
     BAR_POINTS,
     EXPERIMENTS,
@@ -25,9 +34,8 @@ from abbe.models.papers.yang.experiments import (
     Problem,
     YangPlan,
     all_helices,
+    origin_plan,
 )
-from abbe.models.papers.yang.origins import origin_plan
-from abbe.models.papers.yang.simplified import SixParameters, ZConvention, delta_eq2, fit_eq9
 from abbe.models.paths.helix import Law, helix_points
 from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution
 from abbe.service.errors import FileFormatError

@@ -15,7 +15,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidates import SEEN, UNNAMED
+from abbe.models.discovery.candidate_bank import SEEN, UNNAMED
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
 from abbe.models.discovery.selection import Contest

@@ -23,7 +23,7 @@ import numpy as np
 from abbe.models.compensation.distances import DistanceStatistics, Pairs, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import grid_table, quantise_grid
 from abbe.models.compensation.tables import nine_tables, quantise
-from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import Instruments
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources

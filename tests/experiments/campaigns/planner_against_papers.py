@@ -18,11 +18,9 @@ import numpy as np
 from abbe.models.geometry.chain import all_chains
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
-from abbe.models.planning.candidates import BAR_CLEARANCE_MM, candidates
-from abbe.models.planning.information import field_rows, problem
-from abbe.models.planning.instruments import Instruments
-from abbe.models.planning.measurements import DiagonalTest, HelixTest
+from abbe.models.planning.measurements import BAR_CLEARANCE_MM, DiagonalTest, HelixTest, Instruments, candidates
 from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
+from abbe.models.planning.problem import field_rows, problem
 from abbe.models.planning.search import Chosen, Search
 from abbe.models.uncertainty.inputs import StatedInputs
 

@@ -14,8 +14,8 @@ from abbe.models.arrays import F1
 from abbe.models.functions.axis_function import AxisFunction, interval, positions
 from abbe.models.functions.bspline import BSpline, clamped_knots
 from abbe.models.functions.legendre import Legendre
+from abbe.models.functions.motions import nodes
 from abbe.models.functions.polynomial import Polynomial
-from abbe.models.functions.quadrature import nodes
 from abbe.models.functions.table import Table
 
 Kind = Literal["polynomial", "legendre", "bspline", "table"]

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from abbe.models.notation import pahk, wang, yang
+from abbe.models.notation import pahk, yang
+from abbe.models.papers.wang import model as wang
 
 
 @dataclass(frozen=True, slots=True)

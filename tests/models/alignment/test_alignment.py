@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.models.alignment.breaks import breaks
-from abbe.models.alignment.clock import LEAST_PAIRS, across, fit_clock, lower_envelope, relative_rate
+from abbe.models.alignment.clock import LEAST_PAIRS, across, breaks, fit_clock, lower_envelope, relative_rate
 from abbe.models.alignment.lag import fit_lag, lag_between_ways
 from tests.experiments.mathematics.position import position_in_stream, position_on_path
 

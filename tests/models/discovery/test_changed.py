@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from abbe.models.discovery.changed.comparison import Changed, changed_since
-from abbe.models.discovery.changed.search import LINEAR
+from abbe.models.discovery.changed_since import LINEAR, Changed, changed_since
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.known_field import KnownField
 from tests.models.solvers.truth import MACHINE, Truth

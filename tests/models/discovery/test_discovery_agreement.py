@@ -17,7 +17,7 @@ from abbe.models.discovery.agreement import NO_NOISE, TOO_FEW, _Noise, _tested, 
 from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.prediction import SolvedModel, predictions, solve
+from abbe.models.discovery.solved_model import SolvedModel, predictions, solve
 from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten
 from abbe.service.discovery.never_fitted import ALARM
 from abbe.simulators.hidden.cases import make_case

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidates import Bank, bank_of, gain_of, rows_for, starts_of
+from abbe.models.discovery.candidate_bank import Bank, bank_of, gain_of, rows_for, starts_of
 from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten, with_projection
 from abbe.models.effects.catalogue import CATALOGUE
 from tests.models.discovery.test_discovery_search import campaign

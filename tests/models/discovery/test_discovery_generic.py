@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.generic.shapes import SIGNALS, place_at
-from abbe.models.discovery.generic.unnamed_structures import generic_rivals, is_unnamed, where_of
+from abbe.models.discovery.generic.unnamed_structures import SIGNALS, generic_rivals, is_unnamed, place_at, where_of
 from abbe.models.effects.effect import Effect
 from abbe.models.effects.path import Path
 from tests.models.discovery.discovery_paths import campaign, case_of_paths, noise

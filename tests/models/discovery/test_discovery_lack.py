@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.experiment.candidates import offers
+from abbe.models.discovery.experiment.additions import offers
 from abbe.models.discovery.lack import floors, repeat_steps
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discovery_answer import answer_doc

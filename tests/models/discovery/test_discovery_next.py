@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from abbe.models.discovery.experiment.candidates import offers
+from abbe.models.discovery.experiment.additions import offers
 from abbe.models.discovery.experiment.design import SuspectEffect, propose, prospects
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path

@@ -12,13 +12,12 @@ import pytest
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidates import rows_for
+from abbe.models.discovery.candidate_bank import rows_for
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
-from abbe.models.discovery.noise import Colour, unscaled
-from abbe.models.discovery.projection import SignalProjection
+from abbe.models.discovery.instrument_noise import Colour, unscaled
 from abbe.models.discovery.selection import Contest, joined, weighed
-from abbe.models.discovery.whitened_problem import whiten
+from abbe.models.discovery.whitened_problem import SignalProjection, whiten
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path, driven, standing
 from abbe.models.machine import Machine

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
-from abbe.models.discovery.candidates import Pick
+from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.finding import TIME_TRUE_TO_FORM, shape_of, strength_of, true_to_form
 from abbe.models.effects.catalogue import CATALOGUE
+from abbe.models.effects.columns import WITH_CONSTANT, WITH_LINE
 from abbe.models.effects.effect import Form
-from abbe.models.effects.smooth import WITH_CONSTANT, WITH_LINE
 
 BY_NAME = {e.name: e for e in CATALOGUE}
 

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import Localization
-from abbe.models.discovery.experiment.candidates import offers
-from abbe.models.discovery.experiment.unnamed import propose_unnamed
+from abbe.models.discovery.experiment.additions import blind_spots, offers
 from abbe.models.discovery.generic.unnamed_structures import generic_rivals
-from abbe.models.discovery.unnamed import Structure
-from abbe.models.discovery.unseen import unseen
+from abbe.models.discovery.unnamed import Structure, propose_unnamed
 from abbe.models.effects.path import Path
 from tests.models.discovery.discovery_paths import bar, campaign, case_of_paths, circle, laser
 
@@ -83,12 +81,12 @@ def test_a_moment_names_its_run_and_a_period_asks_for_what_is_not_there_yet() ->
 
 
 def test_a_poor_campaign_says_what_it_could_not_have_seen() -> None:
-    found = {u.adds: u for u in unseen(case_of_paths(one_way(), *INCLUDES))}
+    found = {u.adds: u for u in blind_spots(case_of_paths(one_way(), *INCLUDES))}
     assert set(found) == {"second_feed", "opposite_direction", "second_radius", "laser_diagonals", "longer_session"}
     assert "grows with the feed" in found["second_feed"].what
     assert "1 h later" in found["longer_session"].because
     lasers = case_of_paths(tuple(p for p in campaign() if p.kind == "laser"), *INCLUDES)
-    assert "ballbar" in {u.adds for u in unseen(lasers)}
+    assert "ballbar" in {u.adds for u in blind_spots(lasers)}
 
 
 def test_what_is_measured_is_no_longer_unseen_but_only_if_it_is_fitted() -> None:
@@ -97,17 +95,17 @@ def test_what_is_measured_is_no_longer_unseen_but_only_if_it_is_fitted() -> None
     late = replace(first, label="l", at=replace(first.at, t_s=first.at.t_s + 4000.0))
     lasers = tuple(p for p in campaign() if p.kind == "laser")
     case = case_of_paths((first, back, late, *lasers), *INCLUDES)
-    assert unseen(case) == ()
+    assert blind_spots(case) == ()
     judges = replace(case, runs=tuple(replace(r, role="identify" if r.path.label == first.label else "holdout") for r in case.runs))
-    assert len(unseen(judges)) == 5
+    assert len(blind_spots(judges)) == 5
     early = replace(case, runs=tuple(r for r in case.runs if r.path.label != "l"))
-    assert [u.adds for u in unseen(early)] == ["longer_session"]
+    assert [u.adds for u in blind_spots(early)] == ["longer_session"]
 
 
 def late_repeat(first: Path, again: Path) -> bool:
     """Whether a path that is run 4000 s after another one counts as the same one, run late."""
     late = replace(again, label="late", at=replace(again.at, t_s=again.at.t_s - again.at.t_s[0] + first.at.t_s[0] + 4000.0))
-    return "longer_session" not in {u.adds for u in unseen(case_of_paths((first, late), *INCLUDES))}
+    return "longer_session" not in {u.adds for u in blind_spots(case_of_paths((first, late), *INCLUDES))}
 
 
 def test_only_the_same_path_run_late_tells_what_comes_slowly() -> None:
@@ -130,7 +128,7 @@ def test_what_is_proposed_and_what_is_said_to_be_unseen_agree_on_what_one_feed_i
     first = one_way()[0]
     for factor, one in ((1.0, True), (1.29, True), (1.31, False)):
         case = case_of_paths((first, replace(first, label="f", feed_mm_min=factor * first.feed_mm_min)), *INCLUDES)
-        assert ("second_feed" in {u.adds for u in unseen(case)}) is one
+        assert ("second_feed" in {u.adds for u in blind_spots(case)}) is one
         assert ("second_feed" in {o.adds for o in offers(case)}) is one
-    lengths = {u.adds: u.what for u in unseen(case_of_paths((first,), *INCLUDES))}
+    lengths = {u.adds: u.what for u in blind_spots(case_of_paths((first,), *INCLUDES))}
     assert lengths["laser_diagonals"].endswith("the search does not use the bar's certificate")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.localization import SIGNIFICANT, locate
-from abbe.models.discovery.signal_localization import localize_signal
+from abbe.models.discovery.localization import SIGNIFICANT, localize_signal, locate
 from tests.models.discovery.discovery_paths import campaign, noise
 
 PATHS = campaign()

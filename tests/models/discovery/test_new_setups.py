@@ -8,7 +8,7 @@ import pytest
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.case import CaseRun
-from abbe.models.discovery.prediction import left_over, left_together
+from abbe.models.discovery.solved_model import left_over, left_together
 from abbe.models.effects.instruments.bar_thermal import relaxing
 from abbe.models.paths.helix import Law, even_helix_points, helix_points
 from abbe.service.runs.cases import case_of

@@ -8,7 +8,7 @@ import pytest
 from abbe.models.arrays import F1
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.columns import AIR_PER_K
-from abbe.models.effects.probe_paths import DEAD_PATH_MM, probe_paths
+from abbe.models.effects.self_test import DEAD_PATH_MM, probe_paths
 from abbe.simulators.hidden.instrument import AIR_PPM_PER_K
 from abbe.simulators.scenario import from_dict
 from abbe.simulators.truth.surroundings import Air

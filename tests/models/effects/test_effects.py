@@ -15,8 +15,7 @@ from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.drives import vibration
 from abbe.models.effects.effect import Effect
 from abbe.models.effects.path import Path
-from abbe.models.effects.probe_paths import CENTRE_MM, DEAD_PATH_MM, MACHINE, probe_paths
-from abbe.models.effects.self_test import corners, declaration_faults, signal_faults
+from abbe.models.effects.self_test import CENTRE_MM, DEAD_PATH_MM, MACHINE, corners, declaration_faults, probe_paths, signal_faults
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine

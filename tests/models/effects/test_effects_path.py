@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from abbe.models.effects.columns import before_first_turn, commanded_turns, play, rise_of, turn_between, warmth
 from abbe.models.effects.path import FAR_MM, Places, driven
-from abbe.models.effects.probe_paths import probe_paths
+from abbe.models.effects.self_test import probe_paths
 
 RADIUS_MM, FEED = 150.0, 1200.0
 

@@ -19,8 +19,7 @@ from abbe.models.papers.kwon.calibration import (
 )
 from abbe.models.papers.kwon.errors import NoForwardSolution, NotSettled
 from abbe.models.papers.kwon.frames import from_frame, rms
-from abbe.models.papers.kwon.geometry import PER_LEG, Geometry
-from abbe.models.papers.kwon.kinematics import forward, inverse
+from abbe.models.papers.kwon.kinematics import PER_LEG, Geometry, forward, inverse
 
 NOMINAL = Geometry(100.0, 30.0, 101.26, 8.0, 8.0, np.radians(35.0), 20.0)  # type: ignore[arg-type]
 FRAME = moved_frame(np.eye(4), np.array([312.0, 145.5, -40.25, 0.01, -0.02, 0.0366]), np.zeros(3))

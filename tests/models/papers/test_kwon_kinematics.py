@@ -20,8 +20,9 @@ from abbe.models.papers.kwon.errors import (
     SerialSingularity,
     UnreachableLeg,
 )
-from abbe.models.papers.kwon.geometry import PER_LEG, Geometry
 from abbe.models.papers.kwon.kinematics import (
+    PER_LEG,
+    Geometry,
     forward,
     forward_as_printed,
     inverse,
@@ -29,9 +30,11 @@ from abbe.models.papers.kwon.kinematics import (
     jacobian,
     link_determinant,
     links,
+    parameter_design,
+    parameter_jacobian,
+    parameter_names,
     square_commands,
 )
-from abbe.models.papers.kwon.sensitivity import parameter_design, parameter_jacobian, parameter_names
 
 NOMINAL = Geometry(100.0, 30.0, 101.26, 8.0, 8.0, np.radians(35.0), 20.0)  # type: ignore[arg-type]
 

@@ -8,11 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
 from abbe.models.papers.kwon.forensics import square_grid
-from abbe.models.papers.kwon.geometry import Geometry
-from abbe.models.papers.kwon.kinematics import forward, inverse
-from abbe.models.papers.kwon.layout import FLATNESS, layout, parallel_planes
+from abbe.models.papers.kwon.kinematics import Geometry, forward, inverse
+from abbe.models.papers.kwon.layout import CUBIC, FLATNESS, IN_PLANE, layout, parallel_planes, regressors
 from abbe.models.papers.kwon.surface import fit_surface
-from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors
 
 NOMINAL = Geometry(100.0, 30.0, 101.26, 8.0, 8.0, np.radians(35.0), 20.0)  # type: ignore[arg-type]
 RANK = {1: 10, 2: 16, 3: 19}

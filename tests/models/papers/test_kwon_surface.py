@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from abbe.models.papers.kwon.anova import anova, anova_from_sums, critical_f
 from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
 from abbe.models.papers.kwon.forensics import (
     LADDER,
@@ -21,10 +20,9 @@ from abbe.models.papers.kwon.forensics import (
     minimum_norm,
     square_grid,
 )
-from abbe.models.papers.kwon.layout import layout, rank_of
-from abbe.models.papers.kwon.repeatability import repeatability, residual_statistics
-from abbe.models.papers.kwon.surface import fit_surface
-from abbe.models.papers.kwon.terms import CUBIC, IN_PLANE, regressors, term_name
+from abbe.models.papers.kwon.frames import repeatability, residual_statistics
+from abbe.models.papers.kwon.layout import CUBIC, IN_PLANE, layout, rank_of, regressors, term_name
+from abbe.models.papers.kwon.surface import anova, anova_from_sums, critical_f, fit_surface
 from abbe.service.reference.papers.kwon_printed import RESTORED, TABLE1
 from abbe.service.reference.printed import values
 

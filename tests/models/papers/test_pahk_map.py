@@ -14,8 +14,7 @@ from abbe.models.notation.pahk import (
     pahk_type,
 )
 from abbe.models.papers.pahk.diagonals import length_deviation, space_diagonals
-from abbe.models.papers.pahk.tables import ParameterTables
-from abbe.models.papers.pahk.volume_map import chain_deviation_mm, volumetric_map
+from abbe.models.papers.pahk.volume_map import ParameterTables, chain_deviation_mm, volumetric_map
 
 
 def first_order(name, p, d, e, square):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from abbe.models.functions.line_fit import straight_line
 from abbe.models.notation.pahk import TYPES
 from abbe.models.papers.pahk.offset import OffsetSetup, as_measured, line_deviation_mm, offset_terms, refer_to_origin
-from abbe.models.papers.pahk.tables import ParameterTables
+from abbe.models.papers.pahk.volume_map import ParameterTables
 
 # math.md 2.1, corrected value = measured + terms; <> only with the functional point at the probe tip.
 RULES = {

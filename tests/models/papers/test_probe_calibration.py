@@ -8,9 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from abbe.models.papers.probe.calibration import calibrate, fit_sphere, map_of_pattern, master_sphere_pattern, without_absorbed
-from abbe.models.papers.probe.combined import combined_deviation_mm, contact_point_mm, printed_eq17_mm, probe_error_mm
-from abbe.models.papers.probe.frame import direction, direction_angles, probe_frame, to_machine, to_probe
-from abbe.models.papers.probe.lobing import LobingMap
+from abbe.models.papers.probe.model import (
+    LobingMap,
+    combined_deviation_mm,
+    contact_point_mm,
+    direction,
+    direction_angles,
+    printed_eq17_mm,
+    probe_error_mm,
+    probe_frame,
+    to_machine,
+    to_probe,
+)
 
 ANGLE = st.floats(-10.0, 10.0)
 PATTERN = master_sphere_pattern()

@@ -5,12 +5,18 @@ import pytest
 
 from abbe.models.functions.monomials import ErrorArrays
 from abbe.models.geometry.chain import deviation_mm
-from abbe.models.notation.wang import ACUTE_FROM_OBTUSE, iso_motions, iso_squareness, machine
-from abbe.models.papers.wang.angular import abbe_and_spurious_eq7, closure_of_angles_mm, false_straightness_mm
-from abbe.models.papers.wang.mirror import (
+from abbe.models.papers.wang.model import (
+    ACUTE_FROM_OBTUSE,
     cosine_error,
     diagonal_beam,
+    displacement_eq11,
+    displacement_eq11_printed,
+    iso_motions,
+    iso_squareness,
+    machine,
     mirror_normal,
+    position_error_eq9,
+    position_error_eq9_printed,
     projection_factors,
     reading_mm,
     step_readings_mm,
@@ -18,12 +24,14 @@ from abbe.models.papers.wang.mirror import (
     tilt_bias_eq7,
     tilt_closure_mm,
 )
-from abbe.models.papers.wang.model import displacement_eq11, displacement_eq11_printed, position_error_eq9, position_error_eq9_printed
 from abbe.models.papers.wang.squareness import (
     AcuteSquareness,
+    abbe_and_spurious_eq7,
     bias_eq13,
+    closure_of_angles_mm,
     common_scale,
     diagonal_totals_eq12,
+    false_straightness_mm,
     squareness_eq13_printed,
     sum_test_mm,
 )

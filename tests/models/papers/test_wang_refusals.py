@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from abbe.models.functions.monomials import ErrorArrays, monomials
-from abbe.models.papers.wang.angular import abbe_and_spurious_eq7, closure_of_angles_mm
-from abbe.models.papers.wang.mirror import diagonal_beam, projection_factors, step_readings_mm
-from abbe.models.papers.wang.model import displacement_eq11, monomial_field, position_error_eq9
+from abbe.models.papers.wang.model import (
+    diagonal_beam,
+    displacement_eq11,
+    monomial_field,
+    position_error_eq9,
+    projection_factors,
+    step_readings_mm,
+)
+from abbe.models.papers.wang.squareness import abbe_and_spurious_eq7, closure_of_angles_mm
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
 from abbe.models.solvers.step_diagonal import closure_mm, increments, project_eq6, squareness_contrast, u_wang_four, wang_eq7, wang_four
 

@@ -11,8 +11,7 @@ from abbe.models.papers.wang.model import monomial_errors as wang_errors
 from abbe.models.papers.wang.model import monomial_field as wang_field
 from abbe.models.papers.wang.model import position_error_eq9
 from abbe.models.papers.yang.complete import delta_eq1, monomial_errors, monomial_field
-from abbe.models.papers.yang.experiments import YangPlan, all_helices, one_helix, step_diagonals, together, vector_map
-from abbe.models.papers.yang.origins import origin_plan
+from abbe.models.papers.yang.experiments import YangPlan, all_helices, one_helix, origin_plan, step_diagonals, together, vector_map
 from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution, stacked
 
 TRAVEL, TOOL = np.array([812.8, 495.0, 508.0]), np.array([0.0, 0.0, 150.0])

@@ -8,12 +8,18 @@ from hypothesis.extra.numpy import arrays
 
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.notation.yang import YangErrors, iso_motions, iso_squareness, machine, workpiece_mm
-from abbe.models.papers.yang.ballbar import measured_mm, reading_eq6, reading_eq8, second_order_bound_mm
-from abbe.models.papers.yang.complete import delta_eq1, delta_exact, difference_eq3
-from abbe.models.papers.yang.conditioning import design_eq9, spread
+from abbe.models.papers.yang.complete import (
+    delta_eq1,
+    delta_exact,
+    difference_eq3,
+    measured_mm,
+    reading_eq6,
+    reading_eq8,
+    second_order_bound_mm,
+)
+from abbe.models.papers.yang.conditioning import SixParameters, delta_eq2, design_eq9, fit_eq9, spread
 from abbe.models.papers.yang.difference import confidence_interval, model_difference
-from abbe.models.papers.yang.origins import hemisphere_fits, origin_plan
-from abbe.models.papers.yang.simplified import SixParameters, delta_eq2, fit_eq9
+from abbe.models.papers.yang.experiments import hemisphere_fits, origin_plan
 from abbe.models.paths.helix import helix_points, helix_points_likely_code
 from abbe.models.solvers.helix import fit_helix
 

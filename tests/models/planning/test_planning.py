@@ -16,11 +16,19 @@ from abbe.models.geometry.bases import DIRECTIONS
 from abbe.models.geometry.chain import all_chains
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
-from abbe.models.planning.candidates import candidates, opening
-from abbe.models.planning.information import factor, field_rows, mounting_information, problem, scale_temperature_mm2
-from abbe.models.planning.instruments import Instruments, SetupMinutes
-from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, expected_run, machine_seconds
+from abbe.models.planning.measurements import (
+    DiagonalTest,
+    HelixTest,
+    Instruments,
+    LineTest,
+    SetupMinutes,
+    candidates,
+    expected_run,
+    machine_seconds,
+    opening,
+)
 from abbe.models.planning.plan import plan_campaign, uncertainty_mm
+from abbe.models.planning.problem import factor, field_rows, mounting_information, problem, scale_temperature_mm2
 from abbe.models.planning.search import extra_minutes
 from abbe.models.solvers.observe import run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.models.geometry.volume import volume_frame, volume_grid
-from abbe.models.planning.instruments import Instruments
+from abbe.models.planning.measurements import Instruments
 from abbe.models.planning.plan import plan_campaign
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.prediction import predict_deviation

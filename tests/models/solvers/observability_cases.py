@@ -11,11 +11,11 @@ from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import design, travel_sign
 from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.notation import wang as wang_notation
 from abbe.models.notation import yang as yang_notation
 from abbe.models.notation.yang import workpiece_mm
+from abbe.models.papers.wang import model as wang_notation
 from abbe.models.papers.yang.complete import monomial_field
-from abbe.models.papers.yang.origins import origin_plan
+from abbe.models.papers.yang.experiments import origin_plan
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.observability.rank import (

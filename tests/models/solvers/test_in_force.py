@@ -14,7 +14,7 @@ from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from abbe.models.solvers.in_force import LEAD_IN_MM, AppliedTables
+from abbe.models.solvers.applied_tables import LEAD_IN_MM, AppliedTables
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.simulators.campaign.sampler import Conditions, Rig

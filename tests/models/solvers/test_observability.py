@@ -17,8 +17,15 @@ from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.assessment import observability, observability_of, posterior_covariance
 from abbe.models.solvers.joint import solve_joint
-from abbe.models.solvers.observability.parameters import correlations, observable_motions, status_of
-from abbe.models.solvers.observability.rank import campaign_columns, compressed, stated_knowledge, with_knowledge
+from abbe.models.solvers.observability.rank import (
+    campaign_columns,
+    compressed,
+    correlations,
+    observable_motions,
+    stated_knowledge,
+    status_of,
+    with_knowledge,
+)
 from abbe.models.solvers.observability.volume import inner_box
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import predict, setup_unknowns

@@ -15,8 +15,7 @@ from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
 from abbe.models.papers.wang.experiments import WangPlan, distance_errors_mm, interpolated_mm, readings
-from abbe.models.papers.wang.mirror import diagonal_beam
-from abbe.models.papers.wang.model import exact_positions_mm
+from abbe.models.papers.wang.model import diagonal_beam, exact_positions_mm
 from abbe.models.solvers.helix import LINEAR, fit_helix
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.least_squares import ParameterEstimate, solve_map

@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
-from abbe.models.planning.instruments import Instruments
-from abbe.models.planning.measurements import DiagonalTest, HelixTest, LineTest, laser_path, machine_seconds
+from abbe.models.planning.measurements import DiagonalTest, HelixTest, Instruments, LineTest, laser_path, machine_seconds
 from abbe.models.planning.plan import PlanStep
 from abbe.service.campaigns.plan import describe, plan_for, plan_report, read_instruments, recipe_of
 from abbe.service.cli.app import app

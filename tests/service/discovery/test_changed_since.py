@@ -17,7 +17,7 @@ import pytest
 
 from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
-from abbe.models.discovery.changed import comparison as changed
+from abbe.models.discovery import changed_since as changed
 from abbe.service.campaign_data.campaign_folder import from_store, store_solution
 from abbe.service.discovery.changed_since import reference_solution
 from abbe.service.discovery.changed_text import changed_lines, changed_text, proved

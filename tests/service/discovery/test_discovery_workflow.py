@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from abbe.models.discovery.answer import Agreement, Gap, NextTest, Unjudged, Unseen
+from abbe.models.discovery.answer import Agreement, BlindSpot, Gap, NextTest, Unjudged
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_answer import answer_doc
@@ -229,7 +229,7 @@ def test_runs_that_were_never_fitted_are_asked_before_nothing_is_said_to_be_miss
 
 
 def test_what_could_not_be_seen_is_told_where_nothing_is_missing(folder: Path) -> None:
-    slow = Unseen("what grows with the feed looks like geometry", "all ball-bar runs have one feed", "second_feed")
+    slow = BlindSpot("what grows with the feed looks like geometry", "all ball-bar runs have one feed", "second_feed")
     finding = discover(job_of(folder), DiscoveryJournal(), changed(Search("none"), unseen=(slow,)), ignore_progress)
     (line,) = next_of(finding)
     assert line.startswith("could not be seen: what grows with the feed looks like geometry, because all ball-bar runs have one feed")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import Localization
-from abbe.models.discovery.unseen import LATE_S
+from abbe.models.discovery.experiment.additions import LATE_S
 from abbe.service.discovery.discovery_text import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
 from abbe.service.sequences.recipes.recipe import Helix

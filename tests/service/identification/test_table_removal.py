@@ -13,7 +13,7 @@ import pytest
 
 from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
-from abbe.models.solvers.in_force import AppliedTables
+from abbe.models.solvers.applied_tables import AppliedTables
 from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder, from_store
 from abbe.service.compensation.proposals import check_same_table

@@ -1,4 +1,4 @@
-"""Candidate experiments: the additions of run-format.md 5 that a campaign lacks, as runs to be simulated."""
+"""What a campaign lacks: the additions of run-format.md 5 as runs to be simulated, and the blind spots of a campaign that found nothing."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.models.discovery.answer import BlindSpot
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, driven, standing
 from abbe.models.machine import AXES, Machine
@@ -31,6 +32,18 @@ SHORTEST_BAR_MM = 10.0
 """No ball-bar is shorter."""
 OTHER_FEED = 1.3
 """Feeds that differ by a smaller factor count as one: feed-dependent effects then change too little to differ from geometry."""
+REPEAT_LATE_S = 3600.0
+"""A repeat counts as late after this time: axes and spindle warm up within 20 minutes to two hours (effects.md, thermal)."""
+SAME_MM = 2.0
+"""Two paths are the same when their extents agree to this in every direction: at another feed the readings lie elsewhere along it."""
+SAME_LOOK = 0.01
+"""Beams whose unit vectors differ by less in every direction are parallel."""
+GROWS = "what grows with the feed (lag, servo mismatch, vibration of the drives) looks like geometry"
+TURNS = "what differs between the way there and the way back over the same points (lost motion, lateral play) looks like geometry"
+LENGTH = "what belongs to the bar (its length, its balls, its temperature) looks like an error of the machine"
+SLOW = "what comes slowly (axes, spindle and air that warm up) looks like geometry, or like a set-up"
+SCALE = "an error of all scales together is told by the bar's own length alone, and the search does not use the bar's certificate"
+MOVING = "what shows in motion on a curve only (reversals of two axes, servo mismatch, lag) leaves no trace"
 
 
 @dataclass(frozen=True)
@@ -282,3 +295,52 @@ def _again(p: Path, start: float, label: str, machine: Machine) -> CaseRun:
     feed = float(np.median(p.feed_mm_min))
     run = _bar(p, p.at.q_mm, feed, start, label) if p.kind == "bar" else _laser(p, p.at.q_mm, p.look[0], start, label, p.test)
     return replace(run, path=replace(run.path, machine=machine, test=p.test))
+
+
+def blind_spots(case: Case) -> tuple[BlindSpot, ...]:
+    """Blind spots of the fitted runs of a campaign, each with the measurement that would cover it.
+
+    Runs that were not fitted do not count: the search does not use them.
+    """
+    paths = [r.path for r in case.of("identify")]
+    bars, lasers = [p for p in paths if p.kind == "bar"], [p for p in paths if p.kind == "laser"]
+    out: list[BlindSpot] = []
+    if not paths:
+        return ()
+    if not bars:
+        out.append(BlindSpot(MOVING, "no ball-bar run was fitted", "ballbar"))
+    else:
+        if one_feed(bars):
+            out.append(BlindSpot(GROWS, "all ball-bar runs have one feed", "second_feed"))
+        if one_way(bars):
+            out.append(BlindSpot(TURNS, "all ball-bar runs go one way round", "opposite_direction"))
+        if one_radius(bars):
+            out.append(BlindSpot(LENGTH, "all ball-bar runs have one radius", "second_radius"))
+    if not lasers:
+        out.append(BlindSpot(SCALE, "no laser run was fitted", "laser_diagonals"))
+    if not _repeated_late(paths):
+        out.append(BlindSpot(SLOW, f"no path was run again {REPEAT_LATE_S / 3600.0:.0f} h later or more", "longer_session"))
+    return tuple(out)
+
+
+def _repeated_late(paths: list[Path]) -> bool:
+    """Whether some path was repeated, in either direction, `REPEAT_LATE_S` or more after its first run."""
+    first: list[tuple[str, F1, float]] = []
+    for p in sorted(paths, key=lambda p: float(p.at.t_s[0])):
+        place, began = _place(p), float(p.at.t_s[0])
+        before = next((t for test, known, t in first if test == p.test and np.all(np.abs(place - known) <= SAME_MM)), None)
+        if before is None:
+            first.append((p.test, place, began))
+        elif began - before >= REPEAT_LATE_S:
+            return True
+    return False
+
+
+def _place(path: Path) -> F1:
+    """Signature of a path regardless of direction: extent along every axis, a bar's cup and radius, mm; a beam's direction, scaled."""
+    reach = [path.at.q_mm.min(axis=0), path.at.q_mm.max(axis=0)]
+    if path.kind == "bar":
+        return np.concatenate([*reach, path.centre_mm, [path.radius_mm]])
+    beam = path.look[0]
+    back = beam[np.flatnonzero(np.abs(beam) > 0.1)[0]] < 0.0
+    return np.concatenate([*reach, (-beam if back else beam) * SAME_MM / SAME_LOOK])

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.projection import rows_of
-from abbe.models.discovery.whitened_problem import WhitenedProblem
+from abbe.models.discovery.whitened_problem import WhitenedProblem, rows_of
 from abbe.models.effects.effect import Effect, Form, Values
 
 UNNAMED = "unnamed_"
@@ -23,6 +22,8 @@ SEEN = 1e-5
 MOST_CACHED = 16
 """Picks whose columns are cached: a search returns to those it has just used."""
 Short = NDArray[np.float32]
+PART = 20
+"""Candidates whitened together; whitening makes several copies of its input."""
 
 
 @dataclass(frozen=True)
@@ -196,10 +197,6 @@ def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
     )  # fmt: skip
     problem.banks.add(bank)
     return bank
-
-
-PART = 20
-"""Candidates whitened together; whitening makes several copies of its input."""
 
 
 def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:

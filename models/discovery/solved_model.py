@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.candidates import Pick, with_values
+from abbe.models.discovery.candidate_bank import Pick, with_values
 from abbe.models.discovery.case import CaseRun
 from abbe.models.discovery.whitened_problem import WhitenedProblem, ordered
 from abbe.models.effects.effect import Signal

@@ -17,8 +17,7 @@ from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import AXES, Machine
-from abbe.models.planning.instruments import Instruments
-from abbe.models.planning.measurements import BAR_VALUES, HelixTest, Measurement, expected_run
+from abbe.models.planning.measurements import BAR_VALUES, HelixTest, Instruments, Measurement, expected_run
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import bar_length_name, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
