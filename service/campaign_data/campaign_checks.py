@@ -1,12 +1,14 @@
 """Check every run of a campaign before a solution. Each issue is one line: the run, the mistake and the remedy.
 
-The checks are geometry (are the points where the set-up says?), copies, and consistency of the readings with the other runs
+The checks are geometry (are the points where the set-up says?), times, copies, and consistency of the readings with the other runs
 (`abbe.models.solvers.plausibility`). An issue either refuses the campaign or becomes a flag beside the result.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,13 +17,160 @@ from numpy.typing import NDArray
 from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.plausibility import SuspectRun, suspects
-from abbe.service.campaign_data.campaign_issue import CampaignIssue
-from abbe.service.campaign_data.copied_runs import copy_issues
 from abbe.service.campaign_data.run_geometry import geometry_mistake
-from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run import BarSetup, Run
 from abbe.service.errors import CampaignRefused
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignIssue:
+    """One mistake in one run, or in two that contradict each other.
+
+    ``refuse``: the campaign must not be solved; otherwise the issue is a flag beside the result.
+    """
+
+    run: str
+    what: str
+    remedy: str
+    refuse: bool
+
+    @property
+    def line(self) -> str:
+        """Run, mistake and remedy in one line."""
+        return f"run {self.run}: {self.what} - {self.remedy}"
+
+
+FASTEST = 0.2
+"""Least ratio of a run's duration to path length over feed: the programmed feed is the upper limit."""
+SLOWEST = {"ballbar": 10.0, "laser": 200.0}
+"""Largest ratio of a run's duration to path length over feed: a ball-bar run moves steadily, a laser run stops at every point."""
+OVERLAP = 0.1
+"""Largest allowed overlap of two runs as a share of the shorter one: clocks are not set to the second."""
+TIME_UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
+
+
+def time_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
+    """Flags of runs whose clocks disagree, whose t_s does not fit their feed, or which overlap other runs."""
+    out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
+    known = {f.run for f in out}
+    return out + _overlaps([r for r in runs if r.run_id not in known])
+
+
+def _clocks(run: Run) -> list[CampaignIssue]:
+    """The disagreement of a run's clocks, if any (`abbe.service.runs.clocks`)."""
+    trouble = run.timing.trouble
+    return [CampaignIssue(run.run_id, trouble, "look at the sync cable and the links, then measure it again", False)] if trouble else []
+
+
+def _against_feed(run: Run) -> list[CampaignIssue]:
+    points, t, feed = run.columns.q_mm, run.columns.t_s, run.columns.feed_mm_min
+    if len(points) < 2 or not all(np.isfinite(v).all() for v in (points, t, feed)) or feed.min() <= 0.0:
+        return []
+    wanted = float((np.linalg.norm(np.diff(points, axis=0), axis=1) * 60.0 / feed[1:]).sum())
+    if wanted <= 0.0:
+        return []
+    waited = np.sort(np.diff(t))[::-1][: len(run.timing.pieces)].sum()  # pauses between the pieces of a path
+    ratio, slowest = float(t[-1] - t[0] - waited) / wanted, SLOWEST["ballbar" if run.is_bar else "laser"]
+    if FASTEST <= ratio <= slowest:
+        return []
+    unit = next(
+        (text for factor, text in TIME_UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says"
+    )
+    what = f"it took {ratio:.2g} times as long as its path at its feed_mm_min: {unit}"
+    return [
+        CampaignIssue(run.run_id, what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False)
+    ]
+
+
+def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
+    """Runs whose times overlap; the run with the most overlaps is flagged and removed until none remains."""
+    spans = {r.run_id: (float(r.columns.t_s[0]), float(r.columns.t_s[-1])) for r in runs if len(r.columns)}
+    spans = {k: v for k, v in spans.items() if np.isfinite(v).all()}
+    meets = {k: [m for m in spans if m != k and _share(spans[k], spans[m]) > OVERLAP] for k in spans}
+    out = []
+    while any(meets.values()):
+        worst = max(meets, key=lambda k: len(meets[k]))
+        others = meets.pop(worst)
+        meets = {k: [m for m in v if m != worst] for k, v in meets.items()}
+        what = f"its t_s lies within that of {_named(others)}: one machine cannot measure two runs at a time"
+        out.append(CampaignIssue(worst, what, "write t_s in s of one clock for the whole campaign: drift is judged by it", False))
+    if len(out) > 1 and 2 * len(out) >= len(spans):
+        what = f"its t_s and those of {len(out)} other runs overlap: every run seems to have a clock of its own"
+        return [CampaignIssue(next(iter(spans)), what, out[0].remedy, False)]
+    return out
+
+
+def _share(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Common time of two spans as a share of the shorter one."""
+    shorter = min(a[1] - a[0], b[1] - b[0])
+    return (min(a[1], b[1]) - max(a[0], b[0])) / shorter if shorter > 0.0 else 0.0
+
+
+def _named(others: list[str]) -> str:
+    return f"run {others[0]}" if len(others) == 1 else f"{len(others)} other runs ({others[0]}, ...)"
+
+
+COPIED_SHARE = 0.98
+"""Share of equal readings, positions included, from which a run is a copy: noise differs every time."""
+VISIBLE_STEPS = 2.0
+"""Rms second difference of the readings, in sensor steps, above which they show noise: rounding alone gives 0.7."""
+NOTHING_MM = 1e-9
+
+
+def copy_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
+    """Issues of runs whose readings occur in an earlier run, regardless of their labels.
+
+    If the readings show noise, equal readings are a copy whatever their times. Repeats with a coarse sensor can be equal without noise:
+    there a copy must also have the same times.
+    """
+    rows = [_rows(r) for r in runs]
+    out = []
+    for k, run in enumerate(runs):
+        for j in range(k):
+            if _copied(rows[j], rows[k]) and (_shows_noise(run) or _copied(_timed(runs[j], rows[j]), _timed(run, rows[k]))):
+                what = f"its readings are those of run {runs[j].run_id}: one measurement would count twice"
+                out.append(CampaignIssue(run.run_id, what, "leave it out (--without), or export it again", True))
+                break
+    return out
+
+
+def _copied(one: Counter[Any], other: Counter[Any]) -> bool:
+    """Whether nearly all rows of the shorter one occur in the other, equally often."""
+    shorter = min(one.total(), other.total())
+    return shorter > 0 and (one & other).total() >= COPIED_SHARE * shorter
+
+
+def _rows(run: Run) -> Counter[Any]:
+    """Position and deviation of every reading, in 10 nm and 0.01 nm; empty for a run with constant deviations."""
+    y = run.columns.readings_mm
+    if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
+        return Counter()
+    steps = ((y, 1e8), *((along, 1e5) for along in run.columns.q_mm.T))
+    return Counter(zip(*(np.rint(v * n).tolist() for v, n in steps), strict=True))
+
+
+def _timed(run: Run, rows: Counter[Any]) -> Counter[Any]:
+    """Time, ms, and deviation of every reading."""
+    columns = run.columns
+    return Counter(zip(np.rint(columns.t_s * 1e3).tolist(), columns.readings_mm.tolist(), strict=True)) if rows else rows
+
+
+def _shows_noise(run: Run) -> bool:
+    """Whether the readings show noise, so that a repeated measurement would differ: places visited again read differently, or, without
+    repeated places, the second differences exceed those from rounding."""
+    y, columns = run.columns.readings_mm, run.columns
+    states = map(tuple, np.column_stack([columns.q_mm, columns.direction]).tolist())
+    places: dict[Any, list[float]] = {}
+    for state, v in zip(states, y.tolist(), strict=True):
+        places.setdefault(state, []).append(v)
+    again = np.concatenate([np.diff(v) for v in places.values()])
+    if again.size >= max(4, y.size // 4):
+        return bool(np.mean(np.abs(again) > NOTHING_MM) > 0.5)
+    steps = np.diff(np.unique(y))
+    steps = steps[steps > NOTHING_MM]
+    return bool(y.size > 2 and steps.size and np.sqrt(np.mean(np.diff(y, 2) ** 2)) > VISIBLE_STEPS * steps.min())
+
 
 LARGEST_MM = 2.0
 """Largest plausible deviation: many larger numbers are in another unit, single ones are outliers."""

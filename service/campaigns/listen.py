@@ -28,8 +28,8 @@ from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, MeasurementFault
-from abbe.service.runs.laser_columns import MM_PER_COUNT
 from abbe.service.runs.recorder import Recorder
+from abbe.service.runs.sample_columns import MM_PER_COUNT
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
 from abbe.service.sequences.needed import check_devices

@@ -15,9 +15,8 @@ from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.case import Case
 from abbe.models.effects.effect import Effect
-from abbe.service.campaign_data.campaign_checks import check_files, check_readings, refuse
+from abbe.service.campaign_data.campaign_checks import check_files, check_readings, copy_issues, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.campaign_data.copied_runs import copy_issues
 from abbe.service.campaign_data.decimation import lines_of, thinned, thinning
 from abbe.service.campaign_data.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
 from abbe.service.discovery.changed_since import ReferenceSolution

@@ -17,9 +17,7 @@ from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import bar_normals, setup_unknowns
 from abbe.models.solvers.priors import U_WAVELENGTH, Priors
 from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
-from abbe.service.campaign_data.campaign_checks import check_files, check_readings, refuse
-from abbe.service.campaign_data.campaign_issue import CampaignIssue
-from abbe.service.campaign_data.copied_runs import copy_issues
+from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, check_readings, copy_issues, refuse
 from abbe.service.campaign_data.provenance import measured_digest, removals_of
 from abbe.service.domain.run import Run
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable

@@ -13,7 +13,7 @@ from abbe.service.errors import FileFormatError
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import LAYOUT, VectorCase
 from abbe.service.reference.vectors import kwon, pahk, paper_tables, probe, wang, yang
-from abbe.service.runs.json_text import strict_json
+from abbe.service.runs.checks import strict_json
 
 FORMAT = "abbe-vectors/1"
 READERS: dict[str, Callable[[VectorCase, Checks], None]] = {

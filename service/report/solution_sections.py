@@ -12,8 +12,15 @@ from abbe.models.geometry.bases import term_values
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.service.domain.solution_file import SolutionFile
-from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment, noise_lines, outlier_lines, residual_lines, worst_line
-from abbe.service.identification.solve_verdict import layout_line
+from abbe.service.identification.solve_report import (
+    HIDDEN_NOTE,
+    Assessment,
+    layout_line,
+    noise_lines,
+    outlier_lines,
+    residual_lines,
+    worst_line,
+)
 from abbe.service.rendering.document import Block, Lines, Picture, Section, TextTable
 from abbe.service.rendering.model import (
     SETUP_NOTE,

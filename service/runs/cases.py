@@ -15,7 +15,7 @@ from abbe.models.machine import Machine
 from abbe.service.domain.run import LaserSetup, Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, Role
 from abbe.service.errors import MeasurementFault
-from abbe.service.runs.approached import with_reversals
+from abbe.service.runs.observations import with_reversals
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
 AXES = "XYZ"

@@ -9,59 +9,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from abbe.drivers.flags import bar_is_valid
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.domain.run import Columns, Run, RunTiming, parsed_setup
 from abbe.service.domain.run_start import RunEnd, RunStart
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
-from abbe.service.runs.bar_columns import bar_columns, starts_in_stream, sync_edges
 from abbe.service.runs.clocks import RunClock, run_clock
 from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
 from abbe.service.runs.coverage import with_state
-from abbe.service.runs.laser_columns import laser_columns
 from abbe.service.runs.pieces import ReadProgress, counted_columns, progress_of
+from abbe.service.runs.sample_columns import bar_columns, bar_point_columns, laser_columns, starts_in_stream, sync_edges
 from abbe.service.storage.store import Store
-
-
-def bar_point_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
-    """Convert the records of a point-by-point ball-bar test to columns: one row per point, the mean of its samples.
-
-    Parameters
-    ----------
-    records : sequence of dict
-        ``ctrl_us`` (controller time, after the axes had settled), ``target_mm``, ``direction``, ``feed_mm_min``, and for every sample
-        ``device_us``, ``reading_nm``, ``status``; in order.
-    start : RunStart
-        The zero of the clock.
-
-    Returns
-    -------
-    Columns
-        With ``reading_u_mm`` (standard uncertainty of each mean), ``samples_count``, ``device_us`` of the first
-        sample.
-    """
-    return Columns(
-        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
-        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
-        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
-        direction=np.array([one["direction"] for one in records], dtype=np.float64),
-        deviation_mm=np.array([np.mean(one["reading_nm"]) * 1e-6 for one in records], dtype=np.float64),
-        valid=np.array([all(bar_is_valid(s) for s in one["status"]) for one in records], dtype=np.bool_),
-        further={
-            "reading_u_mm": np.array([_u_mm(one["reading_nm"]) for one in records], dtype=np.float64),
-            "samples_count": np.array([len(one["reading_nm"]) for one in records], dtype=np.int64),
-            "device_us": np.array([one["device_us"][0] for one in records], dtype=np.int64),
-        },
-    )
-
-
-def _u_mm(reading_nm: Sequence[int]) -> float:
-    n = len(reading_nm)
-    return float(np.std(reading_nm, ddof=1) * 1e-6 / np.sqrt(n)) if n > 1 else 0.0
-
 
 BAR_CHANNEL = "bar"
 LASER_CHANNEL = "laser"

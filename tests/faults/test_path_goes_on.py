@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from abbe.drivers.errors import Rebooted
-from abbe.service.campaign_data.run_times import time_issues
+from abbe.service.campaign_data.campaign_checks import time_issues
 from abbe.service.campaigns.campaign_run import decline
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume

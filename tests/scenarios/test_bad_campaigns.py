@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from abbe.service.campaign_data.copied_runs import copy_issues
+from abbe.service.campaign_data.campaign_checks import copy_issues
 from abbe.service.errors import AbbeError, CampaignRefused
 from abbe.service.identification.solve import check_campaign
 from tests.experiments.campaigns import population

@@ -124,7 +124,7 @@ def test_workers(traps: Path) -> None:
     """Python's own way of starting processes looks in the working directory, too. The parent is a script, as `abbe` is: without ``-P``."""
     program = traps.parent / "program.py"
     words = "print(list(ProcessExecutor(2).map(neg, [1, 2, 3])))"
-    imports = "from operator import neg; from abbe.service.identification.executors import ProcessExecutor"
+    imports = "from operator import neg; from abbe.service.identification.reanalysis import ProcessExecutor"
     program.write_text(f"if __name__ == '__main__':\n    {imports}\n    {words}\n")
     done = subprocess.run(
         [sys.executable, program], cwd=traps, capture_output=True, text=True, check=False, timeout=120, env=os.environ | {"PYTHONPATH": ""}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.domain.solution_file import SolutionFile
-    from abbe.service.identification.executors import Executor
+    from abbe.service.identification.reanalysis import Executor
     from abbe.service.identification.solve import Solved
     from abbe.service.identification.solve_report import Assessment
     from abbe.service.storage.store import Store
@@ -337,7 +337,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
 
 def _executor(workers: int, dask: str | None) -> Executor:
     from abbe.service.errors import ConfigError
-    from abbe.service.identification.executors import DaskExecutor, ProcessExecutor, SerialExecutor
+    from abbe.service.identification.reanalysis import DaskExecutor, ProcessExecutor, SerialExecutor
 
     if dask is None:
         return SerialExecutor() if workers == 1 else ProcessExecutor(workers)

@@ -10,8 +10,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from abbe.service.identification.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
-from abbe.service.identification.reanalysis import ReanalysisTask, solve_all, tasks_of
+from abbe.service.identification.reanalysis import (
+    DaskExecutor,
+    Executor,
+    ProcessExecutor,
+    ReanalysisTask,
+    SerialExecutor,
+    solve_all,
+    tasks_of,
+)
 from abbe.service.storage.store import Store
 from tests.many_campaigns import dask_cluster, fill
 

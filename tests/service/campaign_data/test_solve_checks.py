@@ -8,11 +8,9 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import step_diagonal
-from abbe.service.campaign_data.campaign_checks import check_files, refuse
-from abbe.service.campaign_data.campaign_issue import CampaignIssue
+from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, refuse, time_issues
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, revision, run_digest, versions
 from abbe.service.campaign_data.run_geometry import geometry_mistake
-from abbe.service.campaign_data.run_times import time_issues
 from abbe.service.errors import CampaignRefused
 from abbe.service.identification.solve import _longest_contained
 from tests.run_documents import run_of, runs_of

@@ -9,8 +9,15 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.errors import ConfigError
-from abbe.service.identification.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
-from abbe.service.identification.reanalysis import ReanalysisResult, solve_all, tasks_of
+from abbe.service.identification.reanalysis import (
+    DaskExecutor,
+    Executor,
+    ProcessExecutor,
+    ReanalysisResult,
+    SerialExecutor,
+    solve_all,
+    tasks_of,
+)
 from abbe.service.storage.store import Store
 from tests.conftest import Require
 from tests.many_campaigns import dask_cluster, fill

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.drivers.api import BarSample
-from abbe.service.campaign_data.run_times import time_issues
+from abbe.service.campaign_data.campaign_checks import time_issues
 from abbe.service.devices.session import KEPT, noted, notes_since
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.domain.owner import Owner

@@ -1,18 +1,19 @@
-"""Convert ball-bar samples to columns: every reading gets the commanded position at which it was taken.
+"""Turn samples into columns: every reading of ball-bar or laser gets the commanded position at which it was taken.
 
-The controller's "path running" output is wired to the bar's box, which samples it together with the reading. The first sample with this
-input set was taken within one period after the path began; nothing here depends on arrival times at the computer.
+For a ball-bar in motion, the controller's "path running" output is wired to the bar's box, which samples it together with the reading. The
+first sample with this input set was taken within one period after the path began; nothing here depends on arrival times at the computer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from abbe.drivers.api import BarSample
-from abbe.drivers.flags import bar_is_valid, on_path
+from abbe.drivers.flags import bar_is_valid, beam_is_gone, on_path
 from abbe.service.domain.run import Columns
 from abbe.service.domain.run_start import CommandedPath, RunEnd, RunStart
 from abbe.service.errors import MeasurementFault
@@ -150,3 +151,87 @@ def _position(points: Array, arc_mm: Array) -> Array:
     corners = points[np.concatenate(([True], steps > 0.0))]  # repeated points would make the arc length ambiguous
     arc = np.concatenate(([0.0], np.cumsum(steps[steps > 0.0])))
     return np.stack([np.interp(arc_mm, arc, corners[:, axis]) for axis in range(3)], axis=1)
+
+
+def bar_point_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
+    """Convert the records of a point-by-point ball-bar test to columns: one row per point, the mean of its samples.
+
+    Parameters
+    ----------
+    records : sequence of dict
+        ``ctrl_us`` (controller time, after the axes had settled), ``target_mm``, ``direction``, ``feed_mm_min``, and for every sample
+        ``device_us``, ``reading_nm``, ``status``; in order.
+    start : RunStart
+        The zero of the clock.
+
+    Returns
+    -------
+    Columns
+        With ``reading_u_mm`` (standard uncertainty of each mean), ``samples_count``, ``device_us`` of the first
+        sample.
+    """
+    return Columns(
+        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
+        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
+        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
+        direction=np.array([one["direction"] for one in records], dtype=np.float64),
+        deviation_mm=np.array([np.mean(one["reading_nm"]) * 1e-6 for one in records], dtype=np.float64),
+        valid=np.array([all(bar_is_valid(s) for s in one["status"]) for one in records], dtype=np.bool_),
+        further={
+            "reading_u_mm": np.array([_u_mm(one["reading_nm"]) for one in records], dtype=np.float64),
+            "samples_count": np.array([len(one["reading_nm"]) for one in records], dtype=np.int64),
+            "device_us": np.array([one["device_us"][0] for one in records], dtype=np.int64),
+        },
+    )
+
+
+def _u_mm(reading_nm: Sequence[int]) -> float:
+    n = len(reading_nm)
+    return float(np.std(reading_nm, ddof=1) * 1e-6 / np.sqrt(n)) if n > 1 else 0.0
+
+
+MM_PER_COUNT = 1e-7
+"""The displacement counts tenths of a nanometre."""
+
+
+def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
+    """Convert laser records to columns.
+
+    Parameters
+    ----------
+    records : sequence of dict
+        ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
+        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: no reading at that standstill.
+    start : RunStart
+        Its set-up states the beam.
+
+    Returns
+    -------
+    Columns
+        With ``status``, ``signal_permille``. Deviations count from the first record, or from the laser's zero if
+        that record is missing. A missing reading is a row with the commanded position, deviation 0 and ``valid`` 0, so that later rows keep
+        their places.
+    """
+    first = records[0] if records else {}
+    beam = start.setup["nominal_beam"]
+    return Columns(
+        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
+        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
+        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
+        direction=np.array([one["direction"] for one in records], dtype=np.float64),
+        deviation_mm=np.array([_deviation_mm(one, first, beam) for one in records], dtype=np.float64),
+        valid=np.array([not (one.get("missing") or beam_is_gone(one["status"])) for one in records], dtype=np.bool_),
+        further={
+            "temp_air_C": np.array([one["air_temp_c"] for one in records], dtype=np.float64),
+            "pressure_air_Pa": np.array([one["air_pressure_pa"] for one in records], dtype=np.float64),
+            "status": np.array([one["status"] for one in records], dtype=np.int64),
+            "signal_permille": np.array([one["signal_permille"] for one in records], dtype=np.int64),
+        },
+    )
+
+
+def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[float]) -> float:
+    if one.get("missing"):
+        return 0.0
+    nominal_mm = sum(b * (now - before) for b, now, before in zip(beam, one["target_mm"], first["target_mm"], strict=True))
+    return float((one["displacement_tenth_nm"] - first["displacement_tenth_nm"]) * MM_PER_COUNT - nominal_mm)

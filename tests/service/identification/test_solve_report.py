@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.solvers.observability.volume import Number
 from abbe.models.uncertainty.prediction import Prediction
-from abbe.service.identification.solve_verdict import WORDS, verdict
+from abbe.service.identification.solve_report import WORDS, verdict
 
 
 def layout(value: float, word: str) -> Number:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.errors import FileFormatError
-from abbe.service.runs.json_text import strict_json
+from abbe.service.runs.checks import strict_json
 
 FILE = Path("a.json")
 
