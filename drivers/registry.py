@@ -14,7 +14,7 @@ from typing import cast
 from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.errors import BadUrl, WrongDevice
+from abbe.drivers.errors import BadUrl
 from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.modbus_line import Canary
@@ -65,10 +65,8 @@ async def open_laser(url: str) -> DisplacementMeter:
     return laser
 
 
-async def open_controller(url: str, *, commissioned: str = "") -> Controller:
+async def open_controller(url: str) -> Controller:
     """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL, or one of an installed driver.
-
-    ``commissioned``: ``identify().firmware`` at commissioning; any other is refused. Empty: any map of this version.
 
     Raises
     ------
@@ -83,11 +81,7 @@ async def open_controller(url: str, *, commissioned: str = "") -> Controller:
         controller = cast(Controller, await _opened(entry, url))
     else:
         controller = ModbusController(await _modbus(url, "a controller"))
-    info = await _identify_or_close(controller)
-    if commissioned and info.firmware != commissioned:
-        await controller.close()
-        detail = f"its register map is not the commissioned one: {info.firmware} instead of {commissioned}"
-        raise WrongDevice(ascii(url), "identify", detail, "another firmware or another machine: commission it anew")
+    await _identify_or_close(controller)
     return controller
 
 

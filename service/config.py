@@ -17,7 +17,7 @@ from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
 from pydantic_settings.exceptions import SettingsError
 
-from abbe.service.config_schema import MachineFile
+from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
 from abbe.service.errors import ConfigError
 from abbe.service.explain import expected, location_text, nearest
 from abbe.service.secrets import mask_secrets
@@ -71,9 +71,22 @@ def load_machine(path: Path | str) -> LoadedMachine:
         machine = MachineFile.model_validate_json(json.dumps(merged, default=str), strict=True)
     except ValidationError as err:
         raise _config_error(path, err.errors(), from_environment) from None
+    _check_exclusive(path, merged)
     origins: dict[str, Origin] = dict.fromkeys((key for key, _ in _leaves(from_file)), "file")
     origins |= dict.fromkeys((key for key, _ in _leaves(from_environment)), "environment")
     return LoadedMachine(path, machine, origins)
+
+
+def _check_exclusive(path: Path, values: Mapping[str, Any]) -> None:
+    """Refuse an entry with keys of both ways to write it, also where a value equals its default: the reader cannot know which was meant."""
+    for name, (one, other) in EXCLUSIVE_KEYS.items():
+        for number, entry in enumerate(values.get(name, ()), start=1):
+            found, more = [key for key in one if key in entry], [key for key in other if key in entry]
+            if found and more:
+                wanted = f"expected {' and '.join(one)} without {', '.join(other)}, or the other way round"
+                raise ConfigError(
+                    f"{path}: {name}[{number}]: {wanted}, got {', '.join([*found, *more])}", f"remove {more[0]} or {found[0]}"
+                )
 
 
 def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:

@@ -45,6 +45,12 @@ def _certificate(day: date | None) -> date | None:
 
 Temperatures = Annotated[Interval, AfterValidator(_celsius)]
 MachineWindow = Annotated[Window, AfterValidator(complete)]
+EXCLUSIVE_KEYS = {
+    "schedule": (("cron",), ("every_h", "first")),
+    "maintenance": (("cron", "hours"), ("days", "start", "end")),
+    "staffed": (("cron", "hours"), ("days", "start", "end")),
+}
+"""Keys of the two ways to write an entry of a list; an entry uses one of them."""
 Certificate = Annotated[date | None, AfterValidator(_certificate)]
 
 

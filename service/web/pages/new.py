@@ -43,7 +43,6 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
             chosen=chosen,
             rates_hz=plans.rates_hz,
             rate_hz=rate_hz,
-            usual_hz=USUAL_HZ,
             dry=dry,
             guided=chosen == CAMPAIGN,
             max_feed=None if plans.machine is None else plans.machine.max_feed_mm_min,

@@ -194,7 +194,7 @@ def test_a_dry_run() -> None:
     dry = PLANS.run("quick-check", 100, Unit("in", IN))
     assert dry is not None
     told = SimpleNamespace(job=None, next_due=[])
-    known = {"choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100, "usual_hz": 100}
+    known = {"choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
     known |= {"max_feed": TOLD.max_feed_mm_min, "may_measure": True, "guided": False, "key": "k", "expired": [], "temperature_c": None}
     page = html.unescape(environment().get_template("new.html").render(machine="m", zone="UTC", status=told, dry=dry, **known))
     assert f"{dry.fastest_mm_min / IN:.2f} in/min (Limit {6000 / IN:.2f})" in page
