@@ -18,8 +18,7 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDic
 from pydantic_settings.exceptions import SettingsError
 
 from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
-from abbe.service.errors import ConfigError
-from abbe.service.explain import expected, location_text, nearest
+from abbe.service.errors import ConfigError, expected, location_text, nearest
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage.engine import resolve_url
 

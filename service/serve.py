@@ -24,21 +24,16 @@ import structlog
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
-from abbe.service.core.board import Board
-from abbe.service.core.cut_off import OpenPushReader, cut_off_now, leave_now
+from abbe.service.core.board import Board, BoardWatch, SnapshotSource, StatePublisher, VerifiedWatch
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns
-from abbe.service.core.push_recovery import PushRecovery
-from abbe.service.core.rights import may, may_measure
+from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns, may, may_measure
+from abbe.service.core.process import OpenPushReader, cut_off_now, leave_now, notify
+from abbe.service.core.push_recovery import PushRecovery, push_is_open
 from abbe.service.core.setup import ServiceSetup
-from abbe.service.core.snapshot import SnapshotSource
-from abbe.service.core.systemd import notify
 from abbe.service.core.table_watch import TableWatch
-from abbe.service.core.watch import BoardWatch, StatePublisher, VerifiedWatch
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import ConfigError
-from abbe.service.jobs.at_start import push_is_open
 from abbe.service.mqtt.publisher import Publisher, StoreOutbox
 from abbe.service.plant.gather import Gatherer
 from abbe.service.queries.reader import Reader

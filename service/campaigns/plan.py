@@ -20,8 +20,7 @@ from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, PlanStep, p
 from abbe.models.planning.search import COVERAGE
 from abbe.service.config import read_toml
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
-from abbe.service.errors import ConfigError
-from abbe.service.explain import expected, location_text, nearest
+from abbe.service.errors import ConfigError, expected, location_text, nearest
 from abbe.service.rendering.document import Document, Lines, Picture, Section, TextTable
 from abbe.service.rendering.plots.views import DrawnTest, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced

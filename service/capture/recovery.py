@@ -16,11 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.ingest import BATCH, chunk_of, may_pass
 from abbe.service.capture.ledger import DAMAGED, Ledger, ledger_of, settle, streams_doc
 from abbe.service.capture.recorder import is_active
-from abbe.service.capture.segment import CHUNK, CLOSE, GAP, OPEN, Scan, scan
+from abbe.service.capture.segment import CHUNK, CLOSE, GAP, OPEN, RealFileIO, Scan, scan
 from abbe.service.capture.settings import (
     CONFLICT,
     DAMAGED_SUFFIX,

@@ -1,16 +1,30 @@
-"""Current state known to the core: the running check, the devices, the broker. Kept in memory; results are in the store."""
+"""Current state known to the core: the running check, the devices, the broker. Kept in memory; results are in the store.
+
+Watchers of the running job keep the board (and with it the page) and the broker up to date; `SnapshotSource` makes one message of it all.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import asyncio
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
-from datetime import datetime
+from datetime import datetime, timedelta
+from pathlib import Path
 
+from abbe.service.channel.messages import Snapshot
 from abbe.service.clock import Clock
+from abbe.service.core.jobs import JobRegistry
+from abbe.service.domain.bounds import TEXT, WORD
 from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.progress import Progress, RunningCheck
-from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.schedule import DueSlot, Schedule
+from abbe.service.errors import StoreError
+from abbe.service.mqtt.publisher import Publisher
 from abbe.service.scheduler.ports import Doc
+from abbe.service.verification.verified_by import VerifiedBy
 
 
 class Board:
@@ -68,3 +82,135 @@ class Board:
         """Note that waiting messages were dropped because the broker was away for too long."""
         self.changes += 1
         self.mqtt_dropped += count
+
+
+LOOK_S = 5.0
+
+
+class BoardWatch:
+    """Updates the board, and reports the change."""
+
+    def __init__(self, board: Board, changed: Callable[[], None]) -> None:
+        self._board, self._changed = board, changed
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        """A check begins."""
+        self._board.job_started(schedule, at_utc)
+        self._changed()
+
+    def job_progress(self, progress: Progress) -> None:
+        """The check got further."""
+        self._board.job_progress(progress)
+        self._changed()
+
+    def job_ended(self, doc: Doc | None) -> None:
+        """The check ended."""
+        self._board.job_ended(doc)
+        self._changed()
+
+
+class StatePublisher:
+    """Keeps the retained state message up to date."""
+
+    def __init__(self, publisher: Publisher, clock: Clock) -> None:
+        self._publisher = publisher
+        self._clock = clock
+
+    def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
+        """A check begins."""
+        self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
+
+    def job_progress(self, progress: Progress) -> None:
+        """Do nothing: the state is retained, so every change is a write in the broker. Progress is for the page."""
+
+    def job_ended(self, doc: Doc | None) -> None:
+        """The check ended."""
+        self._publisher.set_state("online", self._clock.utc())
+
+
+class VerifiedWatch:
+    """Watches which measurement verified the table in force, and updates broker and page when that changes: any process may roll back."""
+
+    def __init__(self, look: Callable[[], VerifiedBy], publisher: Publisher | None, clock: Clock, changed: Callable[[], None]) -> None:
+        self._look, self._publisher, self._clock, self._changed = look, publisher, clock, changed
+        self._published: VerifiedBy | None = None
+
+    async def run(self) -> None:
+        """Watch forever. A database that does not answer is asked again."""
+        while True:
+            with suppress(StoreError):
+                self._publish(await asyncio.to_thread(self._look))
+            await self._clock.sleep(LOOK_S)
+
+    def _publish(self, known: VerifiedBy) -> None:
+        if known == self._published:
+            return
+        self._published = known
+        if self._publisher is not None:
+            self._publisher.set_verified(known.as_doc())
+        self._changed()
+
+
+AGAIN = timedelta(minutes=1)
+"""The timetable is evaluated at most this often, unless a slot has come due: it changes only then."""
+
+
+class SnapshotSource:
+    """Makes snapshots from the board, the registry of jobs (``jobs``), the timetable (``next_due``) and the clock."""
+
+    def __init__(self, board: Board, jobs: JobRegistry, next_due: Callable[[], Sequence[tuple[Schedule, datetime]]], clock: Clock) -> None:
+        self._board, self._jobs, self._next_due, self._clock = board, jobs, next_due, clock
+        self._due: tuple[DueSlot, ...] = ()
+        self._looked: datetime | None = None
+
+    def now(self, web_restarts: int) -> Snapshot:
+        """Return the present state of the service."""
+        board = self._board
+        devices = tuple(replace(d, role=d.role[:WORD], url=d.url[:TEXT], text=d.text[:TEXT]) for d in board.devices)
+        attention = tuple(text[:TEXT] for text in board.attention)
+        return Snapshot(
+            "moment",
+            board.changes,
+            self._check(),
+            devices,
+            self._slots(),
+            board.mqtt_connected,
+            board.mqtt_dropped,
+            attention,
+            rss_bytes(),
+            web_restarts,
+        )
+
+    def _check(self) -> RunningCheck | None:
+        check, job = self._board.job, self._jobs.running
+        if check is None:
+            return None
+        if job is not None:
+            check = replace(check, id=job.id, state=job.state, prompt=job.prompt, ask=job.ask)
+        return replace(
+            check,
+            schedule=check.schedule[:WORD],
+            recipe=check.recipe[:WORD],
+            stage=check.stage[:WORD],
+            message=check.message[:TEXT],
+            why=check.why[:TEXT],
+            done=check.done if math.isfinite(check.done) else 0.0,
+            total=check.total if math.isfinite(check.total) else 0.0,
+            eta_s=check.eta_s if check.eta_s is not None and math.isfinite(check.eta_s) else None,
+        )
+
+    def _slots(self) -> tuple[DueSlot, ...]:
+        now = self._clock.utc()
+        come = any(due.slot_utc <= now for due in self._due)
+        if self._looked is None or come or not self._looked <= now < self._looked + AGAIN:
+            self._looked = now
+            self._due = tuple(DueSlot(schedule=schedule, slot_utc=slot) for schedule, slot in self._next_due()[:200])
+        return self._due
+
+
+def rss_bytes() -> int:
+    """Return the resident memory of this process, bytes; 0 where the system does not report it."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return 0

@@ -22,7 +22,6 @@ from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import RollbackOrder, RollbackRequest
 from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand
-from abbe.service.core.rights import person
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.progress import ProgressSink
@@ -34,14 +33,13 @@ from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, reconciled
+from abbe.service.users.roles import ALLOWED, Permission, Role
 
 log = structlog.get_logger("abbe.orders")
-
 CAMPAIGN: Final = "campaign"
 ROLLBACK: Final = "rollback"
 PUSH: Final = "push"
 NO_PAUSE = "a table is being changed: stop it, or let it end"
-
 OrderedRollback = Callable[[RollbackOrder], Awaitable[JobOutcome]]
 """``await rollback(order)``: restores the previous table; returns the outcome as far as it learned it."""
 Push = Callable[[PushOrder], Awaitable[JobOutcome]]
@@ -285,3 +283,23 @@ class Orders(RetryingStore):
 
 def _answer(request: int, outcome: Outcome, text: str) -> Answer:
     return Answer("answer", request, outcome, text[:4000], "")
+
+
+def may(store: Store, who: str, need: Permission) -> bool:
+    """Return whether ``who`` (``user:NAME`` or ``token:NAME/TOKEN``) is a user who may log in and whose role has the right ``need``."""
+    name = person(who)
+    user = store.people.find(name) if name else None
+    if user is None or user.disabled_utc is not None:
+        return False
+    return any(user.role == role and need in ALLOWED[role] for role in Role)  # an unknown role allows nothing
+
+
+def person(who: str) -> str:
+    """Return the user's name in ``user:NAME`` or ``token:NAME/TOKEN``; empty for anything else."""
+    kind, _, rest = who.partition(":")
+    return rest.partition("/")[0] if kind in {"user", "token"} else ""
+
+
+def may_measure(store: Store, who: str) -> bool:
+    """Return whether a user may measure, as `may`."""
+    return may(store, who, Permission.MEASURE)

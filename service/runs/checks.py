@@ -12,8 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run_file import ColumnsObject, RunFile, SetupObject
-from abbe.service.errors import FileFormatError
-from abbe.service.explain import expected, location_text, short_repr
+from abbe.service.errors import FileFormatError, expected, location_text, short_repr
 from abbe.service.files import NotPlainError, read_plain
 
 MAX_DIGITS = 308

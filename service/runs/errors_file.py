@@ -20,8 +20,7 @@ from abbe.models.functions.polynomial import Polynomial
 from abbe.models.functions.table import Table
 from abbe.models.geometry.propagation import checked_covariance
 from abbe.service.domain import run_file as formats
-from abbe.service.errors import FileFormatError
-from abbe.service.explain import nearest, short_repr
+from abbe.service.errors import FileFormatError, nearest, short_repr
 from abbe.service.runs.checks import check, read_json
 
 NOT_GIVEN = "no uncertainty given in the errors file"

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.service.errors import FileFormatError
-from abbe.service.explain import nearest, short_repr
+from abbe.service.errors import FileFormatError, nearest, short_repr
 
 POSITION = ("x_mm", "y_mm", "z_mm")
 DIRECTION = ("direction_x", "direction_y", "direction_z")

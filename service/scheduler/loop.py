@@ -18,11 +18,10 @@ from abbe.service.clock import Clock
 from abbe.service.domain.schedule import Schedule, Window
 from abbe.service.scheduler import outcomes
 from abbe.service.scheduler.job import FollowUp, FollowUps, RunJob, carry_out
+from abbe.service.scheduler.outcomes import Hindrance, Waiting, busy, maintenance, not_ready
 from abbe.service.scheduler.ports import Doc, Readiness, SlotLedger, SlotState
 from abbe.service.scheduler.ready import AlwaysReady
-from abbe.service.scheduler.slots import next_slot, previous_slot, slots_after
-from abbe.service.scheduler.waiting import Hindrance, Waiting, busy, maintenance, not_ready
-from abbe.service.scheduler.windows import covering
+from abbe.service.scheduler.slots import covering, next_slot, previous_slot, slots_after
 from abbe.service.sequences.control import Control
 
 log = structlog.get_logger("abbe.scheduler")

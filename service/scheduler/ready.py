@@ -13,7 +13,7 @@ from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.errors import AbbeError
-from abbe.service.scheduler.windows import covering
+from abbe.service.scheduler.slots import covering
 from abbe.service.sequences.interlocks import person_may_be_inside, tripped
 
 LOOK_S = 60.0

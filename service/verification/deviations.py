@@ -18,8 +18,7 @@ from abbe.models.machine import AXES, Machine
 from abbe.service.config import load_machine, read_toml
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.machine_object import MachineObject
-from abbe.service.errors import ConfigError, FileFormatError
-from abbe.service.explain import nearest
+from abbe.service.errors import ConfigError, FileFormatError, nearest
 from abbe.service.runs.checks import check, read_json
 from abbe.service.runs.errors_file import KnownErrors, read_errors
 from abbe.service.runs.points import POSITION, TOOL, PointsFile, read_points

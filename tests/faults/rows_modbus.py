@@ -119,7 +119,7 @@ ROWS = (
     Row(
         "M9",
         "another register map",
-        "refused at connect (against what was commissioned) and after a reconnection, with both maps in words",
+        "refused at connect if the driver does not know it, and after a reconnection in any case, with both maps in words",
         crossed(("at connect", "after a reconnection"), MAP_FIELDS),
         _TEST,
         (("another bank base", "it is part of the map's version: no register tells it"),),

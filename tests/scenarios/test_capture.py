@@ -11,8 +11,8 @@ import pytest
 from abbe.drivers.ballbar import driver
 from abbe.drivers.errors import Backpressure
 from abbe.service.campaigns.measure import measure
-from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.recovery import ledger_of
+from abbe.service.capture.segment import RealFileIO
 from abbe.service.cli import run
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
@@ -90,7 +90,7 @@ class HangingDisk(RealFileIO):
 async def test_a_hanging_disk_stops_the_axes_before_a_sample_is_lost(start_sims, monkeypatch):
     disk = HangingDisk()
     monkeypatch.setattr("abbe.service.capture.recorder.RealFileIO", lambda: disk)
-    monkeypatch.setattr("abbe.service.capture.log.MAX_PENDING", 200)
+    monkeypatch.setattr("abbe.service.capture.recorder.MAX_PENDING", 200)
     monkeypatch.setattr(driver, "_MAX_RATE_HZ", 40)  # the ring is 28,800 bytes: 1,200 samples
     sims = start_sims("--speed", "2")
     loaded = load_machine(Path(sims.machine_file))

@@ -18,13 +18,13 @@ from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.config_schema import Web
+from abbe.service.core.push_recovery import recover_at_start
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
-from abbe.service.jobs.at_start import recover_at_start
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import Topics
 from abbe.service.push.operations import Verdict

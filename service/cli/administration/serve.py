@@ -67,9 +67,9 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
+    from abbe.service.core.push_recovery import recover_at_start
     from abbe.service.core.setup import ServiceSetup
     from abbe.service.core.table_watch import look_at_table
-    from abbe.service.jobs.at_start import recover_at_start
     from abbe.service.jobs.check import run_check
     from abbe.service.mqtt.broker import Topics
     from abbe.service.report.report import rules_of

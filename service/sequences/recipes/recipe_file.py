@@ -17,8 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from abbe.service.errors import ConfigError
-from abbe.service.explain import expected, location_text, nearest
+from abbe.service.errors import ConfigError, expected, location_text, nearest
 from abbe.service.sequences.recipes.approach import LOW_SHARE, Cup, TestRecipe, file_fields, file_table, pole_of
 from abbe.service.sequences.recipes.recipe import BarRecipe, Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear, Recipe
 

@@ -20,9 +20,9 @@ from abbe.drivers.ballbar import driver
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import parse_url
-from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.recorder import recording
 from abbe.service.capture.recovery import ledger_of
+from abbe.service.capture.segment import RealFileIO
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store

@@ -11,9 +11,8 @@ from pathlib import Path
 from sqlalchemy import update
 
 from abbe.drivers.api import BarBatch, BarSample
-from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.ledger import Drafter
-from abbe.service.capture.segment import Segment
+from abbe.service.capture.segment import RealFileIO, Segment
 from abbe.service.storage.store import Store
 from abbe.service.storage.tables import runs
 

@@ -15,13 +15,12 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from abbe.service.capture import ingest as ingest_module
-from abbe.service.capture import log as log_module
 from abbe.service.capture import recorder as recorder_module
-from abbe.service.capture.file_io import RealFileIO
 from abbe.service.capture.ingest import is_full
 from abbe.service.capture.ledger import Drafter
 from abbe.service.capture.recorder import CaptureRecorder, close_run, is_active, recording
 from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
+from abbe.service.capture.segment import RealFileIO
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.clock import SystemClock
 from abbe.service.domain.measured import ChunkRecord
@@ -78,7 +77,7 @@ async def test_an_error_at_the_close_fails_the_run_and_loses_nothing(store: Stor
 async def test_a_defect_at_the_end_never_closes_a_run_that_the_database_lacks(store: Store, monkeypatch) -> None:
     monkeypatch.setattr(recorder_module, "CATCH_UP_S", 0.2)
     monkeypatch.setattr(ingest_module.Ingest, "_give", lambda self, records: threading.Event().wait(1.0))
-    monkeypatch.setattr(log_module.CaptureLog, "close", lambda self, doc, cause: 1 / 0)
+    monkeypatch.setattr(recorder_module.CaptureLog, "close", lambda self, doc, cause: 1 / 0)
     failure = await measured(store, run_id := new_run(store), give)
     assert isinstance(failure, ZeroDivisionError)
     assert store.runs.find(str(run_id)).status == "running"
@@ -117,7 +116,7 @@ class Hanging(RealFileIO):
 
 
 async def test_a_disk_that_hangs_at_the_close_leaves_run_and_file_to_the_next_start(store: Store, monkeypatch) -> None:
-    monkeypatch.setattr(log_module, "HANG_S", 0.2)
+    monkeypatch.setattr(recorder_module, "HANG_S", 0.2)
     disk, seen = Hanging(), []
 
     def feed(recorder: CaptureRecorder) -> None:
@@ -146,8 +145,8 @@ async def test_a_disk_that_hangs_at_the_close_leaves_run_and_file_to_the_next_st
 
 
 async def test_a_disk_that_hangs_does_not_hold_the_tap_for_ever(store: Store, monkeypatch) -> None:
-    monkeypatch.setattr(log_module, "HANG_S", 0.2)
-    monkeypatch.setattr(log_module, "MAX_PENDING", 50)
+    monkeypatch.setattr(recorder_module, "HANG_S", 0.2)
+    monkeypatch.setattr(recorder_module, "MAX_PENDING", 50)
     disk = Hanging()
 
     def feed(recorder: CaptureRecorder) -> None:

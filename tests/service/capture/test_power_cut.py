@@ -10,7 +10,7 @@ import pytest
 
 from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.ledger import Drafter
-from abbe.service.capture.log import GROUP_S
+from abbe.service.capture.recorder import GROUP_S
 from abbe.service.capture.recovery import ledger_of, recover_segments
 from abbe.service.capture.segment import CHUNK, Segment, scan
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path

@@ -251,7 +251,7 @@ async def test_a_chunk_that_contradicts_the_database_stops_the_run(store: Store)
 
 
 async def test_a_stuck_disk_holds_the_tap_and_nobody_else(store: Store) -> None:
-    from abbe.service.capture.file_io import RealFileIO
+    from abbe.service.capture.segment import RealFileIO
 
     class Stuck(RealFileIO):
         def __init__(self) -> None:

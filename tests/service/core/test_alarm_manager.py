@@ -20,6 +20,7 @@ from abbe.service.compensation import push_approved
 from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
 from abbe.service.core.jobs import JobRegistry
+from abbe.service.core.push_recovery import push_is_open
 from abbe.service.devices.machine_lock import ENVIRONMENT
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.progress import ProgressSink
@@ -27,7 +28,6 @@ from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import StillActive, StoreError, TableRefused
-from abbe.service.jobs.at_start import push_is_open
 from abbe.service.jobs.investigate import InvestigationContext as Investigation
 from abbe.service.jobs.investigate import Note, investigate
 from abbe.service.push.journal import StoreBook

@@ -13,8 +13,8 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.channel.messages import MOST_JOBS, Answer, StartJob, Steering, SteerJob
 from abbe.service.core.jobs import JobRegistry
+from abbe.service.core.orders import may_measure
 from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, PushRecovery
-from abbe.service.core.rights import may_measure
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MachineInUse, StillActive, StoreError
 from abbe.service.scheduler.loop import Scheduler

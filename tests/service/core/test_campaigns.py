@@ -18,10 +18,9 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, ConfirmPrompt, StartJob, Steering, SteerJob
-from abbe.service.core.board import Board
+from abbe.service.core.board import Board, SnapshotSource
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import CampaignOrder, OrderContext, full_campaigns
-from abbe.service.core.snapshot import SnapshotSource
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.errors import StoreError, TableMismatch
 from abbe.service.scheduler.loop import Scheduler

@@ -20,8 +20,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, RollBack, StartJob
 from abbe.service.compensation.rollback import RollbackOrder
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import OrderActions, OrderContext, Orders
-from abbe.service.core.rights import may
+from abbe.service.core.orders import OrderActions, OrderContext, Orders, may
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.push_entry import PushState, S
 from abbe.service.errors import StoreError

@@ -15,8 +15,7 @@ from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ready import DeviceReadings, Ready
-from abbe.service.scheduler.slots import cron_in_words, next_slot, previous_slot, slots_between
-from abbe.service.scheduler.windows import covers
+from abbe.service.scheduler.slots import covers, cron_in_words, next_slot, previous_slot, slots_between
 from tests.pretended_status import READY, controller_status
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 

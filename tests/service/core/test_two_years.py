@@ -22,8 +22,7 @@ import structlog
 
 from abbe.service.domain.schedule import FIRST_UTC, Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
-from abbe.service.scheduler.slots import slots_between
-from abbe.service.scheduler.windows import covering
+from abbe.service.scheduler.slots import covering, slots_between
 from tests.service.core.cron_oracle import Minutes
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
