@@ -17,8 +17,7 @@ from abbe.drivers.cnc.driver import ModbusController
 from abbe.drivers.errors import BadUrl
 from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
 from abbe.drivers.laser.driver import ModbusLaser
-from abbe.drivers.links.modbus_line import Canary
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, installed, parse_url
 

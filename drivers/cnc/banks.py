@@ -8,7 +8,7 @@ from abbe.drivers.api import BankState, CompStatus
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import BadFrame, DeviceFault, Refused
-from abbe.drivers.links.modbus_line import ModbusOperation
+from abbe.drivers.links.modbus_link import ModbusOperation
 from abbe.drivers.links.words import bytes_of, next_number, run_numbered, words_of
 
 _WINDOW = 100  # even, and all 32-bit values of an image stand at even words: none is ever split

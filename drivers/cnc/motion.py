@@ -10,7 +10,7 @@ from abbe.drivers.api import Condition, ControllerStatus, Point
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.session import ControllerSession
 from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
-from abbe.drivers.links.modbus_line import ModbusOperation
+from abbe.drivers.links.modbus_link import ModbusOperation
 from abbe.drivers.links.shielded import run_to_end
 from abbe.drivers.links.words import next_number, run_numbered
 

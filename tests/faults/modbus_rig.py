@@ -17,8 +17,7 @@ from abbe.drivers.cnc.driver import ModbusController
 from abbe.drivers.errors import DriverError
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.incidents import Backoff
-from abbe.drivers.links.modbus_line import Canary
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 from abbe.simulators.cnc.wire import CncRegisters
 from abbe.simulators.faults.modbus_proxy import ModbusProxy

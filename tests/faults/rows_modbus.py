@@ -40,7 +40,7 @@ ROWS = (
     Row(
         "M1",
         "exception codes",
-        "by table (drivers/links/modbus_line.py): 05, 06 bounded wait, 05 never taken for done, 01 to 03 name the map",
+        "by table (drivers/links/modbus_link.py): 05, 06 bounded wait, 05 never taken for done, 01 to 03 name the map",
         crossed(CODES, KINDS),
         _TEST,
     ),

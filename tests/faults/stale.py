@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.incidents import Backoff
-from abbe.drivers.links.modbus_line import Canary, ModbusOperation
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario

@@ -9,8 +9,7 @@ import pytest
 
 from abbe.drivers.errors import BadFrame, LinkDown
 from abbe.drivers.links.incidents import Backoff
-from abbe.drivers.links.modbus_line import Canary, ModbusOperation
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, parse_url
 from abbe.simulators.faults.modbus_frames import RTU, Frame, parts
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine

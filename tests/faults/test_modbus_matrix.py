@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from abbe.drivers.errors import DriverError, WrongDevice, on_behalf_of
-from abbe.drivers.links.modbus_line import ModbusOperation
+from abbe.drivers.links.modbus_link import ModbusOperation
 from abbe.drivers.registry import open_controller
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.faults import rows_modbus as rows

@@ -9,8 +9,7 @@ import pytest
 
 from abbe.drivers.errors import DriverError, LinkDown, on_behalf_of
 from abbe.drivers.links.incidents import Backoff
-from abbe.drivers.links.modbus_line import Canary
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink
 from abbe.drivers.links.urls import ModbusTcpUrl
 from abbe.simulators.faults.modbus_proxy import ModbusProxy, refusing
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from abbe.drivers.errors import Refused
-from abbe.drivers.links.modbus_line import Canary, ModbusOperation
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.models.compensation.tables import NineTables, grid_positions
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable

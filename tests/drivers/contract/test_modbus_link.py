@@ -8,8 +8,7 @@ import pytest
 
 from abbe.drivers.errors import BadFrame, DeviceFault, LinkDown, Refused, ReplyTimeout
 from abbe.drivers.links import modbus_link
-from abbe.drivers.links.modbus_line import ModbusOperation
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import parse_url
 from tests.drivers.contract.link_peer import TIMEOUT_S, silent, times
 

@@ -28,8 +28,7 @@ from pymodbus.exceptions import ModbusException
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.incidents import Backoff
-from abbe.drivers.links.modbus_line import Canary, ModbusOperation
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
 from abbe.simulators.faults.modbus_frames import MBAP, Cutter, Frame, answer, parts
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
