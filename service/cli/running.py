@@ -170,10 +170,10 @@ async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s:
         if wait_s <= 0.0 or not sys.stdin.isatty():
             raise
         notes = list(getattr(error, "__notes__", []))
-        say("; ".join([str(error), *notes]) + "\a")
-        say("make the machine ready: Abbe restores the old table as soon as that is safe; Ctrl-C ends the wait")
+        print_line("; ".join([str(error), *notes]) + "\a")
+        print_line("make the machine ready: Abbe restores the old table as soon as that is safe; Ctrl-C ends the wait")
         try:
-            done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), notify=say)
+            done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), notify=print_line)
         except asyncio.CancelledError as ended:
             ended.add_note("the unverified table is STILL ACTIVE; the next abbe command takes it back before anything else")
             raise
@@ -181,12 +181,12 @@ async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s:
             for note in (*notes, "the unverified table may still be active; the next abbe command takes it back before anything else"):
                 ended.add_note(note)
             raise
-        say(f"rolled back: {done or 'nothing was left to take back'}")
+        print_line(f"rolled back: {done or 'nothing was left to roll back'}")
         for note in notes:  # cup and bar may still be mounted
-            say(note)
+            print_line(note)
         raise typer.Exit(1) from None
 
 
-def say(text: str) -> None:
+def print_line(text: str) -> None:
     """Print one line on stderr."""
     typer.echo(text, err=True)

@@ -60,7 +60,7 @@ def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Se
     if not tls and (wide or not behind_tls):
         raise ConfigError(
             f"{what} from other computers, and passwords would cross the network in clear",
-            "give certificate and key under [web], or use 127.0.0.1 behind a reverse proxy with TLS and say behind_tls = true",
+            "give certificate and key under [web], or use 127.0.0.1 and behind_tls = true behind a reverse proxy with TLS",
         )
 
 

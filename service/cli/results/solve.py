@@ -245,8 +245,8 @@ def _parameters(summary: Assessment) -> None:
         rows.append([f"backlash {axis}", _figure(v * 1e3), f"{2 * u * 1e3:.2f}", "µm", "lost motion"])
     print_table(["parameter", "value", "U (k = 2)", "unit", "what"], rows)
     typer.echo(f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}")
-    words = {s: ", ".join(n for n, v in status.items() if v == s) or "none" for s in ("observed", "weak", "not observable")}
-    typer.echo("error motions, each for itself: " + "; ".join(f"{s}: {names}" for s, names in words.items()))
+    by_status = {s: ", ".join(n for n, v in status.items() if v == s) or "none" for s in ("observed", "weak", "not observable")}
+    typer.echo("error motions, each by itself: " + "; ".join(f"{s}: {names}" for s, names in by_status.items()))
 
 
 def _comparison(summary: Assessment) -> None:
@@ -342,5 +342,5 @@ def _executor(workers: int, dask: str | None) -> Executor:
     if dask is None:
         return SerialExecutor() if workers == 1 else ProcessExecutor(workers)
     if workers != 1:
-        raise ConfigError("--workers and --dask both say where to compute", "give one of them")
+        raise ConfigError("--workers and --dask exclude each other", "give one of them")
     return DaskExecutor(dask)

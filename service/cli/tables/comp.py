@@ -138,7 +138,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     files = read_files(file)
     status = seal_status(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
     found = read_key(form, files, settings_for(control, nominal, start))
-    doc: dict[str, Any] = {"tables": _tables(found), "standing": "signed" if status.signed else "candidate", "why": status.why}
+    doc: dict[str, Any] = {"tables": _tables(found), "status": "signed" if status.signed else "candidate", "why": status.why}
     if known is not None:
         same = check_same(found, expected(known, control, at), 0.51 * control.unit_mm + 1e-6)
         doc["differences_um"] = {d.axis: d.size_mm * 1e3 for d in same}
@@ -148,7 +148,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     print_table(
         ("table", "points", "from (mm)", "to (mm)", "smallest", "largest", "unit"), [tuple(map(str, t.values())) for t in doc["tables"]]
     )
-    typer.echo(f"{doc['standing']}: {status.why}")
+    typer.echo(f"{doc['status']}: {status.why}")
     if "differences_um" in doc:
         sizes = ", ".join(f"{a} {v:.4f} µm" for a, v in doc["differences_um"].items())
         typer.echo(f"these are the tables of solution {solution}; largest difference: {sizes}")
@@ -201,8 +201,8 @@ def _choice(c: FormatChoice) -> dict[str, Any]:
 
 def _holds(limits: Any) -> str:
     kinds = ("own", "cross", "products", "lattice", "motions")
-    held = [kind for kind in kinds if getattr(limits, kind)]
-    return ", ".join(held) + ("; both directions" if limits.directional and limits.own else "")
+    possible = [kind for kind in kinds if getattr(limits, kind)]
+    return ", ".join(possible) + ("; both directions" if limits.directional and limits.own else "")
 
 
 def _tables(found: Compensation) -> list[dict[str, Any]]:

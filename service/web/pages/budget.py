@@ -28,7 +28,7 @@ class SourceLine:
     """One source: u, share, type of evaluation and degrees of freedom; a dash if the solution lacks them."""
 
     name: str
-    words: str
+    text: str
     u: str
     share: str
     evaluation: str

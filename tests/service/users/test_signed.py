@@ -152,14 +152,14 @@ def test_export_signs_and_import_checks(folder: Path, capsys: pytest.CaptureFixt
     export = ["comp", "export", "solution.json", "--format", "mach4", "--out", "out"]
     bring = ["comp", "import", "out", "--format", "mach4", "--json", "--machine"]
 
-    def standing(machine: str, *more: str) -> str:
+    def status(machine: str, *more: str) -> str:
         code = run([*bring, machine, *more])
         out, err = capsys.readouterr()
-        return json.loads(out)["standing"] if code == 0 else err.split(":")[0]
+        return json.loads(out)["status"] if code == 0 else err.split(":")[0]
 
     assert run(export) == 0
     capsys.readouterr()
-    assert standing("m.toml") == "candidate"  # unsigned: never more than that
+    assert status("m.toml") == "candidate"  # unsigned: never more than that
     for file in (folder / "out").iterdir():
         file.unlink()
     (folder / "out").rmdir()
@@ -169,13 +169,13 @@ def test_export_signs_and_import_checks(folder: Path, capsys: pytest.CaptureFixt
     assert run([*export, "--sign", "key.pem", "--machine", "m.toml", "--days", "10"]) == 0
     capsys.readouterr()
     assert (folder / "out.sig").exists()
-    assert standing("m.toml") == "signed"
-    assert standing("other.toml") == standing("stranger.toml") == "error SIG-001"
-    assert standing("stranger.toml", "--trust", public_of(read_key(folder / "key.pem"))) == "signed"
-    assert standing("m.toml", "--base", "ab" * 32) == "error SIG-001"
+    assert status("m.toml") == "signed"
+    assert status("other.toml") == status("stranger.toml") == "error SIG-001"
+    assert status("stranger.toml", "--trust", public_of(read_key(folder / "key.pem"))) == "signed"
+    assert status("m.toml", "--base", "ab" * 32) == "error SIG-001"
     table = next((folder / "out").iterdir())
     table.write_text(table.read_text() + "\n")
-    assert standing("m.toml") == "error SIG-001"
+    assert status("m.toml") == "error SIG-001"
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
         told = [(r.action, r.outcome) for r in store.audit.events()]
     signed = [outcome for action, outcome in told if action == "abbe comp export"]

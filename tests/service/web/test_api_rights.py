@@ -1,4 +1,4 @@
-"""The matrix of rights over the whole route table, the document against the routes, and payloads that mean something elsewhere."""
+"""Every route answers who may, the document against the routes, and payloads that mean something elsewhere."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from urllib.parse import quote
 
 import httpx
 import pytest
-from starlette.responses import Response
-from starlette.types import Receive, Scope, Send
 
 from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.login.access import MUTATING, PUBLIC, Need, route_permissions
-from abbe.service.web.login.auth_middleware import AuthMiddleware
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.service.web.api_bench import Plant, app_of, served
 
@@ -41,31 +38,11 @@ def table_of(plant: Plant) -> list[tuple[str, str, Need | None]]:
     return [cell for cell in route_permissions(plant.app.routes) if cell[1] not in {"/login", "/logout", "/static"}]
 
 
-async def behind(scope: Scope, receive: Receive, send: Send) -> None:
-    """Stands for every route: the request got past the auth."""
-    await Response(status_code=204)(scope, receive, send)
-
-
-async def test_every_route_by_every_role(plant: Plant) -> None:
-    """The auth lets every permitted role pass and no other, before any route."""
-    table, asserted = table_of(plant), 0
-    auth = AuthMiddleware(behind, plant.app.routes, plant.auth)
-    async with httpx.AsyncClient(transport=httpx.ASGITransport(auth, False), base_url=BASE) as client:
-        everybody = {"anonymous": ({"Origin": BASE}, frozenset()), "foreign token": ({"Authorization": "Bearer abbe_0_0"}, frozenset())}
-        everybody |= {role: ({**plant.session(role), "Origin": BASE}, ALLOWED[role]) for role in Role}
-        everybody |= {f"token of {role}": (plant.token(role), ALLOWED[role]) for role in Role}
-        for name, (headers, allowed) in everybody.items():
-            for method, path, need in table:
-                answer = await client.request(method, filled(path, "999"), headers=headers)
-                wanted = 204 if need is PUBLIC or need in allowed else 403 if allowed else 401
-                assert answer.status_code == wanted, (name, method, path)
-                asserted += 1
-    assert asserted == 12 * len(table)
-    assert len([path for _, path, _ in table if path.startswith("/api/v1")]) >= 32
-
-
 async def test_every_route_answers_who_may(plant: Plant) -> None:
-    """The whole application, by session and by token: without content 404, without a body 422, and the auth first."""
+    """The whole application, by session and by token: without content 404, without a body 422, and the auth first.
+
+    Every role, and whoever may nothing, at the auth: `tests/service/users/test_access.py`.
+    """
     async with httpx.AsyncClient(transport=httpx.ASGITransport(plant.app, False), base_url=BASE) as client:
         sessions = {role: {**plant.session(role), "Origin": BASE} for role in Role}
         tokens = {role: plant.token(role) for role in Role}

@@ -41,7 +41,7 @@ def pages(running: Served) -> dict[str, str]:
 
 @pytest.mark.parametrize("name", USERS)
 def test_every_role_sees_the_screens_that_it_may(running: Served, name: str) -> None:
-    """The right to each route is asked of every role in `test_api_rights`; here the bar leads nowhere else."""
+    """The right to each route is asked of everybody in `tests/service/users/test_access.py`; here the bar leads nowhere else."""
     allowed = ALLOWED[Role(USERS[name])]
     with as_user(running, name) as client:
         links = set(re.findall(r'<a href="(/[a-z]*)"', client.get("/runs").text))
