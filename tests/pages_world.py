@@ -183,7 +183,7 @@ def _proposals(store: Store, site: Site, runs: list[dict[str, Any]], solved: Sol
     now = datetime.now(UTC)
     ended_s = (now - timedelta(hours=2)).timestamp()
     promise = Promise(tables, change, predicted, None, ended_s, ended_s)
-    candidate = candidate_of(site, promise, base, runs, TableFormat(LSB_NM, 4096))
+    candidate = candidate_of(site, promise, base, runs_of(runs), TableFormat(LSB_NM, 4096))
     one = Proposed(
         site.doc, campaign, solution, candidate, tables.u_mm, BaseMark(image, 0, 3, 7), 99, site.limits, True, PROPOSER,
         utc_text(now), (), (f"backlash of X is not in a table{evil}",),
