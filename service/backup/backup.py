@@ -15,13 +15,13 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from abbe.service.audit.book import AuditBook, heads_in, this_account
 from abbe.service.audit.chain import faults
 from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.errors import BackupRefused
+from abbe.service.domain.document import document, record
+from abbe.service.errors import BackupRefused, Unusable
 from abbe.service.files import is_plain, read_plain
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage.copying import copy_online, prove_copy, rows_of, sync_file
@@ -41,11 +41,44 @@ LONGEST_LIST = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
+class ListedFile:
+    """Size and SHA-256 of a file of a backup."""
+
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class ListedAudit:
+    """The audit of a backup: its records, whether its key is in the backup, and the faults found when it was copied."""
+
+    records: int
+    key: bool
+    faults: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class BackupList:
+    """What a backup holds (``backup.json``). ``schema``: revision of the database; ``rows``: of its main tables; ``files``: by path."""
+
+    format: str
+    made_utc: str
+    abbe: str
+    source: str
+    database_id: str
+    schema: str
+    rows: dict[str, int]
+    segments: int
+    audit: ListedAudit
+    files: dict[str, ListedFile]
+
+
+@dataclass(frozen=True, slots=True)
 class Backup:
-    """A backup whose files match its list, ``doc``."""
+    """A backup whose files match its list."""
 
     folder: Path
-    doc: dict[str, Any]
+    listed: BackupList
 
     @property
     def database(self) -> Path:
@@ -67,14 +100,14 @@ def digest_of(path: Path) -> str:
     return found.hexdigest()
 
 
-def file_list(folder: Path) -> dict[str, dict[str, Any]]:
-    """Size and digest of every file below a folder except the list, by relative path. Raises OSError."""
-    found = dict[str, dict[str, Any]]()
+def file_list(folder: Path) -> dict[str, ListedFile | None]:
+    """Every file below a folder except the list, by relative path; None: no plain file. Raises OSError."""
+    found = dict[str, ListedFile | None]()
     for path in sorted(folder.rglob("*")):
         if not is_plain(path):  # a link, pipe or device: no backup has one, and a copy would follow it
-            found[path.relative_to(folder).as_posix()] = {}
+            found[path.relative_to(folder).as_posix()] = None
         elif path.is_file() and path != folder / LIST:
-            found[path.relative_to(folder).as_posix()] = {"bytes": path.stat().st_size, "sha256": digest_of(path)}
+            found[path.relative_to(folder).as_posix()] = ListedFile(path.stat().st_size, digest_of(path))
     return found
 
 
@@ -90,18 +123,19 @@ def read_backup(folder: Path) -> Backup:
         doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
         if doc.get("format") != FORMAT:
             raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", f"this version of Abbe reads {FORMAT}")
-        wanted, found = doc["files"], file_list(folder)
-        wrong = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        listed = record(BackupList, doc, f"{folder / LIST}")
+        wanted, found = listed.files, file_list(folder)
+        wrong = sorted(name for name in wanted.keys() | found.keys() if name not in wanted or wanted[name] != found.get(name))
     except FileNotFoundError:
         raise BackupRefused(f"{folder} is no backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
     except OSError as err:
         raise BackupRefused(f"{folder} cannot be read: {err.strerror}", "look at its rights and at the disk") from None
-    except (ValueError, AttributeError, KeyError) as err:
+    except (ValueError, AttributeError, Unusable) as err:
         raise BackupRefused(f"{folder / LIST} is damaged: {err}", "take another backup") from None
     if wrong:
         how = "missing" if wrong[0] not in found else "not of this backup" if wrong[0] not in wanted else "not as it was written"
         raise BackupRefused(f"{folder / wrong[0]} is {how}", "take another backup")
-    return Backup(folder, doc)
+    return Backup(folder, listed)
 
 
 def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, list[str]]:
@@ -163,7 +197,7 @@ def sqlite_file(url: str, what: str) -> Path:
     return Path(str(parsed.database))
 
 
-def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> dict[str, Any]:
+def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> BackupList:
     """Make a backup: the new folder ``target`` (0700, files 0600), complete or not at all. The service keeps running.
 
     The backup holds everything that was on the disk at the call: samples first, because they leave their segment only when the database
@@ -176,8 +210,8 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
 
     Returns
     -------
-    dict
-        The backup's list (``backup.json``). ``audit.faults``: faults of the copied audit.
+    BackupList
+        What the backup holds. ``audit.faults``: faults of the copied audit.
 
     Raises
     ------
@@ -191,7 +225,7 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
         raise BackupRefused(f"there is no database {database}", "give a machine file or --store URL")
     part = _new_folder(target)
     try:
-        doc = _fill(part, database, source, utcnow, with_key=with_key)
+        made = _fill(part, database, source, utcnow, with_key=with_key)
         os.rename(part, target)
         sync_file(target.parent)
     except OSError as err:
@@ -199,11 +233,11 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     finally:
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(source.url) as store:
-        options = {"made_utc": doc["made_utc"], "key": "with" if with_key else "without"}
+        options = {"made_utc": made.made_utc, "key": "with" if with_key else "without"}
         AuditBook(store, source.url).write(
             AuditEvent(who=this_account(), action="abbe backup", target=str(target), outcome="done", doc=options)
         )
-    return doc
+    return made
 
 
 def _new_folder(target: Path) -> Path:
@@ -217,7 +251,7 @@ def _new_folder(target: Path) -> Path:
     return part
 
 
-def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[], datetime], *, with_key: bool) -> dict[str, Any]:
+def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[], datetime], *, with_key: bool) -> BackupList:
     made = utcnow().isoformat(timespec="seconds")
     segments = _segments(part / CAPTURE, source)
     copy_online(database, part / DATABASE)
@@ -225,23 +259,23 @@ def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[],
     audit = _audit(part, source, with_key=with_key)
     if source.machine_file is not None:
         _copy_private(source.machine_file, part / MACHINE)
-    doc = {
-        "format": FORMAT,
-        "made_utc": made,
-        "abbe": version("abbe"),
-        "source": mask_secrets(source.url),
-        "database_id": str(rows_of(part / DATABASE, "SELECT uid FROM identity")[0][0]) if revision >= "0004" else "",
-        "schema": revision,
-        "rows": counts(part / DATABASE),
-        "segments": segments,
-        "audit": audit,
-        "files": file_list(part),
-    }
+    listed = BackupList(
+        format=FORMAT,
+        made_utc=made,
+        abbe=version("abbe"),
+        source=mask_secrets(source.url),
+        database_id=str(rows_of(part / DATABASE, "SELECT uid FROM identity")[0][0]) if revision >= "0004" else "",
+        schema=revision,
+        rows=counts(part / DATABASE),
+        segments=segments,
+        audit=audit,
+        files={name: one for name, one in file_list(part).items() if one is not None},
+    )
     (part / LIST).touch(mode=0o600)
-    (part / LIST).write_text(json.dumps(doc, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (part / LIST).write_text(json.dumps(document(listed), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     for path in [*part.rglob("*"), part]:
         sync_file(path)
-    return doc
+    return listed
 
 
 def _segments(folder: Path, source: BackupSource) -> int:
@@ -264,12 +298,12 @@ def _segments(folder: Path, source: BackupSource) -> int:
     return copied
 
 
-def _audit(part: Path, source: BackupSource, *, with_key: bool) -> dict[str, Any]:
+def _audit(part: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
     """Copy the audit's files. Heads come after the database, so that none is missing; later ones are dropped."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():
-        return {"records": audit_faults(part / DATABASE, part / HEADS, None)[0], "key": False, "faults": []}
+        return ListedAudit(audit_faults(part / DATABASE, part / HEADS, None)[0], key=False, faults=[])
     last = int(rows_of(part / DATABASE, "SELECT coalesce(max(id), 0) FROM audit")[0][0])
     lines = book.head_file.read_text(encoding="ascii", errors="replace").splitlines(keepends=True) if book.head_file.exists() else []
     kept = [line for line in lines if not (number := line.partition(" ")[0]).isdigit() or int(number) <= last]
@@ -278,7 +312,7 @@ def _audit(part: Path, source: BackupSource, *, with_key: bool) -> dict[str, Any
     records, found = audit_faults(part / DATABASE, part / HEADS, book.key_file)
     if with_key:
         _copy_private(book.key_file, part / KEY)
-    return {"records": records, "key": with_key, "faults": found}
+    return ListedAudit(records, with_key, found)
 
 
 def _copy_private(source: Path, target: Path) -> None:

@@ -88,7 +88,7 @@ def restore(
     finally:
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(into.url) as store:
-        options = {"from": str(folder), "made_utc": str(backup.doc["made_utc"]), "aside": ", ".join(map(str, aside))}
+        options = {"from": str(folder), "made_utc": backup.listed.made_utc, "aside": ", ".join(map(str, aside))}
         AuditBook(store, into.url).write(
             AuditEvent(who=this_account(), action="abbe restore", target=str(database), outcome="done", doc=options)
         )

@@ -17,7 +17,7 @@ from abbe.service.compensation.gate import PushContext, admit
 from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.compensation.recover import finish_when_safe, recovered_session
+from abbe.service.compensation.recover import finish_when_safe, recovered_session, with_notes
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
@@ -98,20 +98,20 @@ async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Cl
             raise
         except (AbbeError, DriverError, OSError) as error:  # the devices failed before the push began
             await order.begun()
-            return JobOutcome("failed", _with_notes(error))
+            return JobOutcome("failed", with_notes(error))
 
 
 async def _attempt(context: PushContext, order: PushOrder) -> JobOutcome:
     try:
         return await _pushed(context, order)
     except TakenBack as back:
-        return JobOutcome("rolled back", _with_notes(back))
+        return JobOutcome("rolled back", with_notes(back))
     except TableRefused as no:
-        return JobOutcome("refused", _with_notes(no))
+        return JobOutcome("refused", with_notes(no))
     except StillActive as open_:
         return await _finish_when_safe(context, order, open_)
     except (AbbeError, DriverError, OSError) as error:
-        return JobOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", _with_notes(error))
+        return JobOutcome(STOPPED if order.control.stopping or order.control.aborting else "failed", with_notes(error))
 
 
 async def _pushed(context: PushContext, order: PushOrder) -> JobOutcome:
@@ -139,9 +139,5 @@ async def _finish_when_safe(context: PushContext, order: PushOrder, error: Still
     try:
         done = await order.control.unless_aborted(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return JobOutcome("failed", f"{_with_notes(error)}; {_with_notes(again)}; it is taken back as soon as it can be")
-    return JobOutcome("rolled back", f"{_with_notes(error)}; {done or 'nothing was left to roll back'}")
-
-
-def _with_notes(error: BaseException) -> str:
-    return "; ".join([str(error), *getattr(error, "__notes__", [])])
+        return JobOutcome("failed", f"{with_notes(error)}; {with_notes(again)}; it is taken back as soon as it can be")
+    return JobOutcome("rolled back", f"{with_notes(error)}; {done or 'nothing was left to roll back'}")

@@ -344,3 +344,8 @@ def _blocked_by(look: Outcome) -> str:
         return look.value.unsafe if isinstance(look.value, Truth) else "no answer"
     # The message of the link counts down: its text would differ, and notify, at every look.
     return "the controller does not answer" if isinstance(look, Doubt) else look.text
+
+
+def with_notes(error: BaseException) -> str:
+    """Text of an error with its notes, which name the table in force."""
+    return "; ".join([str(error), *getattr(error, "__notes__", [])])

@@ -18,7 +18,7 @@ from abbe.service.clock import Clock
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposals import by_whom
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, RestoredTable
-from abbe.service.compensation.recover import LIMIT_S, finish_when_safe, recover
+from abbe.service.compensation.recover import LIMIT_S, finish_when_safe, recover, with_notes
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.job_state import JobOutcome
@@ -204,7 +204,7 @@ async def ordered_rollback(site: Site, store: Store, order: RollbackOrder, *, cl
     except MachineInUse as busy:
         return JobOutcome("refused", f"{busy}; nothing was written")
     except (AbbeError, DriverError, OSError) as error:
-        return JobOutcome("failed", _with_notes(error))
+        return JobOutcome("failed", with_notes(error))
 
 
 async def _attempt(controller: TableController, store: Store, site: Site, order: RollbackOrder, clock: Clock) -> JobOutcome:
@@ -213,13 +213,13 @@ async def _attempt(controller: TableController, store: Store, site: Site, order:
         await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
         back = await rollback(controller, store, site, request=order.request)
     except (TableRefused, TableMismatch) as no:
-        return JobOutcome("refused", _with_notes(no))
+        return JobOutcome("refused", with_notes(no))
     except StillActive as open_:
         return await _finish_when_safe(controller, store, site, order, open_, clock)
     except MachineInUse:
         raise
     except (AbbeError, DriverError, OSError) as error:
-        return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", _with_notes(error))
+        return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", with_notes(error))
     if back is None:
         return JobOutcome("refused", "the table from before is in force already; nothing was written")
     text = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
@@ -250,9 +250,5 @@ async def _finish_when_safe(
     try:
         done = await order.request.control.unless_stopped(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return JobOutcome("failed", f"{_with_notes(error)}; {_with_notes(again)}; the rollback runs before the next check")
-    return JobOutcome("rolled back", f"{_with_notes(error)}; {done or 'nothing was left to roll back'}")
-
-
-def _with_notes(error: BaseException) -> str:
-    return "; ".join([str(error), *getattr(error, "__notes__", [])])
+        return JobOutcome("failed", f"{with_notes(error)}; {with_notes(again)}; the rollback runs before the next check")
+    return JobOutcome("rolled back", f"{with_notes(error)}; {done or 'nothing was left to roll back'}")

@@ -103,7 +103,11 @@ def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
     """Table of each run of a solution; those of the solution itself if its runs have none."""
     used = set(record.run_ids)
     tables = [r.start.table for r in store.runs.all(record.campaign_id) if r.id in used]
-    return tables if any(table.document for table in tables) else [RunTable.from_document(table) for table in tables_of(record.doc)]
+    return (
+        tables
+        if any(table.document for table in tables)
+        else [RunTable(crc=table.crc, acting=table.acting) for table in tables_of(record.doc)]
+    )
 
 
 def _acting(tables: Sequence[RunTable]) -> int | None:

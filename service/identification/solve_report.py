@@ -42,7 +42,6 @@ from abbe.service.domain.solution_file import (
     ResidualTestResult,
     RunResult,
     SolutionFile,
-    TableInForce,
     Uncertainty,
     VerdictValue,
     Versions,
@@ -248,7 +247,7 @@ def _inputs(found: Assessment, model: str) -> Inputs:
         digest=campaign_digest(found.solved.digests, "\n".join([model, *found.solved.removed]), machine),
         machine=machine,
         runs=found.solved.digests,
-        tables=[TableInForce(**table) for table in distinct(found.solved.tables.values())],
+        tables=distinct(found.solved.tables.values()),
     )
 
 

@@ -7,9 +7,9 @@ the old correction and make the machine worse, so they are refused. `abbe correc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 from abbe.service.domain.document import Doc
+from abbe.service.domain.solution_file import TableInForce
 from abbe.service.errors import FormatRefused
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
@@ -21,26 +21,26 @@ REMEDY = "measure again without a table in force; or, where the control has Abbe
 CONFIRM_REMEDY = "if no correction was in force, confirm with --without-table"
 
 
-def distinct(tables: Iterable[Doc]) -> list[Doc]:
-    """Tables sorted by CRC, with the controller's statement whether each one acts (``acting``; missing in runs of older versions)."""
-    found: dict[int, Doc] = {}
+def distinct(tables: Iterable[Doc]) -> list[TableInForce]:
+    """Tables of runs, sorted by CRC, with the controller's statement whether each one acts (None in runs of older versions)."""
+    acting: dict[int, bool | None] = {}
     for table in tables:
-        one = {"crc": int(table["crc"])} | ({} if table.get("acting") is None else {"acting": bool(table["acting"])})
-        found[one["crc"]] = found.get(one["crc"], {}) | one
-    return [found[crc] for crc in sorted(found)]
+        crc, acts = int(table["crc"]), table.get("acting")
+        acting[crc] = acting.get(crc) if acts is None else bool(acts)
+    return [TableInForce(crc=crc) if (acts := acting[crc]) is None else TableInForce(crc=crc, acting=acts) for crc in sorted(acting)]
 
 
-def tables_of(doc: dict[str, Any]) -> list[Doc]:
+def tables_of(doc: Doc) -> list[TableInForce]:
     """Tables named in a solution's document."""
     return distinct(doc.get("inputs", {}).get("tables", []))
 
 
-def stored_tables(store: Store, solution_id: int) -> list[Doc]:
+def stored_tables(store: Store, solution_id: int) -> list[TableInForce]:
     """Tables of a stored solution's runs, also for older documents that do not name them."""
     solution = store.solutions.get(solution_id)
     runs = [r.start_doc for r in store.runs.all(solution.campaign_id) if r.id in set(solution.run_ids)]
     found = [start.get("imported", start).get("table", {}) for start in runs]
-    return distinct([t for t in found if "crc" in t] + tables_of(solution.doc))
+    return distinct([t for t in found if "crc" in t] + solution.doc.get("inputs", {}).get("tables", []))
 
 
 def images_of(store: Store) -> Images:
@@ -56,12 +56,12 @@ def no_images(crc: int) -> bytes | None:
     return None
 
 
-def check_fresh(tables: list[Doc], images: Images, *, confirmed_none: bool = False) -> bool:
+def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: bool = False) -> bool:
     """Refuse a solution that was measured with a correction in force; return whether it is known that none was.
 
     Parameters
     ----------
-    tables : list of dict
+    tables : list of TableInForce
         From `distinct`.
     images : callable
         Returns the image of a CRC, or None.
@@ -74,11 +74,11 @@ def check_fresh(tables: list[Doc], images: Images, *, confirmed_none: bool = Fal
         A table corrected something, or it is not known whether it did.
     """
     for table in tables:
-        image = images(table["crc"])
-        acts = table.get("acting")
+        image = images(table.crc)
+        acts = table.acting
         if image is not None:
             acts = int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
-        name = f"table {table['crc']:08X}"
+        name = f"table {table.crc:08X}"
         if acts:
             raise FormatRefused(
                 f"this solution was measured while {name} corrected the machine: its files alone would remove that correction", REMEDY

@@ -28,21 +28,20 @@ def backup(
     """Copy the database, samples that it does not have yet, and the audit into a new folder while the service runs. The copy is checked."""
     from abbe.service.backup.backup import back_up
     from abbe.service.clock import SystemClock
+    from abbe.service.domain.document import document
 
     source, target = _places(places, store, "TARGET")
-    doc = back_up(source, target, SystemClock().utc, with_key=not without_key)
+    made = back_up(source, target, SystemClock().utc, with_key=not without_key)
     if as_json:
-        print_json(doc)
+        print_json(document(made))
     else:
-        rows, size = doc["rows"], sum(one["bytes"] for one in doc["files"].values())
-        typer.echo(
-            f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {doc['segments']} segments, {size / 1e6:.1f} MB, checked"
-        )
-        for text in doc["audit"]["faults"][:3]:
+        rows, size = made.rows, sum(one.bytes for one in made.files.values())
+        typer.echo(f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {made.segments} segments, {size / 1e6:.1f} MB, checked")
+        for text in made.audit.faults[:3]:
             typer.echo(f"audit: {text}")
-        if doc["audit"]["records"] and not doc["audit"]["key"]:
+        if made.audit.records and not made.audit.key:
             typer.echo("without the key of the audit: abbe restore will ask for it (--audit-key)")
-    raise typer.Exit(1 if doc["audit"]["faults"] else 0)
+    raise typer.Exit(1 if made.audit.faults else 0)
 
 
 def restore(
@@ -59,15 +58,16 @@ def restore(
     """Restore a backup, after checking its files, its schema and its audit. Refused over a database that exists or is in use."""
     from abbe.service.backup.restore import restore as restore_backup
     from abbe.service.clock import SystemClock
+    from abbe.service.domain.document import document
 
     into, folder = _places(places, store, "BACKUP")
     done = restore_backup(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
     aside = [str(path) for path in done.aside]
     if as_json:
-        print_json({"database": str(done.database), "backup": done.backup.doc, "audit_records": done.records, "aside": aside})
+        print_json({"database": str(done.database), "backup": document(done.backup.listed), "audit_records": done.records, "aside": aside})
         return
-    rows = done.backup.doc["rows"]
-    typer.echo(f"{done.database}: as of {done.backup.doc['made_utc']}, {rows['runs']} runs, {rows['verifications']} checks")
+    rows = done.backup.listed.rows
+    typer.echo(f"{done.database}: as of {done.backup.listed.made_utc}, {rows['runs']} runs, {rows['verifications']} checks")
     typer.echo(f"audit: {done.records} records, all there and as written")
     if done.segments:
         typer.echo(f"{done.segments} segments: the next command that connects to the machine takes them over")

@@ -61,7 +61,7 @@ def test_while_another_process_writes_nothing_acknowledged_is_missing(shop: Shop
         writer.drain(10)
         target = tmp_path / f"backup-{k}"
         assert run(["backup", str(shop.machine), str(target)]) == 0
-        assert prove_copy(target / "abbe.sqlite3") == read_backup(target).doc["schema"]
+        assert prove_copy(target / "abbe.sqlite3") == read_backup(target).listed.schema
         numbers = [row[0] for row in rows_of(target / "abbe.sqlite3", "SELECT id FROM verifications ORDER BY id")]
         assert numbers == list(range(1, len(numbers) + 1))  # one instant: a prefix of what was written
         assert len(numbers) >= writer.on_disk

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -127,7 +128,7 @@ def _edited(made: Path, statement: str) -> None:
         database.execute(statement)
         database.commit()
     doc = json.loads((made / "backup.json").read_text())
-    (made / "backup.json").write_text(json.dumps(doc | {"files": file_list(made)}))
+    (made / "backup.json").write_text(json.dumps(doc | {"files": {name: asdict(one) for name, one in file_list(made).items() if one}}))
 
 
 @pytest.mark.parametrize(

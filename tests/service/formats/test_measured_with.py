@@ -12,6 +12,7 @@ import pytest
 from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.cli import run
 from abbe.service.domain.push_entry import PushState
+from abbe.service.domain.solution_file import TableInForce
 from abbe.service.push.journal import GENESIS, follow
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import distinct
@@ -102,6 +103,6 @@ def test_of_older_runs_the_database_knows_what_their_table_was(
 
 def test_what_one_run_knows_of_a_table_counts_for_all() -> None:
     assert distinct([{"crc": 5}, {"crc": 3, "acting": False}, {"crc": 5, "acting": True}]) == [
-        {"crc": 3, "acting": False},
-        {"crc": 5, "acting": True},
+        TableInForce(crc=3, acting=False),
+        TableInForce(crc=5, acting=True),
     ]
