@@ -1,4 +1,4 @@
-"""The nominal machine: which carriage carries what, how far it travels, where it pivots, how long the tool is."""
+"""The nominal machine: chain of carriages, strokes, pivots, tool."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Machine:
     tool_mm: F1 = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        """Check and normalise once, so that everything later can trust the geometry."""
+        """Check and normalise the geometry once."""
         for name, shape in (("stroke_mm", (3, 2)), ("pivots_mm", (3, 3)), ("tool_mm", (3,))):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != shape or not np.isfinite(value).all():

@@ -198,7 +198,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
     ----------
     device_s, arrived_s : array, shape (n,)
         Device time of a sample (the newest of those that arrived together), and monotonic host time of its arrival.
-        50 pairs or more, of one segment: no reboot, no step in between (`abbe.models.alignment.clock`).
+        50 pairs or more, of one segment: no reboot, no step in between .
     least_delay_s, u_delay_s : float
         Shortest delay of the link itself, and its standard uncertainty; the arrivals do not show it.
     grid_s : float

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term, term_values
 from abbe.models.machine import AXES
+from abbe.models.solvers.components import InformationSums, total
 from abbe.models.solvers.engine import CampaignFit, CampaignProblem, build, expected_noise, settle
-from abbe.models.solvers.information import InformationSums, total
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 from abbe.models.uncertainty.known_field import KnownField

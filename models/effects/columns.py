@@ -1,4 +1,4 @@
-"""What the effects' columns are made of: axes of a key, columns per kind of run, state in time, sizes of coefficients."""
+"""Parts of the effects' columns: axes of a key, columns per kind of run, state in time, strength from coefficients."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def of_machine(deviation: Deviation) -> Signal:
 
 
 def of_path(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
-    """The same for a deviation that depends on the machine too: its strokes, where gravity acts."""
+    """`of_machine` for a deviation that also depends on the machine: its strokes, its vertical axis."""
 
     def signal(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
         return [path.read(lambda at, p=path: deviation(p, at, key, values)) for path in paths]  # type: ignore[misc]
@@ -83,7 +83,7 @@ def of_path(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
 
 
 def of_body(deviation: Callable[[Path, Places, str, Values], F3], turn: Callable[[Path, Places, str, Values], F3]) -> Signal:
-    """The same for a body that turns: the mirror on it turns too, and a step across the beam meets it at another distance.
+    """`of_path` for a body that turns: the mirror on it turns too, and a step across the beam meets it at another distance.
 
     ``turn``: rotation of tool against workpiece, shape (rows, 3, k), rad per unit. A plane mirror turned by w reads (w x n).l more where it
     stands l beside the beam's first spot; 50 mm times 20 urad is 1 um (effects.md, second order (ii)).
@@ -125,7 +125,7 @@ def per_setup(kind: str, parts: int, reading: Callable[[Path], F2]) -> Signal:
 
 
 def order_of(names: Iterable[str]) -> dict[str, int]:
-    """Place of every different name, by name (so that the order of runs does not matter)."""
+    """Index of every different name in alphabetical order, so that the order of runs does not matter."""
     return {name: k for k, name in enumerate(sorted(set(names)))}
 
 
@@ -143,13 +143,13 @@ def commanded_turns(at: Places, axis: int) -> tuple[F1, F1]:
 
 
 def wind_up(at: Places, axis: int, *over_mm: float) -> list[F1]:
-    """What is still missing of a turn while screw, coupling and guide wind up over some travel, one column per length."""
+    """Share of a turn that is still missing while screw, coupling and guide wind up, one column per wind-up length."""
     sign, since = commanded_turns(at, axis)
     return [np.asarray(sign * np.exp(-since / length)) for length in over_mm]
 
 
 def before_first_turn(at: Places, axis: int) -> F1:
-    """Travel of an axis since the first reading, `FAR_MM` once it has turned: what a turn in the run-in, which is not recorded, leaves."""
+    """Travel of an axis since the first reading, `FAR_MM` once it has turned: for what a turn in the unrecorded run-in leaves."""
     if len(at.t_s) < 2 or not at.v_mm_s.any():
         return np.full(len(at.t_s), FAR_MM)
     travel = np.abs(at.q_mm[:, axis] - at.q_mm[0, axis])
@@ -157,7 +157,7 @@ def before_first_turn(at: Places, axis: int) -> F1:
 
 
 def play(at: Places, axis: int, width_mm: float = 0.008) -> F1:
-    """Where an axis stands in a play of some width, -1 .. +1 in the direction of motion, shape (n,).
+    """Position of an axis within a play of some width, -1 .. +1 in the direction of motion, shape (n,).
 
     After a turn the axis stays until the command has travelled the width. The turn is the farthest position that was commanded: a control
     commands positions, and between two of them nothing is known of the play.
@@ -167,20 +167,20 @@ def play(at: Places, axis: int, width_mm: float = 0.008) -> F1:
 
 
 def turn_between(at: Places, axis: int) -> F1:
-    """What changes in `play` if the axis turns where it comes to rest between two readings."""
+    """Change of `play` if the axis turns at its rest position between two readings."""
     return np.asarray(at.sign[:, axis] - play(at, axis))
 
 
 def warmth(t_s: F1, tau_s: float) -> F1:
-    """How far a machine has warmed up since the campaign's clock started: 0 at first, 1 in the end; shape of ``t_s``."""
+    """Warm-up of a machine since the start of the campaign's clock: 0 at first, 1 in the end; shape of ``t_s``."""
     return np.asarray(-np.expm1(-np.maximum(t_s, 0.0) / tau_s))
 
 
 def rise_of(paths: tuple[Path, ...], sensor: str) -> Callable[[F1], F1] | None:
     """Rise of a temperature sensor since the first reading of the campaign, K, as a function of the clock; None without the sensor.
 
-    Blocks of a run are averaged, because a sensor is a regressor with noise; between runs it is a straight line, so that the moment a cup
-    was set has a temperature too.
+    Blocks of a run are averaged, because a sensor is a regressor with noise; between runs it is a straight line, so that the
+    setting of a cup has a temperature too.
     """
     clock: dict[float, float] = {}
     for path in paths:
@@ -237,7 +237,7 @@ def size(coefficients: F1, values: Values) -> float:
 
 
 def setup_length(parts: int) -> Callable[[F1, Values], float]:
-    """Strength of an effect with ``parts`` coefficients per set-up: root mean square length of those that are not zero (never seen)."""
+    """Strength of an effect with ``parts`` coefficients per set-up: root mean square length of those that are not zero (observed)."""
 
     def strength(coefficients: F1, values: Values) -> float:
         lengths = np.linalg.norm(np.reshape(coefficients, (-1, parts)), axis=1)
@@ -267,5 +267,5 @@ def shifts(direction: Callable[[str], int], first: int, last: int) -> Signal:
 
 
 def finer_shifts(direction: Callable[[str], int]) -> tuple[Form, ...]:
-    """Freedoms of form of such a translation: orders 7 to 9, and 10 to 13."""
+    """Freedoms of form of a translation of `shifts`: orders 7 to 9, and 10 to 13."""
     return Form("finer", shifts(direction, 7, 9)), Form("finest", shifts(direction, 10, 13))

@@ -1,4 +1,4 @@
-"""What an effect declares: everything that the discovery, the reports and the self-test need to know of it, in one place."""
+"""Declaration of an effect: everything that discovery, reports and self-test need."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Remedy = Literal["table", "control parameter", "mechanics", "warm up or sensor",
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One non-linear parameter: physical bounds, what is usual with its source, and where a search starts."""
+    """One non-linear parameter: physical bounds, usual range with its source, and starts of a search."""
 
     name: str
     unit: str
@@ -54,7 +54,7 @@ class Effect:
         The field's term, for people.
     family : which part of the machine it belongs to.
     keys : tuple of str
-        Axes, components or planes it may sit at; ``("",)`` when there is only one.
+        Axes, components or planes at which it may occur; ``("",)`` if there is only one.
     unit : str
         Of the strength: ``"um"``, ``"urad"``, ``"ms"``, ``"K"``, ``"K/h"`` or ``"mrad"`` (run-format.md 5).
     per_unit : float
@@ -69,18 +69,18 @@ class Effect:
         Signed strength in ``unit``. The strength is linear or a norm of the coefficients.
     forms : tuple of Form
     unseen : tuple of float
-        Whole strength over that of the columns, and its standard uncertainty, where the columns leave out what the present model swallows
-        of the effect whatever it is (the line of a straightness); the strength is stated whole.
+        Whole strength over that of the columns, and its standard uncertainty, where the columns leave out what the present model absorbs
+        of the effect (the line of a straightness); the stated strength includes it.
     kind : "mean" | "variance"
         Whether it moves the readings or makes them noisier (stick-slip, vibration with an unknown phase, outliers); a "variance" effect's
         ``signal`` says where: its columns are non-negative weights of the extra variance per reading.
     absorbed_by : tuple of str
         Entries of ``current_model.includes`` that make it part of the present model (then it is no candidate).
-    needs : what a campaign must hold to show it, for people. blind : tests that cannot see it.
+    needs : what a campaign must contain to show it, for people. blind : tests that cannot show it.
     signature, remedy_text : for people: how it looks, what to do at the machine.
-    remedy : who can take it out.
+    remedy : part of the machine or control that can remove it.
     variant_of : str
-        Name of a simpler effect that this one holds beside a freedom of its own; it has to earn being preferred.
+        Name of a simpler effect that this one contains, with a freedom of its own; preferred only if the evidence is clear.
     separated_by : dict
         Rival (name, or name:key) -> what to add (``next_test.adds`` of run-format.md 5) to tell the two apart.
     source : paper, standard or effects.md section.

@@ -1,4 +1,4 @@
-"""How a run was driven, as effects see it: positions, velocities, reversals, clock, what the instrument looks along."""
+"""A run as effects need it: positions, velocities, reversals, clock, and measuring direction of the instrument."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAR_MM = 1e9
 
 @dataclass(frozen=True)
 class Places:
-    """Where the tool is and how it got there; one row per moment. What an effect of the machine may depend on.
+    """Position and motion of the tool, one row per time: all that an effect of the machine may depend on.
 
     Attributes
     ----------
@@ -62,10 +62,10 @@ class Path:
     at : Places
         The path itself.
     reference : Places
-        The moment that the reading is relative to, one row: cup set with the spindle (bar: at the centre, at ``t_set_s``, standing, from
+        Zero of the reading, one row: cup set with the spindle (bar: at the centre, at ``t_set_s``, standing, from
         no known direction), or the first record (laser).
     look : array, shape (n, 3)
-        What one millimetre of deviation of the tool changes the reading by, to first order: unit vector cup to tool, or beam.
+        Direction of measurement, unit vector: cup to tool, or beam; change of the reading per mm of deviation, to first order.
     feed_mm_min, direction : array, shape (n,)
     travel_mm : array, shape (n,)
         Nominal displacement along the beam since the first record; zero for a bar.
@@ -99,7 +99,7 @@ class Path:
         return len(self.at.t_s)
 
     def read(self, deviation: Callable[[Places], F3]) -> F2:
-        """What the instrument sees of a deviation of the tool from the workpiece, first order (effects.md, "First-order observables").
+        """Reading of a deviation of the tool from the workpiece, first order (effects.md, "First-order observables").
 
         Parameters
         ----------
@@ -174,6 +174,6 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
 
 
 def standing(q_mm: F1, t_s: float, temp_c: Mapping[str, F1]) -> Places:
-    """One instant at which the machine stands, with an unknown approach."""
+    """Places with one row: the machine stands, its approach is unknown."""
     rest = np.zeros((1, 3))
     return Places(q_mm[None], rest, np.full((1, 3), FAR_MM), rest, rest, np.array([t_s]), temp_c)

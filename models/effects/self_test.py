@@ -40,7 +40,7 @@ SENSORS = ("x", "y", "z", "spindle", "air")
 
 
 def declaration_faults(effect: Effect) -> tuple[str, ...]:
-    """What is wrong with what an effect says of itself; empty when nothing is. Nothing of it is computed."""
+    """Faults of an effect's declaration; empty if there are none. No column is computed."""
     texts = {n: getattr(effect, n) for n in ("title", "needs", "signature", "remedy_text", "source")}
     low, high = effect.typical
     checks = [
@@ -65,7 +65,7 @@ def declaration_faults(effect: Effect) -> tuple[str, ...]:
 
 
 def signal_faults(effect: Effect, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """What is wrong with an effect's columns, and with those of its forms, on some paths (`abbe.models.effects.self_test`)."""
+    """Faults of the columns of an effect and of its forms on some paths; empty if there are none."""
     out: list[str] = []
     for name, signal in (("signal", effect.signal), *((f"form {f.name}", f.signal) for f in effect.forms)):
         for key, values in itertools.product(effect.keys, corners(effect)):
@@ -145,7 +145,7 @@ def _circle(radius_mm: float, plane: int) -> F2:
 
 
 def _warm(t_s: F1) -> dict[str, F1]:
-    """Temperatures of all sensors, degrees C: all of them rise, each at its own pace."""
+    """Temperatures of all sensors, degrees C: all rise, each at its own rate."""
     return {name: 20.0 + (k + 1) * -np.expm1(-t_s / (1500.0 + 900.0 * k)) for k, name in enumerate(SENSORS)}
 
 

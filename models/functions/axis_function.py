@@ -1,4 +1,4 @@
-"""What every error function of one axis can do, whatever its kind."""
+"""Interface of all error functions of one axis."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class AxisFunction(Protocol):
 
     @property
     def domain_mm(self) -> tuple[float, float]:
-        """Where the function was stated; what holds outside is said by each kind."""
+        """Interval in which the function is defined; each kind states what holds outside."""
 
     @property
     def parameters(self) -> F1:

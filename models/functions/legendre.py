@@ -1,4 +1,4 @@
-"""Legendre series over a stroke: the smooth error function whose terms do not disturb each other."""
+"""Legendre series over a stroke: the smooth error function with orthogonal terms."""
 
 from __future__ import annotations
 

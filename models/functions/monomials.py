@@ -1,7 +1,7 @@
 """The 21 error functions as powers of u = position / travel, the form in which the papers' vectors state a machine (math.md 4.6).
 
 Positioning and angles have powers 1..d, straightness 2..d, squareness one value: 18 d - 3 coefficients. Both papers' letters fit: delta_ij
-and eps_ij (Yang), delta_i(J) and alpha_i(J) (Wang); their signs are the affair of `abbe.models.notation`.
+and eps_ij (Yang), delta_i(J) and alpha_i(J) (Wang); `abbe.models.notation` converts their signs.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def error_arrays(terms: tuple[Monomial, ...], theta: F1, u: F2, angle_scale: flo
 
 
 def each_alone(terms: tuple[Monomial, ...], u: F2, angle_scale: float = 1.0) -> list[tuple[slice, ErrorArrays]]:
-    """The functions with one coefficient at a time 1 and the others 0, as few batches, because a design needs them all.
+    """Functions with one coefficient 1 and the others 0, for every coefficient in as few batches as possible: a design needs them all.
 
     Returns
     -------

@@ -35,7 +35,7 @@ def nodes(stroke_mm: tuple[float, float], breaks_mm: F1, count: int) -> tuple[F1
     ----------
     stroke_mm : (smaller, larger)
     breaks_mm : array
-        Where pieces meet, in any order; those outside the stroke do not matter.
+        Ends of the pieces, in any order; those outside the stroke do not matter.
     count : int
         Nodes per piece: integrals of polynomials up to degree 2 count - 1 are exact.
 
@@ -55,7 +55,7 @@ def nodes(stroke_mm: tuple[float, float], breaks_mm: F1, count: int) -> tuple[F1
 
 @dataclass(frozen=True, slots=True)
 class Straightness:
-    """A function without line, and the line: ``original(x) = function(x) + offset_mm + slope * x_mm``.
+    """A function without its line, and the line: ``original(x) = function(x) + offset_mm + slope * x_mm``.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class FromZero:
 
 
 def as_straightness(function: AxisFunction, stroke_mm: ArrayLike) -> Straightness:
-    """Take the least-squares line over the stroke away.
+    """Remove the least-squares line over the stroke.
 
     For polynomials, Legendre series and B-splines the line minimises the INTEGRAL of the squared rest over the stroke, integrated exactly
     (Gauss-Legendre on every polynomial piece). For a table it minimises the SUM of squares over the table's own positions inside the
@@ -265,7 +265,7 @@ class ErrorMotions:
     def sensitivities(
         self, names: Iterable[str], axes_mm: ArrayLike, direction: ArrayLike | None = None
     ) -> tuple[list[tuple[int, int]], F2]:
-        """How much of each parameter stands in the error motions at given positions.
+        """Derivative of the error motions at given positions with respect to each parameter.
 
         Parameters
         ----------
@@ -306,9 +306,9 @@ class ErrorMotions:
         return places, weights
 
     def straightened(self, stroke_mm: ArrayLike) -> Straightened:
-        """Write all slopes of straightness as squareness, nothing lost: the deviation changes by a rigid motion that is handed back.
+        """Move all slopes of straightness into squareness; the deviation changes by a rigid motion, which is returned.
 
-        The lines are those of `abbe.models.functions.rules.as_straightness`.
+        The lines are those of `as_straightness`.
 
         Parameters
         ----------

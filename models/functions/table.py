@@ -17,7 +17,7 @@ Interpolation = Literal["linear", "cubic"]
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Values at positions, in between straight lines or one smooth cubic spline.
+    """Values at positions; between them straight lines or one smooth cubic spline.
 
     Outside the positions the end value is held and the slope is zero, as controllers do. ``cubic`` is the interpolating spline with
     continuous second derivative whose first two and last two pieces are one cubic each (not-a-knot); three positions give a parabola,

@@ -86,7 +86,7 @@ def exact_deviation_mm(
     Parameters
     ----------
     rotation : "vector", "zyx" or "small"
-        How a carriage's three angles make one rotation: by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation (a table's own
+        Rotation from a carriage's three angles: by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation (a table's own
         is −E, and its transform is inverted exactly); or the papers' matrix I + [E]×, on the work side the exact inverse of I + [−E]×.
         Pahk (1), (3) leave the choice open; they differ in second order only.
     """

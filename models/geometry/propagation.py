@@ -1,4 +1,4 @@
-"""What uncertain parameters of the error motions do to the deviation of the tool."""
+"""Uncertainty of the tool's deviation from uncertain parameters of the error motions."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ WEIGHTS = 2**20
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Where a deviation is asked for.
+    """Points at which a deviation is computed.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def deviation_covariance(
     Raises
     ------
     ValueError
-        The matrix does not fit the names or is no covariance (`abbe.models.geometry.propagation`), or as in `sensitivity`.
+        The matrix does not fit the names or is no covariance (`checked_covariance`), or as in `sensitivity`.
     """
     names, matrix = covariance
     matrix = checked_covariance(matrix, len(names))
@@ -182,7 +182,7 @@ def _slopes(machine: Machine, errors: ErrorMotions, at: Points, *, exact: bool) 
 
 
 def _motion_covariance(weights: F2, covariance: F2, first: NDArray[np.intp]) -> F3:
-    """Covariance of the error motions themselves, shape (n, g, g): at most 18 of them stand between the parameters and the deviation.
+    """Covariance of the error motions themselves, shape (n, g, g): at most 18 of them link the parameters to the deviation.
 
     A parameter acts in one motion, so that only the matrix' block of two motions enters for each pair of them, and half of the pairs do.
 

@@ -1,7 +1,7 @@
-"""What a small rotation adds to a vector: (R − I) v without ever forming R, so that nothing is lost by subtracting long vectors.
+"""Change of a vector by a small rotation: (R − I) v without forming R, so that no digits are lost by subtracting long vectors.
 
 Three exact forms of the rotation of a carriage that turns by E = (EA, EB, EC) (docs/explanation/conventions.md, "Exact kinematics"):
-they agree to first order and part at the second, by the order in which the three turns are taken.
+they agree to first order and differ at the second, by the order of the three turns.
 """
 
 from __future__ import annotations

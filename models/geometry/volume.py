@@ -83,7 +83,7 @@ def unit_deviation(machine: Machine, terms: tuple[Term, ...], points_mm: F2, too
 
 
 def rigid_at(points_mm: F2, reference_mm: F2) -> F3:
-    """`rigid_design` of the reference points, evaluated at other points, shape (m, 3, 6)."""
+    """`rigid_design` of the reference points, at other points, shape (m, 3, 6)."""
     centre = reference_mm.mean(axis=0)
     balanced = np.concatenate([points_mm, 2.0 * centre - points_mm])  # their centroid is the reference's
     return rigid_design(balanced)[: len(points_mm)]

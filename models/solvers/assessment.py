@@ -1,7 +1,7 @@
 """What a campaign determines about a machine and what it does not, before it is measured and after it is solved.
 
 `observability` needs the runs' set-ups only (a planner's question), `observability_of` takes a solution. Both give rank and null space in
-words with a cause and a cure, what is known of every parameter and motion, and how well the deviation is known in the volume. Rank is of
+text with a cause and a cure, the status of every parameter and motion, and the uncertainty of the deviation in the volume. Rank is of
 the readings and stated calibrations alone; uncertainties include the documented priors (`abbe.models.solvers.priors`).
 """
 
@@ -61,7 +61,7 @@ class Observability:
     reachable : int
         Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
     known : tuple of str
-        Set-up unknowns counted as known for the rank, because somebody states them.
+        Set-up unknowns that count as known for the rank, because a run or the caller states them.
     hidden : tuple of HiddenGroup
         The null space in words; groups that change nothing with the tools used come last.
     advice : tuple of Advice
@@ -126,7 +126,7 @@ def observability(
     floor_mm: dict[str, float] | None = None,
     known: Knowledge | None = None,
 ) -> Observability:
-    """What runs can determine, from where they measure; readings are not used.
+    """What runs can determine, from their positions only; readings are not used.
 
     Parameters
     ----------

@@ -1,9 +1,13 @@
 """Variance components and order of the model, from the readings themselves: noise of the instruments, typical size of the errors of each
 class, and the number of Legendre orders that the readings support (chosen by held-out runs).
 
+A campaign is compressed to normal equations of the unknowns, per fold and instrument (`InformationSums`): all later work is in the space
+of the unknowns (a few hundred), whatever the number of readings.
+
 Marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher scoring on the
 logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". Their own uncertainty widens the prior of the error motions
-(`cautious`). Deterministic: no random numbers, a fixed number of steps at most."""
+(`cautious`). Deterministic: no random numbers, a fixed number of steps at most.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
-from abbe.models.arrays import F1, F2
+from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term
-from abbe.models.solvers.information import I1, InformationSums, total
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
+I1 = NDArray[np.int64]
+KINDS = ("bar", "laser")
+"""Instruments whose noise is estimated separately."""
 NOISE_SD = 2.0
 """Weak hyperprior of an instrument's log noise variance about that of its repeats: a factor of e in the standard deviation."""
 LEAST_ETA = -8.0
@@ -30,6 +37,108 @@ TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
 LARGEST_STEP = 1.5
 HALVINGS = 6
+FOLDS = 8
+RIGID6 = 0
+"""Level of the model with three scales and three squareness errors only."""
+
+
+@dataclass(frozen=True)
+class PlannedReadings:
+    """Whitened, scaled readings of all runs on top of each other.
+
+    Attributes
+    ----------
+    a : array, shape (n, p)
+        Design; every row divided by its expected noise, every column multiplied by the unknown's reference size.
+    y : array, shape (n,)
+        Readings minus the prediction at the expansion point, divided by their expected noise.
+    run, fold, kind : arrays of int, shape (n,)
+        Which run, which fold (set-ups that are held out together) and which of `KINDS` each row is of.
+    """
+
+    a: F2
+    y: F1
+    run: I1
+    fold: I1
+    kind: I1
+
+
+@dataclass(frozen=True)
+class InformationSums:
+    """Normal equations per kind of instrument: A^T W A (k, p, p), A^T W y (k, p), y^T W y (k,), sum of weights (k,)."""
+
+    gram: F3
+    moment: F2
+    square: F1
+    count: F1
+
+    def minus(self, other: InformationSums) -> InformationSums:
+        """The sums without a part of the readings."""
+        return InformationSums(self.gram - other.gram, self.moment - other.moment, self.square - other.square, self.count - other.count)
+
+    def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> InformationSums:
+        """The sums for other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
+        gram = self.gram.copy()
+        for at in blocks:
+            gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
+        for at in blocks:
+            gram[:, at, :] = root[np.ix_(at, at)].T @ gram[:, at, :]
+        return InformationSums(gram, self.moment @ root, self.square, self.count)
+
+    def decimated(self, factor: F1) -> InformationSums:
+        """The sums with fewer effective readings by ``factor``, shape (k,), because neighbours are correlated."""
+        f: F1 = 1.0 / factor
+        return InformationSums(self.gram * f[:, None, None], self.moment * f[:, None], self.square * f, self.count * f)
+
+
+@dataclass(frozen=True)
+class Grams:
+    """A^T A of every (fold, kind) with all weights 1, computed once: shape (folds, kinds, p, p)."""
+
+    parts: NDArray[np.float64]
+
+
+def grams(r: PlannedReadings) -> Grams:
+    """Gram matrices of all folds and kinds of instrument."""
+    folds, p = int(r.fold.max()) + 1, r.a.shape[1]
+    out = np.zeros((folds, len(KINDS), p, p))
+    for f in range(folds):
+        for k in range(len(KINDS)):
+            rows = r.a[(r.fold == f) & (r.kind == k)]
+            if rows.size:
+                used = np.flatnonzero(rows.any(axis=0))  # most set-up unknowns belong to other folds
+                part = rows[:, used]
+                out[f, k][np.ix_(used, used)] = part.T @ part
+    return Grams(out)
+
+
+def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...]:
+    """Normal equations of every fold for given weights of the readings (1: as it is, 0: not used), shape (n,)."""
+    found = []
+    for f in range(g.parts.shape[0]):
+        gram, moment, square, count = g.parts[f].copy(), [], [], []
+        for k in range(len(KINDS)):
+            at = (r.fold == f) & (r.kind == k)
+            w, y = weight[at], r.y[at]
+            downweighted = np.flatnonzero(at & (weight < 1.0))
+            if downweighted.size:
+                out = r.a[downweighted]
+                gram[k] -= (out * (1.0 - weight[downweighted])[:, None]).T @ out
+            moment.append((w * y) @ r.a[at])
+            square.append(float(w @ y**2))
+            count.append(float(w.sum()))
+        found.append(InformationSums(gram, np.array(moment), np.array(square), np.array(count)))
+    return tuple(found)
+
+
+def total(parts: tuple[InformationSums, ...]) -> InformationSums:
+    """All folds together."""
+    return InformationSums(
+        np.sum([s.gram for s in parts], axis=0),
+        np.sum([s.moment for s in parts], axis=0),
+        np.sum([s.square for s in parts], axis=0),
+        np.sum([s.count for s in parts], axis=0),
+    )
 
 
 @dataclass(frozen=True)
@@ -164,7 +273,7 @@ def _moved(c: Components, step: F1) -> Components:
 
 
 def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
-    """As `estimate`, with the correlation length of the error motions, by climbing over `LENGTHS` from the model's own.
+    """`estimate` together with the correlation length of the error motions, by hill climbing over `LENGTHS` from the model's own.
 
     ``sums`` about the unknowns in units of their typical size.
     """
@@ -186,9 +295,9 @@ def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tu
 
 
 def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Components]:
-    """Cautious prior of the error motions where the most probable one would promise too much.
+    """Prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
-    It differs in three ways, none of which matters where readings are plenty.
+    It differs in three ways, none of which matters with many readings.
 
     - Every motion is a little rougher (`ROUGHER`) than most probable: near the ends of the stroke, where nothing was measured, it may be
       rougher than elsewhere without contradicting the readings.
@@ -210,14 +319,9 @@ def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Comp
     return replace(model, root=model.root * factor), c
 
 
-FOLDS = 8
-RIGID6 = 0
-"""Level of the model with three scales and three squareness errors only."""
-
-
 @dataclass(frozen=True)
 class OrderChoice:
-    """Score of every model on readings it had not seen.
+    """Score of every model on held-out readings.
 
     ``levels``: 0 for `RIGID6`, else the highest Legendre order. ``score``: mean log predictive density per fold, best = 0. ``se``: standard
     error of that difference over the folds. ``chosen``: the simplest level within one standard error of the best.

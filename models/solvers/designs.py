@@ -13,8 +13,7 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out
-from abbe.models.solvers.least_squares import singular_values, svd
+from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out, singular_values, svd
 
 Field = Callable[[F2], F3]
 """Commanded workpiece coordinates (n, 3), mm, to the deviation per unit of each parameter (n, 3, p)."""

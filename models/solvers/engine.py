@@ -1,4 +1,4 @@
-"""The inside of the joint solution: one campaign as scaled arrays, and its iteration to the exact model."""
+"""Core of the joint solution: one campaign as scaled arrays, and its iteration to the exact model."""
 
 from __future__ import annotations
 
@@ -11,8 +11,24 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term
 from abbe.models.machine import Machine
-from abbe.models.solvers.components import ComponentPosterior, Components, blend, cautious, estimate, fit_length, folds, posterior
-from abbe.models.solvers.information import I1, KINDS, Grams, InformationSums, PlannedReadings, grams, sums, total
+from abbe.models.solvers.components import (
+    I1,
+    KINDS,
+    ComponentPosterior,
+    Components,
+    Grams,
+    InformationSums,
+    PlannedReadings,
+    blend,
+    cautious,
+    estimate,
+    fit_length,
+    folds,
+    grams,
+    posterior,
+    sums,
+    total,
+)
 from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
@@ -30,10 +46,10 @@ FOURTH: F1 = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 
 
 def repeat_noise_mm(runs: tuple[RunData, ...], kind: str) -> float | None:
-    """Standard deviation of one raw reading of an instrument from what was measured more than once, mm; None: nothing was.
+    """Standard deviation of one raw reading of an instrument from repeats, mm; None without repeats.
 
     Ball-bar: fourth differences of neighbours on a dense path, which smooth motions do not reach. Laser: readings at equal positions of one
-    run with lost motion and drift taken out; where every position was visited once, fourth differences too. Median over the readings, so
+    run, lost motion and drift removed; fourth differences if every position was visited once. Median over the readings, so
     that outliers do not count.
     """
     found = [v for run in runs if run.kind == kind for v in (_of_run(run),) if v.size]
@@ -91,7 +107,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class InstrumentNoise:
-    """Expected noise per instrument before the fit: one raw reading, least of an averaged value, what repeats say (None: nothing)."""
+    """Expected noise per instrument before the fit: of one raw reading, least of an averaged value, from repeats (None without repeats)."""
 
     sigma_mm: dict[str, float]
     floor_mm: dict[str, float]
@@ -144,7 +160,7 @@ class CampaignFit:
 
 
 def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None, floor_mm: dict[str, float] | None) -> InstrumentNoise:
-    """What the caller states, else what repeats tell, else the makers' figures."""
+    """Noise that the caller states, else from repeats, else the makers' figures."""
     repeats = {kind: repeat_noise_mm(runs, kind) for kind in KINDS}
     sigma = {k: (sigma_mm or {}).get(k) or repeats[k] or DEFAULT_SIGMA_MM[k] for k in KINDS}
     return InstrumentNoise(sigma, {k: max((floor_mm or {}).get(k, 0.0), RESOLUTION_MM) for k in KINDS}, repeats)
@@ -168,7 +184,7 @@ def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], 
 
 
 def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
-    """Iterate weights, components and the exact model until nothing moves."""
+    """Iterate weights, components and the exact model to convergence."""
     r = problem.readings
     gram, measured, sizes = grams(r), problem.measured, problem.sizes
     x, weight = np.zeros(len(problem.names)), np.ones(len(measured))

@@ -14,8 +14,7 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.identifiability import Identifiability, analyse
-from abbe.models.solvers.least_squares import ParameterEstimate, solve_map
+from abbe.models.solvers.least_squares import Identifiability, ParameterEstimate, analyse, solve_map
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors, bar_length_sd
 

@@ -2,7 +2,7 @@
 
 Published methods solve the data sets one by one and take the set-ups as perfect (math.md 4.5, 5.4). Here cup offsets, bar lengths, mirror
 tilts, laser zeros and drifts are unknowns with documented priors (`abbe.models.solvers.priors`); what the data cannot separate is listed.
-How noisy the instruments are and how large errors of each class are is estimated with them (docs/decisions/0011-sizes-from-the-data.md).
+The noise of the instruments and the size of the errors of each class are estimated with them (docs/decisions/0011-sizes-from-the-data.md).
 """
 
 from __future__ import annotations
@@ -16,11 +16,9 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine, with_tool
-from abbe.models.solvers.components import RIGID6, OrderChoice, choose, term_levels
+from abbe.models.solvers.components import KINDS, RIGID6, OrderChoice, choose, term_levels, total
 from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, build, expected_noise, settle
-from abbe.models.solvers.identifiability import Identifiability, combinations_of, taking_part
-from abbe.models.solvers.information import KINDS, total
-from abbe.models.solvers.least_squares import ParameterEstimate
+from abbe.models.solvers.least_squares import Identifiability, ParameterEstimate, combinations_of, taking_part
 from abbe.models.solvers.observability.rank import campaign_columns, compressed, hidden_free, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns
@@ -53,7 +51,7 @@ class JointSolution:
         Smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. Its covariance holds the noise as it was
         estimated and the uncertainty of the estimated sizes.
     tool_count : int
-        How many different tools the runs used; with one, what only another tool would show stays hidden (math.md 4.6).
+        Number of different tools in the runs; with one tool, what only another tool would show stays hidden (math.md 4.6).
     data, setup : the runs as they were used; their set-up unknowns.
     prior_sd : array, shape (p,)
         Prior standard deviation of every unknown of ``estimate``, with the sizes estimated from these data.
@@ -121,7 +119,7 @@ class JointSolution:
 
 
 def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:
-    """Set-up unknowns farther from zero than ``limit`` prior standard deviations: (name, how many), largest first.
+    """Set-up unknowns of more than ``limit`` prior standard deviations: (name, number of standard deviations), largest first.
 
     A bar length that far off means that ball-bar and laser do not measure in the same millimetres.
     """

@@ -1,7 +1,8 @@
-"""Weighted linear least squares with an explicit prior, full covariance, and what the data alone can tell.
+"""Weighted linear least squares with an explicit prior, full covariance, and what the data determine.
 
-The prior is part of the statement, never hidden: `ParameterEstimate.data_share` says for every parameter how much of its information came
-from the data. Parameters that live on the prior alone are named by `abbe.models.solvers.identifiability`.
+The prior is part of the statement, never hidden: `ParameterEstimate.data_share` states for every parameter the share of its information
+that comes from the data. Parameters that only the prior determines are named with the hidden combinations: rank with a stated tolerance,
+and the null space in words (`Identifiability`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,13 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
+
+RANK_TOLERANCE = 1e-9
+EFFECTIVE_TOLERANCE = 1e-3
+HIDDEN = 1e-6
+"""A parameter takes part in what is hidden if its unit column has this component in the null space."""
+LEAST_SHARE = 1e-3
+"""Words name members of a combination from this share of its largest on."""
 
 
 def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
@@ -134,3 +142,126 @@ def _solve_whitened(names: tuple[str, ...], b: F2, z: F1, ridge: F1) -> tuple[F1
 def _column_scale(a: F2) -> F1:
     norm = np.linalg.norm(a, axis=0)
     return np.where(norm > 0, 1.0 / np.where(norm > 0, norm, 1.0), 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """A direction of parameter space that leaves no trace in the observations.
+
+    ``weights`` relate the parameters in units of their typical size, largest first, including small members: without them the combination
+    leaves a trace. ``text``: a sentence about the members that matter (`LEAST_SHARE`).
+    """
+
+    weights: tuple[tuple[str, float], ...]
+    text: str
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Names of the members that matter, largest first."""
+        return _members(self.weights)
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Rank analysis of a scaled design.
+
+    Attributes
+    ----------
+    n_parameters, rank, effective_rank : int
+        Singular values above 1e-9 and 1e-3 of the largest (math.md 4.6).
+    condition : float
+        Largest over smallest singular value counted in ``rank``.
+    hidden : tuple of Combination
+        The null space (beyond ``rank``) as sparse combinations.
+    involved : frozenset of str
+        Parameters that take part in the null space at all (`taking_part`): none of them has a value of its own.
+    """
+
+    n_parameters: int
+    rank: int
+    effective_rank: int
+    condition: float
+    hidden: tuple[Combination, ...]
+    involved: frozenset[str] = frozenset()
+
+
+def taking_part(names: tuple[str, ...], null_space: F2) -> frozenset[str]:
+    """Parameters that take part in a hidden combination; ``null_space``: orthonormal in unit columns, shape (p, k)."""
+    size = np.linalg.norm(null_space, axis=1) if null_space.shape[1] else np.zeros(len(names))
+    return frozenset(n for n, s in zip(names, size, strict=True) if s > HIDDEN)
+
+
+def combinations_of(names: tuple[str, ...], null_space: F2) -> tuple[Combination, ...]:
+    """A null space, shape (p, k), as sparse combinations in words."""
+    return tuple(_sentence(names, v) for v in sparse_rows(null_space.T))
+
+
+def project_out(a: F2, nuisance: F2) -> F2:
+    """Design with everything that set-up unknowns could explain taken out: (I - N N+) a."""
+    if nuisance.shape[1] == 0:
+        return a
+    norm = np.linalg.norm(nuisance, axis=0)
+    u, s, _ = svd(nuisance[:, norm > 0] / norm[norm > 0], full_matrices=False)
+    basis = u[:, s > RANK_TOLERANCE * s[0]] if s.size else u[:, :0]
+    return np.asarray(a - basis @ (basis.T @ a))
+
+
+def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, tolerance: float = RANK_TOLERANCE) -> Identifiability:
+    """Rank, condition and null space of a design.
+
+    Parameters
+    ----------
+    a : array, shape (n, p)
+        Whitened design, set-up unknowns projected out.
+    typical : array, shape (p,), optional
+        Typical size of each parameter; default: unit-norm columns (the convention of math.md 4.4 to 4.6).
+    """
+    norm = np.linalg.norm(a, axis=0)
+    seen = norm > tolerance * (norm.max() if norm.size else 1.0)
+    scale = np.where(seen, 1.0 / np.where(seen, norm, 1.0), 1.0) if typical is None else typical
+    _, s, vt = svd(a * scale, full_matrices=True)
+    s = np.concatenate([s, np.zeros(len(names) - s.size)])
+    top = s[0] if s.size and s[0] > 0 else 1.0
+    rank = int((s > tolerance * top).sum())
+    effective = int((s > EFFECTIVE_TOLERANCE * top).sum())
+    condition = float(top / s[rank - 1]) if rank else float("inf")
+    null = vt[rank:].T
+    return Identifiability(len(names), rank, effective, condition, combinations_of(names, null), taking_part(names, null))
+
+
+def sparse_rows(null: F2) -> F2:
+    """A basis of the same space with as many zeros as elimination gives: reduced row echelon form by largest pivot."""
+    m = np.array(null, dtype=np.float64)
+    row = 0
+    free = np.ones(m.shape[1], dtype=bool)
+    while row < m.shape[0]:
+        block = np.abs(m[row:]) * free
+        i, j = divmod(int(block.argmax()), block.shape[1])
+        if block[i, j] < 1e-9:
+            break
+        swap = np.array([row, row + i])
+        m[swap] = m[swap[::-1]]
+        m[row] /= m[row, j]
+        others = np.arange(m.shape[0]) != row
+        m[others] -= np.outer(m[others, j], m[row])
+        free[j] = False
+        row += 1
+    m[np.abs(m) < 1e-7] = 0.0
+    return m
+
+
+def _members(parts: tuple[tuple[str, float], ...]) -> tuple[str, ...]:
+    return tuple(n for n, w in parts if abs(w) > LEAST_SHARE)
+
+
+def _sentence(names: tuple[str, ...], v: F1) -> Combination:
+    order = np.argsort(-np.abs(v))
+    parts = tuple((names[i], float(v[i])) for i in order if abs(v[i]) > HIDDEN)
+    members = _members(parts)
+    shown = members[:4]
+    if len(members) == 1:
+        text = f"{shown[0]} leaves no trace in these data"
+    else:
+        more = f" and {len(members) - 4} more" if len(members) > 4 else ""
+        text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be told apart"
+    return Combination(parts, text)

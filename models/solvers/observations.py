@@ -39,7 +39,7 @@ class RunData:
     t_s : array, shape (n,)
         Campaign clock.
     weight_n : array, shape (n,)
-        How many raw readings each value is the mean of.
+        Number of raw readings in each mean.
     centre_mm, radius_mm : bar set-up. beam : laser set-up, nominal unit vector.
     u_length_mm : float, optional
         Stated standard uncertainty of the bar's calibrated length.
@@ -48,9 +48,9 @@ class RunData:
     tool_mm : array, shape (3,), optional
         Spindle reference to functional point in this run; None: the machine's own.
     test : "helix" | "circle" | "diagonal" | "linear" | ""
-        What was run, for people and for who compares runs; how it reads follows from ``kind`` and the positions alone.
+        Test, for people and for comparing runs; the reading depends on ``kind`` and the positions only.
     rejected : int
-        How many raw readings `block_average` left out.
+        Number of raw readings that `block_average` left out.
     """
 
     label: str
@@ -71,7 +71,7 @@ class RunData:
     rejected: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what no solver could use, naming the run."""
+        """Refuse data that no solver can use; the error names the run."""
         _check_columns(self)
         if self.kind == "bar":
             _check_bar(self)
@@ -125,7 +125,7 @@ def block_average(run: RunData, blocks: int) -> RunData:
     averaged is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside it. A
     run of at most ``blocks`` readings is returned as it is.
 
-    Single outliers do not enter a mean. A reading is left out if it lies farther from the median of its block than `REJECT_SIGMA` times
+    Single outliers are left out of the mean. A reading is left out that lies farther from the median of its block than `REJECT_SIGMA` times
     the largest of three: the noise of the whole run (second differences), the block's own spread (median of the distances from its median,
     as a standard deviation), so that what moves steadily through a block stays, and `LEAST_SPREAD_MM`. ``rejected`` counts what was left
     out and ``weight_n`` what was averaged.

@@ -1,4 +1,4 @@
-"""What a run reads of a machine and its set-up, exactly, and how each unknown changes it (docs/explanation/conventions.md, "Readings").
+"""Exact readings of a run from machine and set-up, and their derivatives (docs/explanation/conventions.md, "Readings").
 
 Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns. The readings are those of math.md 4.2
 and 5.4 without any linearisation: finite rotations in the chain, the length of the bar as a length, the mirror as a tilted plane that a
@@ -60,7 +60,7 @@ class SetupUnknowns:
 def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine | None = None) -> SetupUnknowns:
     """Set-up unknowns of a set of runs, named as in the module's docstring.
 
-    Runs with the same nominal radius share one bar; where they state its length differently, the widest statement is believed. Runs with
+    Runs with the same nominal radius share one bar; if they state its length differently, the largest uncertainty counts. Runs with
     the same set-up share cup, mirror and beam.
 
     Parameters
@@ -197,7 +197,7 @@ LOST = 3
 
 @dataclass(frozen=True)
 class AxisPlaces:
-    """Commanded positions of one machine and tool with everything about them that no unknown changes.
+    """Commanded positions of one machine and tool, with all values that depend on no unknown.
 
     Attributes
     ----------
@@ -243,7 +243,7 @@ class AxisPlaces:
         return exact_jacobian(self.machine, self.axes_mm, motions)
 
     def rows(self, direction: F2, slope: F4) -> F2:
-        """What a reading in the given directions (n, 3) takes of every term and lost motion, shape (n, terms + 3)."""
+        """Derivative of a reading in the given directions (n, 3) with respect to every term and lost motion, shape (n, terms + 3)."""
         seen = (direction[:, None, :] @ slope.reshape(-1, 3, 18))[:, 0, :]
         lost = -0.5 * self.sign * seen[:, [0, 7, 14]]
         return np.concatenate([self.values * seen[:, self.column], lost], axis=1)
@@ -270,7 +270,7 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
     machine, terms
         Nominal machine; terms of its error motions.
     run : RunData
-        Where the axes were commanded to; its readings are not looked at.
+        Commanded positions; its readings are not used.
     setup : SetupUnknowns
         Set-up unknowns of the campaign (`setup_unknowns`); one that has no name there is taken as zero.
     theta : array, shape (terms + 3 + set-up,)

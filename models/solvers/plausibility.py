@@ -1,7 +1,7 @@
-"""Runs of a campaign that cannot be what they claim: wrong unit, wrong sign, swapped axes, another machine.
+"""Runs of a campaign that contradict the others: wrong unit, wrong sign, swapped axes, another machine.
 
 All runs form one linear model with wide priors. For every run and every possible mistake, the evidence of the whole campaign is computed
-with that mistake undone, and with that run unrelated to the others. The best hypothesis counts only if it is better by far (`STRONG`).
+with that mistake undone, and with that run unrelated to the others. The best hypothesis counts only if it is better by `STRONG`.
 Source: marginal likelihood of a linear model with normal priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong", the limit here
 is far above it).
 """
@@ -145,7 +145,7 @@ class SuspectRun:
     ----------
     run : str
     cause : str
-        Key of `FACTORS` or `SWAPS`: with that mistake undone the run fits. "other": nothing makes it fit.
+        Key of `FACTORS` or `SWAPS`: with that mistake corrected the run fits. "other": no correction makes it fit.
     gain : float
         By how much the log evidence of the campaign grows.
     misfit_mm, expected_mm : float

@@ -1,4 +1,4 @@
-"""Typical sizes of error motions and set-up errors: documented priors, never hidden ones.
+"""Typical sizes of error motions and set-up errors: the documented priors.
 
 They are wide (a first machine is expected well inside them) and only decide what the data leave open: `Estimate.data_share` tells.
 Sources: effects.md 2 (typical magnitudes of geometry), published machine data (Yang Table 2: 100 urad scales; Pahk: up to 110 urad).
@@ -116,7 +116,7 @@ SMALLEST_SHARE = 1e-7
 
 @cache
 def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
-    """Shapes in which an error motion may bend, and how much: the covariance of its Legendre coefficients of order 2 to ``order``.
+    """Shapes of an error motion and their variances: the prior covariance of its Legendre coefficients of order 2 to ``order``.
 
     An error motion is equally large and equally smooth everywhere on its stroke, its line taken away. Independent Legendre coefficients
     would not say so: all polynomials are largest at the ends of the stroke. So the coefficients are those of a stationary process with a
@@ -211,7 +211,7 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
 
 
 def with_length(model: SizeModel, length: float) -> SizeModel:
-    """The same for error motions of another correlation length, strokes."""
+    """The size model for error motions of another correlation length, strokes."""
     root = np.eye(model.typical.size)
     for at in model.blocks:
         shapes, variance = smooth_shapes(at.size + 1, length)

@@ -1,1 +1,1 @@
-"""What a result is worth: propagation and Monte Carlo of the uncertainty of predicted deviations."""
+"""Uncertainty of predicted deviations: propagation and Monte Carlo."""

@@ -38,7 +38,7 @@ CHUNK_READINGS = 4_000_000
 
 @dataclass(frozen=True)
 class CampaignTrials:
-    """Inputs of a solution and how a prediction at points answers to them.
+    """Inputs of a solution and their influence on a prediction at points.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class CampaignTrials:
         return draw
 
     def exact(self) -> Draw:
-        """Trials through the exact readings, iterated; everything that is no reading stays linear."""
+        """Trials through the exact readings, iterated; all other inputs stay linear."""
         solution, gain, sd = self.sources.solution, self.response.gain, self._reading_sd()
         n = len(solution.terms)
         measured = np.concatenate([run.deviation_mm for run in solution.data])

@@ -60,7 +60,7 @@ class Interval:
 
 
 def apart_from_zero(vectors: F2, covariance: F3, probability: float = PROBABILITY) -> NDArray[np.bool_]:
-    """Whether the ellipsoid that holds each vector with this probability leaves out zero: noise alone does so in 5 % of all cases.
+    """Whether the coverage ellipsoid of each vector excludes zero: pure noise does so in 5 % of all cases.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def shortest_interval(samples: F2, probability: float = PROBABILITY) -> Interval
 
 
 def _inside(trials: int, probability: float) -> int:
-    """How many of the trials the interval spans, q of GUM-S1 7.7.2."""
+    """Number of trials that the interval spans, q of GUM-S1 7.7.2."""
     _checked_probability(probability)
     inside = int(probability * trials + 0.5)
     if not 0 < inside < trials:

@@ -1,4 +1,4 @@
-"""What is known of an input as a distribution (GUM-S1 6): normal, rectangular, or Student's t for a figure from few repeats."""
+"""Knowledge of an input as a distribution (GUM-S1 6): normal, rectangular, or Student's t for a figure from few repeats."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Moments:
         self.count = 0
 
     def add(self, results: F2) -> None:
-        """Take in results, shape (trials, p)."""
+        """Add results, shape (trials, p)."""
         d = results - self._about
         self._first += d.sum(axis=0)
         self._second += d.T @ d

@@ -1,6 +1,6 @@
-"""The deviation of a machine over its volume as one solution knows it: whole, or the part that chosen error motions make, with covariance.
+"""Deviation of a machine over its volume by one solution, with covariance: whole, or the part of chosen error motions.
 
-It needs no solution at hand but what a store keeps of it: terms, coefficients and their covariance from all sources.
+It needs only what a store keeps of a solution: terms, coefficients and their covariance from all sources.
 """
 
 from __future__ import annotations

@@ -135,7 +135,7 @@ def _figures(results: F2, probability: float) -> F2:
 
 
 def _known(figures: list[F2]) -> F2:
-    """How well every figure is known, (6, m): twice the standard deviation of its mean over the batches; inf from too few of them."""
+    """Numerical uncertainty of every figure, (6, m): twice the standard deviation of its mean over the batches; inf from too few."""
     if len(figures) < FEWEST_BATCHES:
         return np.full(figures[0].shape, np.inf)
     return np.asarray(2.0 * np.std(figures, axis=0, ddof=1) / np.sqrt(len(figures)))

@@ -1,6 +1,6 @@
 """Inputs of a campaign's solution and their influence on it: one error source per input (GUM 5.1).
 
-The estimate is linear in what went into it, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
+The estimate is linear in its inputs, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
 posterior covariance C. So the covariance splits exactly, C = C A^T W A C + C P^-1 C: noise per instrument, and the prior of every single
 unknown (the bar's calibrated length, the set-ups, the typical size of errors). Inputs unknown to the solver are added.
 """
@@ -185,7 +185,7 @@ def order_source(solution: JointSolution, r: Response, orders_above: int) -> tup
 
 
 def chosen_order(solution: JointSolution) -> int:
-    """Legendre order that the data support; terms of the solution above it are there only to be allowed for."""
+    """Legendre order that the data support; terms of the solution above it only contribute uncertainty."""
     return solution.order
 
 

@@ -1,7 +1,7 @@
 """The coefficients of a solution with their covariance, as stored, from which predictions can be recomputed.
 
 Deviation at points = field @ coefficients, covariance = field @ covariance @ field^T, where field holds the deviation per unit of each term
-(`abbe.models.geometry.volume.field`, with the machine's tool and the requested frame).
+(`abbe.models.geometry.volume.unit_deviation`, with the machine's tool and the requested frame).
 """
 
 from __future__ import annotations

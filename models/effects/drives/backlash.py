@@ -1,4 +1,4 @@
-"""Backlash (lost motion): the axis stays behind by half the play in the direction it came from."""
+"""Backlash (lost motion): the axis lags half the play behind, in the direction it came from."""
 
 from __future__ import annotations
 

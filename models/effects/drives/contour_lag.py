@@ -1,4 +1,4 @@
-"""Contour lag: all axes follow late by the same time, so a circle is driven too small, the more the faster."""
+"""Contour lag: all axes follow late by the same time, so a circle becomes too small, more so at a higher feed."""
 
 from __future__ import annotations
 

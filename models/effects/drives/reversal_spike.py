@@ -16,7 +16,7 @@ SHAPE = (
 
 
 def _height(path: Path, key: str, values: Values) -> F1:
-    """Direction times what the feed makes of 1 um at 1000 mm/min."""
+    """Direction times the height at the commanded feed for 1 um at 1000 mm/min."""
     return np.asarray(-UM * path.at.sign[:, axis_of(key)] * (path.feed_mm_min / 1000.0) ** values["p"])
 
 
@@ -56,7 +56,7 @@ def _rounded(path: Path, key: str, values: Values) -> F2:
 
 
 def _at_once(path: Path, key: str, values: Values) -> F2:
-    """A quicker rise than the usual one: what the first part of it leaves out."""
+    """A quicker rise than the usual one: the difference in its first part."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     return _read(path, key, _height(path, key, values) * np.maximum(1.0 - x / RISE, 0.0))
 

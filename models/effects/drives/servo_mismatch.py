@@ -1,4 +1,4 @@
-"""Servo mismatch: one axis follows later than the others by a time, so its error is proportional to its velocity."""
+"""Servo mismatch: one axis lags the others by a constant time, so its error is proportional to its velocity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vibration: an axis swings at a frequency of its own while it moves."""
+"""Vibration: an axis oscillates at its own frequency while it moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Angular error: a carriage turns as it moves, and the arm to the tool makes a deviation of it."""
+"""Angular error: a carriage turns as it moves, and its lever arm to the tool makes this a deviation."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from abbe.models.effects.path import Path
 
 
 def struck(path: Path, key: str, values: Values) -> F2:
-    """Where it may strike: any laser reading, with the variance of 1 um (before its small share of the readings)."""
+    """Extra variance of any laser reading, that of 1 um (before its small share of the readings)."""
     return np.full((path.n, 1), UM**2)
 
 

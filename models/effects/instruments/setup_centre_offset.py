@@ -1,4 +1,4 @@
-"""Offset of the cup's centre: where the cup stands less where the spindle put it."""
+"""Offset of the cup's centre: actual position of the cup minus the position at which the spindle set it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bed that gives way: straightness of one axis that changes its sign across another."""
+"""Non-rigid bed: straightness of one axis that changes its sign across another."""
 
 from __future__ import annotations
 

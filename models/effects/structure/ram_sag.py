@@ -1,4 +1,4 @@
-"""Sag of a horizontal ram: the further it reaches out the lower its end hangs, and the more it points down."""
+"""Sag of a horizontal ram: the farther it reaches out, the more its end sinks and tilts down."""
 
 from __future__ import annotations
 

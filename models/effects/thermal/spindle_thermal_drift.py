@@ -9,7 +9,7 @@ from abbe.models.effects.path import Path, Places
 
 
 def drift(at: Places, key: str, values: Values) -> F3:
-    """1 - exp(-t / tau), 1 um; only the change since the cup was set or the laser was zeroed is seen."""
+    """1 - exp(-t / tau), 1 um; readings show only the change since the cup was set or the laser was zeroed."""
     return along(axis_of(key), UM * warmth(at.t_s, values["tau_s"]))
 
 

@@ -3,7 +3,7 @@
 The paper supposes that errors of the kinematic parameters cause the position errors (4.2), and fits a surface to them. Here the 18
 parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.kinematics`) together with the unknown
 placement on the CMM, with a stated prior for each: what the points do not carry stays at its prior and is named. Points worse than stated
-and a prior that the points contradict are noticed, widened and said (`abbe.models.papers.kwon.calibration`).
+and a prior that the points contradict are detected, widened and reported (`weigh`).
 """
 
 from __future__ import annotations
@@ -18,13 +18,12 @@ from abbe.models.geometry.rotation import rotation_matrix
 from abbe.models.papers.kwon.errors import NotSettled
 from abbe.models.papers.kwon.frames import best_fit_errors, best_fit_frame, checked_frame, from_frame, into_frame, rms
 from abbe.models.papers.kwon.kinematics import LEGS, PER_LEG, Geometry, forward, inverse, jacobian, parameter_design, parameter_names, poses
-from abbe.models.solvers.identifiability import Combination, Identifiability, analyse, project_out
-from abbe.models.solvers.least_squares import ParameterEstimate, solve_map
+from abbe.models.solvers.least_squares import Combination, Identifiability, ParameterEstimate, analyse, project_out, solve_map
 
 CONFLICT = 0.01
 """Probability below which the deviations contradict the stated prior."""
 UNSEEN = 1e-9
-"""Singular values below this share of the largest leave no trace (as abbe.models.solvers.identifiability)."""
+"""Singular values below this share of the largest leave no trace (as abbe.models.solvers.least_squares)."""
 SPATIAL = 3
 """Coordinates of a point."""
 STRAY = 0.01
@@ -66,7 +65,7 @@ class PriorTest:
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What to weigh points and prior with.
+    """Weights of points and prior.
 
     Attributes
     ----------
@@ -89,7 +88,7 @@ class Weights:
 
 
 def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
-    """Look at whitened, linear observations ``observed = design @ (theta, placement) + noise``.
+    """Weights from whitened, linear observations ``observed = design @ (theta, placement) + noise``.
 
     With the placement projected out and theta in units of its prior, every singular direction gives one number of the variance
     ``variance_factor + (prior_factor x singular value)^2``; the rest of the observations is noise alone.
@@ -119,7 +118,7 @@ def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
 
 
 def outlying_points(residual: F2) -> tuple[int, ...]:
-    """Rows whose residual stands out from the others: not one in a set of good points, in 99 of 100 sets.
+    """Rows whose residual exceeds the others' by more than chance: 99 of 100 sets of good points have none.
 
     Parameters
     ----------
@@ -281,7 +280,7 @@ class KwonCalibration:
 
     @property
     def statement(self) -> str:
-        """What the figures rest on, in one sentence."""
+        """Basis of the figures, in one sentence."""
         return "; ".join([*self._seen(), *self._warnings(), "every stated uncertainty is conditional on the prior"])
 
     def _seen(self) -> list[str]:
@@ -312,7 +311,7 @@ class KwonCalibration:
         return warnings
 
     def predict_mm(self, lambda_mm: F2) -> F2:
-        """Where the ball centre is for commands, CMM coordinates, shape (n, 3)."""
+        """Ball centre for commands, CMM coordinates, shape (n, 3), mm."""
         return from_frame(self.frame, forward(self.geometry, lambda_mm))
 
     def u_predict_mm(self, lambda_mm: F2) -> F2:
@@ -343,7 +342,7 @@ def default_prior() -> F1:
 def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = None, frame: F2 | None = None) -> KwonCalibration:
     """Most probable parameters, given normal priors about nominal; Gauss-Newton on the exact forward solution.
 
-    Noise and prior are widened where the points demand it (`abbe.models.papers.kwon.weighing.weigh`): the noise by what no parameter can
+    Noise and prior are widened where the points demand it (`weigh`): the noise by what no parameter can
     follow, all prior standard deviations by one common factor, until the deviations in the carried directions are as large as the prior
     lets expect. A contradiction (p < 0.01) is in ``prior_test`` and in the statement.
 
@@ -386,7 +385,7 @@ def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = 
 
 
 def error_left(nominal: Geometry, calibrated: Geometry, lambda_mm: F2, measured_mm: F2) -> ErrorLeft:
-    """Position error before and after calibration; use points that the calibration has not seen.
+    """Position error before and after calibration; use points that the calibration did not use.
 
     Parameters
     ----------
@@ -406,7 +405,7 @@ def _with(nominal: Geometry, theta: F1) -> Geometry:
 def _step(
     geometry: Geometry, readings: PlaneReadings, frame: F2, pivot: F1 | None, known: tuple[F1, F1]
 ) -> tuple[ParameterEstimate, Weights]:
-    """One linearised fit about the present geometry and frame, points and prior weighed as they themselves demand."""
+    """One linearised fit about the present geometry and frame, points and prior weighted by `weigh`."""
     theta, prior = known
     design, misfit = whitened(geometry, readings, frame, pivot)
     free = design.shape[1] - prior.size

@@ -1,4 +1,4 @@
-"""What a parallel machine or its data can refuse, by name. All are ValueErrors with one line that says which pose and which leg."""
+"""Errors of a parallel machine or its data. All are ValueErrors whose one line names the pose and the leg."""
 # ruff: noqa: N818 - the names say what is geometrically wrong, as math.md 6 lists it
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ Fault = tuple[type["PoseError"], NDArray[np.bool_], str]
 
 
 class KwonError(ValueError):
-    """Base of the refusals of this package."""
+    """Base of this package's errors."""
 
 
 class PoseError(KwonError):
-    """A refusal that belongs to single poses.
+    """An error of single poses.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class ExtrapolationRefused(KwonError):
 
 
 class NotSettled(KwonError):
-    """An iteration did not come to rest: the points do not fit the machine that was given as nominal."""
+    """An iteration did not converge: the points do not fit the nominal machine."""
 
 
 def refuse(kind: type[PoseError], bad: NDArray[np.bool_], text: str) -> None:

@@ -1,4 +1,4 @@
-"""What printed coefficients of a response surface betray: the plane they were fitted on, their in-plane form, their sums on a grid."""
+"""Conclusions from printed coefficients of a response surface: the plane they were fitted on, their in-plane form, their sums on a grid."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def square_grid(half_mm: float = 1.0, step_mm: float = 0.25, z_mm: float = 0.0) 
 
 
 def grid_sums(in_plane: F1, half_mm: float = 1.0, step_mm: float = 0.25) -> GridSums:
-    """Largest value and sums of squares of an in-plane cubic on a square grid: to be held against a printed analysis of variance."""
+    """Largest value and sums of squares of an in-plane cubic on a square grid: for comparison with a printed analysis of variance."""
     values = regressors(square_grid(half_mm, step_mm), IN_PLANE) @ _sized(in_plane, len(IN_PLANE))
     return GridSums(values.size, float(np.abs(values).max()), float(((values - values.mean()) ** 2).sum()), float((values**2).sum()))
 

@@ -256,7 +256,7 @@ def repeatability(readings_mm: F3) -> Repeatability:
 
 
 def residual_statistics(residual_mm: F1, df_res: int, repeat_sd_mm: float, repeat_dof: int) -> ResidualStatistics:
-    """Whether the residuals of a surface are more than repeatability (test of lack of fit for single readings).
+    """Test of lack of fit for single readings: whether the residuals of a surface exceed the repeatability.
 
     Parameters
     ----------

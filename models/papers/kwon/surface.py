@@ -15,7 +15,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.papers.kwon.errors import ExtrapolationRefused, SurfaceNotDetermined
 from abbe.models.papers.kwon.kinematics import poses
 from abbe.models.papers.kwon.layout import RANK_TOLERANCE, Exponents, Layout, centring, layout, regressors, term_matrix, term_name
-from abbe.models.solvers.identifiability import analyse
+from abbe.models.solvers.least_squares import analyse
 
 ROUNDING = 1000.0 * float(np.finfo(np.float64).eps)
 """Scatter below this share of the root mean square of the values is what the computation itself leaves (2e-13; 3e-11 mm of 150 mm)."""

@@ -68,7 +68,7 @@ class WangPlan:
 
 
 def problem(plan: WangPlan, degree: int) -> tuple[F2, F2]:
-    """Design of the error functions (18 degree - 3 columns) and of the mirror tilts, all readings but the zero first ones."""
+    """Design of the error functions (18 degree - 3 columns) and of the mirror tilts, without each run's first reading (zero)."""
     terms = monomials(degree)
 
     def field(points_mm: F2) -> F3:
@@ -92,7 +92,7 @@ def _design(plan: WangPlan, field: Field) -> tuple[F2, F2]:
 
 
 def readings(plan: WangPlan, deviation: Deviation, tilt_rad: dict[str, F1]) -> F1:
-    """What the laser shows on a machine, in the order of the rows of `problem`, mm.
+    """Readings of the laser on a machine, in the order of the rows of `problem`, mm.
 
     Parameters
     ----------

@@ -131,7 +131,7 @@ def displacement_eq11_printed(errors: ErrorArrays, axes_mm: F2) -> F3:
 
 
 def exact_positions_mm(errors: ErrorArrays, axes_mm: F2) -> F2:
-    """Where the mirror really is, full rotations Rz Ry Rx: actual minus nominal, shape (n, 3), mm."""
+    """Position error of the mirror with full rotations Rz Ry Rx: actual minus nominal, shape (n, 3), mm."""
     return exact_deviation_mm(machine(_ANY), axes_mm, _motions(errors, axes_mm), rotation="zyx")
 
 
@@ -262,7 +262,7 @@ def reading_mm(points_mm: F2, mirror: F1, beam: F1) -> F1:
 def step_readings_mm(path_mm: F2, deviation_mm: F2, beam: F1, mirror: F1) -> F1:
     """Displayed deviation of a diagonal test: reading since the first record minus nominal displacement along the diagonal, shape (n,).
 
-    Nominal and erroneous part are read apart, so that the result has the digits of a micrometre and not those of a metre. Exact:
+    Nominal and erroneous part are computed separately, so that the result is rounded like a micrometre and not like a metre. Exact:
     `reading_mm` of the moved mirror less the nominal displacement (math.md 5.4; eq (4) and (5) for a square mirror).
 
     Parameters
@@ -332,7 +332,7 @@ def projection_factors(inc_mm: F1) -> F1:
 
 
 def _facing(mirror: F1, beam: F1) -> float:
-    """m.l, refused where the mirror shows the beam its edge (or has no normal)."""
+    """m.l; ValueError where the beam meets the mirror edge-on, or the mirror has no normal."""
     along = float(mirror @ beam)
     if not abs(along) > 1e-12 * float(np.linalg.norm(mirror)):
         raise ValueError("laser: the mirror stands along the beam (m.l = 0)")

@@ -97,7 +97,7 @@ def sum_test_mm(totals_mm: dict[str, float]) -> float:
 
 
 def common_scale(totals_mm: dict[str, float], length_mm: F1) -> float:
-    """The only scale figure that plain diagonals tell: sum(X_i² e_i) / R², relative length error of the mean diagonal (math.md 5.3).
+    """The only scale figure that plain diagonals determine: sum(X_i² e_i) / R², relative length error of the mean diagonal (math.md 5.3).
 
     Not in the paper, whose (12) leaves the scale errors out.
 

@@ -66,7 +66,7 @@ def difference_eq3(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
 
 
 def delta_exact(errors: YangErrors, slide_mm: F2, tool_mm: F1, *, small_angles: bool = False) -> F2:
-    """The same machine without linearisation: full rotations Rz Ry Rx, or (``small_angles``) the paper's matrices multiplied out exactly.
+    """`delta_eq1` without linearisation: full rotations Rz Ry Rx, or (``small_angles``) the paper's matrices multiplied out exactly.
 
     Parameters, result: as `delta_eq1`.
     """
@@ -156,7 +156,7 @@ def reading_eq6(d_mm: F2, error_mm: F2) -> F1:
 
 
 def reading_eq8(d_mm: F2, error_mm: F2) -> F1:
-    """The same to first order, eq (8): (w - w0) . (Delta - Delta0) / R, shape (n,), mm.
+    """`reading_eq6` to first order, eq (8): (w - w0) . (Delta - Delta0) / R, shape (n,), mm.
 
     Parameters, errors: as `reading_eq6`; R is the length of each row of ``d_mm``. Erratum: the paper takes the slide's z for a workpiece
     coordinate; WORKPIECE coordinates are wanted here (math.md 3 row Y (8), 4.2). What it leaves out: `second_order_bound_mm`.
@@ -177,7 +177,7 @@ def second_order_bound_mm(error_mm: F2, radius_mm: float) -> F1:
 
 
 def measured_mm(tip_mm: F2, ball_mm: F1, radius_mm: float, bar_offset_mm: float = 0.0) -> F1:
-    """Bar reading from where the two balls really are: |tip - ball| - R + offset, shape (n,).
+    """Bar reading from the actual positions of the two balls: |tip - ball| - R + offset, shape (n,).
 
     Parameters
     ----------

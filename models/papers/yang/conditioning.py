@@ -15,7 +15,7 @@ import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.solvers.designs import unit_columns
-from abbe.models.solvers.identifiability import RANK_TOLERANCE
+from abbe.models.solvers.least_squares import RANK_TOLERANCE
 
 RADIUS_TOLERANCE = 0.01
 """A larger share cannot be lost motion or polyline: radius or origin belong to other points, and all parameters scale with it."""
@@ -44,7 +44,7 @@ class SixParameters:
 
 @dataclass(frozen=True, slots=True)
 class SixFit:
-    """Solution of eq (9), the covariance per unit variance of a reading (times your noise in mm²), and what the reader must know."""
+    """Solution of eq (9), the covariance per unit variance of a reading (times your noise in mm²), and a note for the reader."""
 
     parameters: SixParameters
     covariance_per_mm2: F2

@@ -36,7 +36,7 @@ DEFAULT_OFFSETS_MM = ((-200.0, -75.0), (-200.0, 75.0), (200.0, -75.0), (200.0, 7
 
 @dataclass(frozen=True)
 class YangPlan:
-    """What was measured where.
+    """A plan: volume, tool, cups, bars and steps of the experiments.
 
     Attributes
     ----------

@@ -1,5 +1,4 @@
-"""Cures for hidden combinations: every usual addition to a campaign is tried out
-(`abbe.models.solvers.observability.cures`).
+"""Cures for hidden combinations: every usual addition to a campaign is tried.
 
 Nothing is looked up: the rank with each addition is computed on the campaign at hand, so the advice fits this machine and these runs.
 """
@@ -17,8 +16,7 @@ from abbe.models.geometry.bases import Term
 from abbe.models.machine import AXES, Machine, with_tool
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
-from abbe.models.solvers.identifiability import project_out
-from abbe.models.solvers.least_squares import singular_values
+from abbe.models.solvers.least_squares import project_out, singular_values
 from abbe.models.solvers.observability.rank import (
     CampaignColumns,
     Knowledge,
@@ -78,7 +76,7 @@ class Present:
 
     @property
     def next_order(self) -> str:
-        """The first usual order in which none was stepped yet (the last one if all were)."""
+        """The first usual order that no diagonal has; the last one if all are used."""
         return next((o for o in STEP_ORDERS if o not in self.orders), STEP_ORDERS[-1])
 
     @property
@@ -159,7 +157,7 @@ class Addition:
 
 
 def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
-    """What could be added to these runs, cheapest first; every cause is a fact about them (`abbe.models.solvers.observability.cures`).
+    """Possible additions to these runs, cheapest first; every cause is a fact about them.
 
     Parameters
     ----------

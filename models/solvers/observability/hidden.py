@@ -12,8 +12,7 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
 from abbe.models.machine import AXES, Machine, with_tool
-from abbe.models.solvers.identifiability import RANK_TOLERANCE, sparse_rows
-from abbe.models.solvers.least_squares import singular_values, svd
+from abbe.models.solvers.least_squares import RANK_TOLERANCE, singular_values, sparse_rows, svd
 from abbe.models.solvers.observability.cures import Addition, CampaignLayout, CureTrial, best_sequence, trials
 from abbe.models.solvers.observability.rank import ObservedInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
@@ -57,7 +56,7 @@ def motion_text(motion: str) -> str:
 
 
 def part_text(motion: str, orders: Iterable[int]) -> str:
-    """Which part of a motion: its slope (order 1, for positioning the scale), its shape (order 2 and more), or all of it."""
+    """Text for the part of a motion: its slope (order 1, for positioning the scale), its shape (order 2 and more), or all of it."""
     found, whole = sorted(set(orders)), motion_text(motion)
     if found == [0] or not found:
         return whole
@@ -96,7 +95,7 @@ def _proportion(terms: tuple[Term, ...], family: Family) -> str:
 
 
 def _unit(term: Term) -> tuple[float, str, str]:
-    """A coefficient as people read it: factor, unit, and over which way; order 1 of a Legendre series as its change over the stroke."""
+    """Display of a coefficient: factor, unit, and the length it refers to; order 1 of a Legendre series as its change over the stroke."""
     size, unit = (1e3, "µm") if term.order > 0 and term.component < 3 else (1e6, "µrad")
     return (2.0 * size, unit, " over the stroke") if term.order else (size, unit, "")
 

@@ -25,8 +25,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, term_values
 from abbe.models.machine import Machine
 from abbe.models.solvers.designs import unit_columns
-from abbe.models.solvers.identifiability import EFFECTIVE_TOLERANCE, HIDDEN, RANK_TOLERANCE, project_out, taking_part
-from abbe.models.solvers.least_squares import svd
+from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, HIDDEN, RANK_TOLERANCE, project_out, svd, taking_part
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, bar_length_name, run_design, straight_line_of
 
@@ -289,7 +288,7 @@ class ParameterStatus:
 
 @dataclass(frozen=True, slots=True)
 class Correlation:
-    """Two unknowns whose errors go together: ``r`` above 0.9 in magnitude."""
+    """Two unknowns with correlated errors: ``r`` above 0.9 in magnitude."""
 
     first: str
     second: str
@@ -313,7 +312,7 @@ class MotionStatus:
 
 
 def status_of(share: float, *, hidden: bool) -> Status:
-    """Word for a share of information from the readings."""
+    """Status for a share of information from the readings."""
     if hidden or share < SEEN:
         return "not observable"
     return "observed" if share >= OBSERVED else "weak"

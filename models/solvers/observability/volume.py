@@ -1,7 +1,7 @@
-"""How well the deviation is known at every point of the volume, and one number for it.
+"""Uncertainty of the deviation at every point of the volume, and one number for the whole.
 
 All figures are of the deviation without the best-fit rigid motion over the inner 80 % of the strokes: where the workpiece lies is no
-property of the machine. Three standard deviations belong to a point: what a typical machine has (prior), what is left after the runs
+property of the machine. Three standard deviations belong to a point: what a typical machine has (prior), what remains after the runs
 (posterior), and what one micrometre of reading noise makes of it (noise gain).
 """
 

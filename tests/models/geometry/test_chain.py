@@ -8,7 +8,7 @@ from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import all_chains, design, deviation_mm, exact_deviation_mm, travel_sign
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import AXES, Machine, levers_mm, split_chain
-from abbe.models.solvers.identifiability import analyse
+from abbe.models.solvers.least_squares import analyse
 from tests.experiments.mathematics.presets import PRESETS, preset
 
 STROKE = np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]])
@@ -46,7 +46,7 @@ def test_rank_of_a_full_vector_map_with_one_tool_is_that_of_the_specification(de
     points = volume_grid(m.stroke_mm, 6)
     full = design(m, terms, points)
     rigid = np.eye(3)[None].repeat(len(points), 0)
-    from abbe.models.solvers.identifiability import project_out
+    from abbe.models.solvers.least_squares import project_out
 
     a = project_out(full.reshape(-1, len(terms)), rigid.reshape(-1, 3))
     found = analyse(tuple(t.name for t in terms), a)

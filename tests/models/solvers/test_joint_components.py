@@ -6,8 +6,7 @@ from numpy.polynomial import legendre
 from scipy import stats
 
 from abbe.models.geometry.bases import smooth_terms
-from abbe.models.solvers.components import Components, FittedComponents, cautious, estimate, posterior, slope
-from abbe.models.solvers.information import InformationSums
+from abbe.models.solvers.components import Components, FittedComponents, InformationSums, cautious, estimate, posterior, slope
 from abbe.models.solvers.priors import SMALLEST_BEND, Priors, SizeModel, size_model, smooth_shapes
 from tests.models.solvers.truth import MACHINE
 

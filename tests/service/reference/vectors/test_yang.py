@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.paths.helix import helix_points
 from abbe.models.solvers.helix import fit_helix, helix_design
-from abbe.models.solvers.identifiability import analyse
+from abbe.models.solvers.least_squares import analyse
 from abbe.service.reference.vector_results import check_file
 from tests.service.reference.vectors.altering import load, missed, read
 
