@@ -11,7 +11,9 @@ import asyncio
 import os
 import signal
 import socket
+import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -27,7 +29,6 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board, BoardWatch, SnapshotSource, StatePublisher, VerifiedWatch
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns, may, may_measure
-from abbe.service.core.process import OpenPushReader, cut_off_now, leave_now, notify
 from abbe.service.core.push_recovery import PushRecovery, push_is_open
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.core.table_watch import TableWatch
@@ -57,6 +58,10 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("abbe.serve")
 
+JOURNAL_S = 0.25
+"""Longest time to read the push journal before a forced end, s."""
+OpenPushReader = Callable[[], str]
+"""Return the open push as a sentence; empty: none."""
 STOP_S = 4.5
 """The process promises to end within 5 s of the signal; after this it is cut off. The store survives that."""
 LEAVE_S = 0.3
@@ -317,3 +322,33 @@ def _admins(url: str) -> int:
         return 0
     with Store.open(url) as store:
         return store.people.active_admins()
+
+
+def cut_off_now(readers: list[OpenPushReader]) -> None:
+    """End the process. The axes have stopped already, and the push journal is written before each step that it permits: nothing is lost."""
+    texts: list[str] = []
+    for one in readers:  # in a thread of its own: a database that hangs must not delay the end
+        reading = threading.Thread(target=lambda read=one: texts.append(read()), daemon=True)
+        reading.start()
+        reading.join(JOURNAL_S)
+    log.error("stop timeout; ending the process", open_push=texts[0] if texts else "the journal could not be read")
+    leave_now(1)
+
+
+def leave_now(code: int) -> None:
+    """End the process at once, after flushing its output."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def notify(state: str) -> None:
+    """Notify systemd (``sd_notify``). Does nothing without systemd."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    if address.startswith("@"):
+        address = "\0" + address[1:]
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+        channel.connect(address)
+        channel.send(state.encode())

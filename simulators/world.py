@@ -11,8 +11,7 @@ from abbe.simulators.hidden.live import live_of
 from abbe.simulators.laser.device import RATE_HZ, LaserDevice
 from abbe.simulators.scenario import Magnitudes, Scenario
 from abbe.simulators.truth.draws import UM, Draws, draw_machine
-from abbe.simulators.truth.machine import Geometry, Machine
-from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.machine import Geometry, Machine, Play
 from abbe.simulators.truth.surroundings import Air, drift
 
 # Each box was switched on at its own time: no two clocks agree.

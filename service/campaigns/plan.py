@@ -35,11 +35,11 @@ Minutes = Annotated[float, Field(ge=0.0, le=1440.0)]
 Length = Annotated[float, Field(ge=10.0, le=2000.0)]
 
 
-class _Table(BaseModel):
+class _TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-class SetupTable(_Table):
+class SetupTable(_TomlTable):
     """``[setup]``: minutes that a person needs."""
 
     cup_min: Minutes = USUAL.cup
@@ -48,7 +48,7 @@ class SetupTable(_Table):
     diagonal_min: Minutes = USUAL.diagonal
 
 
-class InstrumentsFile(_Table):
+class InstrumentsFile(_TomlTable):
     """Available instruments; an omitted key keeps its default."""
 
     bar_lengths_mm: tuple[Length, ...] = BAR_LENGTHS_MM

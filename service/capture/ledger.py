@@ -140,7 +140,7 @@ Item = tuple[int, BarBatch] | tuple[str, dict[str, Any]]
 
 
 @dataclass(slots=True)
-class _Stream:
+class _OpenStream:
     number: int
     next_seq: int = 0
     last_us: int | None = None
@@ -154,7 +154,7 @@ class Drafter:
         self._run, self._offset_s = run, utc_offset_s
         self._numbers: dict[str, int] = {}
         self._counts: dict[str, int] = {}
-        self._stream = _Stream(-1)
+        self._stream = _OpenStream(-1)
 
     @property
     def last_seq(self) -> int:
@@ -190,7 +190,7 @@ class Drafter:
                     found += self._chunks(batches)
                     batches = []
                 if stream != self._stream.number:
-                    self._stream = _Stream(stream)
+                    self._stream = _OpenStream(stream)
                 if batch.missing:
                     found.append(self._gap(batch))
                 batches.append(batch)
@@ -210,7 +210,7 @@ class Drafter:
 
     def lost(self, cause: str, last: int | None, after_us: int | None, stream: int | None = None) -> Record:
         """Return the record of a gap from the next expected number on, in the current stream or a later one without drafts."""
-        at = self._stream if stream in (None, self._stream.number) else _Stream(int(stream or 0))
+        at = self._stream if stream in (None, self._stream.number) else _OpenStream(int(stream or 0))
         if last is not None and last < at.next_seq:  # the numbers went back: the end is unknown
             last = None
         return self.gap_record(SampleGap(max(0, at.number), at.next_seq, last, cause, at.last_us, after_us))

@@ -154,7 +154,7 @@ def recover_segments(store: Store, settings: CaptureSettings) -> list[RecoveredR
     return found
 
 
-class _Runs:
+class _KnownRuns:
     """Runs by number, each loaded on demand: a month's runs with their documents take 100 MB."""
 
     def __init__(self, store: Store) -> None:
@@ -171,19 +171,19 @@ def _in_folder(store: Store, folder: Path, settings: CaptureSettings, *, only_ou
     """Recover the segments of one folder; ``only_ours``: only those of runs of this database."""
     if not folder.is_dir() or not any(folder.glob(f"*{SUFFIX}")):
         return []
-    known = _Runs(store)
+    known = _KnownRuns(store)
     if only_ours and not any(_is_ours(path, known) for path in folder.glob(f"*{SUFFIX}")):
         return []
     with exclusive_lock(folder / LOCK_NAME) as locked:
         if not locked:
             return [RecoveredRun(0, "", 0, 0, f"another process is recovering {folder}; nothing was done here")]
         paths = [path for path in sorted(folder.glob(f"*{SUFFIX}")) if not only_ours or _is_ours(path, known)]
-        known = _Runs(store)  # reload: another process may have closed some
+        known = _KnownRuns(store)  # reload: another process may have closed some
         found = (_recover_one(store, path, known, settings) for path in paths)
         return [one for one in found if one is not None]
 
 
-def _is_ours(path: Path, known: _Runs) -> bool:
+def _is_ours(path: Path, known: _KnownRuns) -> bool:
     """Whether a segment belongs to a run of this database, by number, name and start time."""
     try:
         records = read_segment(path).records
@@ -206,7 +206,7 @@ def _read(path: Path) -> Scan:
     return scan(path.read_bytes())  # not mapped: a truncation of the file, or a bad sector, would kill the process
 
 
-def _recover_one(store: Store, path: Path, known: _Runs, settings: CaptureSettings) -> RecoveredRun | None:
+def _recover_one(store: Store, path: Path, known: _KnownRuns, settings: CaptureSettings) -> RecoveredRun | None:
     number = path.stem.rpartition("-")[2]
     if not number.isdecimal() or path.name != segment_path(path.parent, int(number)).name:
         return _aside(path, CONFLICT, None, "it has the name of no segment")

@@ -162,8 +162,8 @@ class Serving:
 
 
 @dataclass(frozen=True, slots=True)
-class Heartbeat:
-    """Heartbeat: the event loop of the web process runs."""
+class WebHeartbeat:
+    """The event loop of the web process runs."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["alive"]
@@ -236,7 +236,7 @@ class PushNow:
 
 CoreRequest = StartJob | SteerJob | ConfirmPrompt | RollBack | PushNow
 """Requests that the core answers with an `Answer`."""
-FromWeb = Serving | Heartbeat | CoreRequest
+FromWeb = Serving | WebHeartbeat | CoreRequest
 
 FROM_CORE: TypeAdapter[FromCore] = TypeAdapter(Annotated[FromCore, Field(discriminator="kind")])
 FROM_WEB: TypeAdapter[FromWeb] = TypeAdapter(Annotated[FromWeb, Field(discriminator="kind")])

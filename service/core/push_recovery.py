@@ -20,7 +20,7 @@ from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse
 from abbe.service.scheduler import record
-from abbe.service.scheduler.loop import Alarms
+from abbe.service.scheduler.loop import AlarmSink
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
@@ -51,7 +51,7 @@ class PushRecovery:
         Asked after everything was closed.
     claim : MachineClaim
         Claims the machine during a try, so that no check starts.
-    alarms : Alarms
+    alarms : AlarmSink
         Gets each new reason for a failure.
     attention : list of str
         Texts on the page until the recovery succeeds.
@@ -64,7 +64,7 @@ class PushRecovery:
         recover: Recover,
         is_open: IsOpen,
         claim: MachineClaim,
-        alarms: Alarms,
+        alarms: AlarmSink,
         attention: MutableSequence[str],
         clock: Clock,
         changed: Callable[[], None],

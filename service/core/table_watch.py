@@ -18,7 +18,7 @@ from abbe.service.clock import Clock
 from abbe.service.devices.machine_lock import lock_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import AbbeError, TableMismatch
-from abbe.service.scheduler.loop import Alarms
+from abbe.service.scheduler.loop import AlarmSink
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables import table_gate
@@ -104,7 +104,7 @@ class TableWatch:
     ----------
     look : LookAtTable
         One look; raises errors of devices and store.
-    alarms : Alarms
+    alarms : AlarmSink
         Gets each unknown table once.
     attention : list of str
         Texts on the page until the table is one that Abbe knows.
@@ -113,7 +113,7 @@ class TableWatch:
     """
 
     def __init__(
-        self, look: LookAtTable, alarms: Alarms, attention: MutableSequence[str], clock: Clock, changed: Callable[[], None]
+        self, look: LookAtTable, alarms: AlarmSink, attention: MutableSequence[str], clock: Clock, changed: Callable[[], None]
     ) -> None:
         self._look, self._alarms, self._attention = look, alarms, attention
         self._clock, self._changed = clock, changed

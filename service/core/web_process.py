@@ -23,7 +23,6 @@ from abbe.service.channel.messages import (
     Begin,
     ConfirmPrompt,
     CoreRequest,
-    Heartbeat,
     Jobs,
     LivePath,
     LiveSamples,
@@ -33,6 +32,7 @@ from abbe.service.channel.messages import (
     Snapshot,
     StartJob,
     SteerJob,
+    WebHeartbeat,
     Wire,
     from_web,
 )
@@ -276,7 +276,7 @@ class WebProcess:
                     answer = await self._answered(message)
                     wire.send(Jobs("jobs", self._jobs.latest()))  # first: a client that gets a job's number can ask for it
                     wire.send(answer)
-                case Heartbeat():
+                case WebHeartbeat():
                     pass
 
     async def _answered(self, message: CoreRequest) -> Answer:

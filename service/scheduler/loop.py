@@ -39,7 +39,7 @@ RunSlot = Callable[[Schedule, datetime], Awaitable[str]]
 """``await run(schedule, slot)``: runs the check of a slot; returns the state to record for it."""
 
 
-class Alarms(Protocol):
+class AlarmSink(Protocol):
     """Recipient of the scheduler's own alarms."""
 
     async def alarm(self, doc: Doc) -> None:
@@ -86,7 +86,7 @@ class Scheduler:
         Remembers slots across restarts; its ``claim`` makes each of them run once.
     run_slot : callable
         ``await run_slot(schedule, slot)`` returns the state to record for the slot.
-    alarms : Alarms
+    alarms : AlarmSink
         Gets missed and skipped slots and clock jumps.
     terms : LoopTerms, optional
         Maintenance windows, preconditions, pace.
@@ -97,7 +97,7 @@ class Scheduler:
         schedules: Sequence[Schedule],
         ledger: SlotLedger,
         run_slot: RunSlot,
-        alarms: Alarms,
+        alarms: AlarmSink,
         clock: Clock,
         terms: LoopTerms | None = None,
     ) -> None:

@@ -11,8 +11,7 @@ from abbe.simulators.arrays import F
 from abbe.simulators.laser.device import Mount
 from abbe.simulators.scenario import Scenario
 from abbe.simulators.truth.draws import UM, URAD, Draws, draw_machine, generator
-from abbe.simulators.truth.machine import Geometry, Machine
-from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.machine import Geometry, Machine, Play
 from abbe.simulators.truth.surroundings import drift
 
 STREAM_SETUP, STREAM_NOISE, STREAM_LENGTH, STREAM_SCALE = range(20, 24)

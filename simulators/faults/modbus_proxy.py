@@ -10,8 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from abbe.simulators.faults.modbus_frames import MBAP, RTU, Cutter
-from abbe.simulators.faults.modbus_toxics import Act, Toxics
+from abbe.simulators.faults.modbus_toxics import MBAP, RTU, Act, Cutter, Toxics
 from abbe.simulators.faults.scenario import Fault, FaultScenario, load
 
 _CONNECTION_KINDS = ("accept_then_close", "one_socket", "kick_oldest")

@@ -3,8 +3,7 @@
 import asyncio
 from pathlib import Path
 
-from abbe.simulators.faults.modbus_frames import RTU, Cutter, Frame, answer, parts
-from abbe.simulators.faults.modbus_toxics import Act, Toxics
+from abbe.simulators.faults.modbus_toxics import RTU, Act, Cutter, Frame, Toxics, answer, parts
 from abbe.simulators.faults.scenario import FaultScenario
 from abbe.simulators.modbus_wire import RegisterMap
 from abbe.simulators.pseudo_serial import PseudoSerial

@@ -11,8 +11,7 @@ from abbe.simulators.ballbar.device import NO_BAR, OUT_OF_RANGE
 from abbe.simulators.ballbar.port import BAUD, Received
 from abbe.simulators.ballbar.wire import SERIAL_NO, START, WITH_SETTINGS_BCD, BallbarWire, Parser
 from abbe.simulators.faults.serial_bytes import Sample, cut, sample_of
-from abbe.simulators.faults.serial_line import FaultyLine
-from abbe.simulators.faults.serial_uart import Uart
+from abbe.simulators.faults.serial_line import FaultyLine, Uart
 from abbe.simulators.scenario import DEFAULT_PATH, load
 from abbe.simulators.world import World
 

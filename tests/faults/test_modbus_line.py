@@ -11,7 +11,7 @@ from abbe.drivers.errors import BadFrame, LinkDown
 from abbe.drivers.links.incidents import Backoff
 from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, parse_url
-from abbe.simulators.faults.modbus_frames import RTU, Frame, parts
+from abbe.simulators.faults.modbus_toxics import RTU, Frame, parts
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 from tests.experiments.campaigns.late_replies import AddressMap

@@ -10,8 +10,8 @@ from abbe.drivers.ballbar.frames import Bad, FrameDecoder
 from abbe.drivers.errors import LinkDown, LossyLine
 from abbe.simulators.faults.scenario import Fault, FaultScenarioError, load, scenario
 from abbe.simulators.faults.serial_bytes import cut, every_nth, sliced
+from abbe.simulators.faults.serial_line import Uart, heard
 from abbe.simulators.faults.serial_player import KINDS, play
-from abbe.simulators.faults.serial_uart import Uart, heard
 from tests.faults.serial_pure import honest
 from tests.faults.serial_rig import be_patient, stage
 

@@ -7,9 +7,8 @@ import sys
 
 import pytest
 
-from abbe.simulators.faults.modbus_frames import MBAP, RTU, Cutter, Frame, answer, crc16, parts
 from abbe.simulators.faults.modbus_proxy import ModbusProxy, refusing
-from abbe.simulators.faults.modbus_toxics import KINDS, Toxics
+from abbe.simulators.faults.modbus_toxics import KINDS, MBAP, RTU, Cutter, Frame, Toxics, answer, crc16, parts
 from abbe.simulators.faults.scenario import Fault, FaultScenario, FaultScenarioError, from_dict, load, scenario
 
 READ = Frame(1, bytes.fromhex("0300640002"), tid=7)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.machine import Play
 
 
 def test_lost_motion_and_hysteresis() -> None:

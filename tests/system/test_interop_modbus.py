@@ -26,7 +26,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc.device import Controller
 from abbe.simulators.cnc.wire import CncRegisters
-from abbe.simulators.faults.modbus_frames import crc16
+from abbe.simulators.faults.modbus_toxics import crc16
 from abbe.simulators.laser.wire import LaserRegisters
 from abbe.simulators.modbus_wire import ModbusRtu, ModbusTcp
 from abbe.simulators.scenario import MachineConfig, Scenario

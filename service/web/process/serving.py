@@ -13,7 +13,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.channel.messages import PROTOCOL, Begin, Heartbeat, Serving, Wire, from_core
+from abbe.service.channel.messages import PROTOCOL, Begin, Serving, WebHeartbeat, Wire, from_core
 from abbe.service.clock import SystemClock
 from abbe.service.errors import AbbeError, ChannelBroken
 from abbe.service.plant.gather import Gatherer
@@ -174,4 +174,4 @@ async def _send_heartbeats(wire: Wire, server: Server) -> None:
     wire.send(Serving("up", PROTOCOL))
     while True:
         await asyncio.sleep(ALIVE_S)
-        wire.send(Heartbeat("alive"))
+        wire.send(WebHeartbeat("alive"))

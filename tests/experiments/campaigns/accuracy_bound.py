@@ -19,7 +19,7 @@ from abbe.models.geometry.bases import Term, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.solvers.observe import run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors
-from abbe.simulators.truth.functions import draw
+from abbe.simulators.truth.draws import draw
 from tests.experiments.campaigns.population import Case
 
 ORDER = 12

@@ -102,7 +102,7 @@ async def _run(folder: Path, load: Load, progress: Callable[[str], None]) -> dic
     with Store.open(url) as store, ExitStack() as stack:
         campaign = store.campaigns.add(store.machines.add("M", {"name": "M"}), "load", {})
         run_id = store.runs.start(campaign, "r01", "ballbar_helix", "identify", {})
-        box = _child(stack, "-m", "abbe.simulators.box_alone", "--link", str(folder / "box"), "--ledger", str(ledger), "--speed",
+        box = _child(stack, "-m", "abbe.simulators.ballbar_box", "--link", str(folder / "box"), "--ledger", str(ledger), "--speed",
                      str(load.speed), "--spoil-every", str(load.spoil_every),
                      "--buffer-kib", str(int(64 * max(1.0, load.speed))))  # fmt: skip
         locker = _child(stack, "-c", LOCK, str(folder / "abbe.sqlite3"), str(load.lock_s))

@@ -30,8 +30,8 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.links.incidents import Backoff
 from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl, parse_url
-from abbe.simulators.faults.modbus_frames import MBAP, Cutter, Frame, answer, parts
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
+from abbe.simulators.faults.modbus_toxics import MBAP, Cutter, Frame, answer, parts
 from abbe.simulators.faults.rtu_toxic import ToxicRtuLine
 from abbe.simulators.faults.scenario import Fault, FaultScenario, scenario
 

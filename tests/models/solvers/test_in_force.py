@@ -19,7 +19,7 @@ from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.simulators.campaign.sampler import Conditions, Rig
 from abbe.simulators.scenario import MachineConfig, Scenario
-from abbe.simulators.truth.play import Play
+from abbe.simulators.truth.machine import Play
 from abbe.simulators.truth.surroundings import drift
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"

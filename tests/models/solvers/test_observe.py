@@ -19,9 +19,8 @@ from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import linearise, perpendicular, predict, run_design, run_jacobian, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.simulators.scenario import MachineConfig
-from abbe.simulators.truth.machine import Geometry
+from abbe.simulators.truth.machine import Geometry, Play
 from abbe.simulators.truth.machine import Machine as TrueMachine
-from abbe.simulators.truth.play import Play
 
 STROKE = np.array([[0.0, 600.0], [-50.0, 450.0], [20.0, 470.0]])
 TERMS = smooth_terms(4)

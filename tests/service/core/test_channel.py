@@ -105,7 +105,7 @@ CORE = [
 ]
 WEB = [
     m.Serving("up", 1),
-    m.Heartbeat("alive"),
+    m.WebHeartbeat("alive"),
     m.StartJob("start", 1, "quick-check", "k", "user:bob"),
     m.SteerJob("steer", 2, "0" * 12, "pause", "x"),
     m.ConfirmPrompt("hand", 3, "0" * 12, 2, "user:bob"),

@@ -1,4 +1,4 @@
-"""``python -m abbe.simulators.box_alone``: only a ball-bar's box on a serial line, as fast as wanted, with its ledger in a file."""
+"""``python -m abbe.simulators.ballbar_box``: only a ball-bar's box on a serial line, as fast as wanted, with its ledger in a file."""
 
 import argparse
 import asyncio
@@ -23,7 +23,7 @@ RADIUS_MM = 100.0
 
 def main(argv: Sequence[str]) -> int:
     """Run until standard input ends or a signal comes; gives the exit code."""
-    parser = argparse.ArgumentParser(prog="abbe.simulators.box_alone", description="Only a ball-bar's box, on a pseudo terminal.")
+    parser = argparse.ArgumentParser(prog="abbe.simulators.ballbar_box", description="Only a ball-bar's box, on a pseudo terminal.")
     parser.add_argument("--link", type=Path, required=True, help="stable path of the serial line")
     parser.add_argument("--ledger", type=Path, required=True, help="file for the fate of every sample, written at every STOP")
     parser.add_argument("--speed", type=float, default=1.0, help="device seconds per second: 20 at 1000 Hz is 20 kHz")
