@@ -16,7 +16,7 @@ from abbe.service.runs.columns import path_progress
 from abbe.service.runs.pieces import ReadProgress
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.interlocks import Suspending, Watching, check_interlocks
-from abbe.service.sequences.journal import DONE, RUN, WAITS, Journal
+from abbe.service.sequences.journal import DONE, WAITS, Journal, RunLine, lines_of
 from abbe.service.sequences.needed import BEFORE_S
 from abbe.service.sequences.resume_plan import Attempt, PathRemainder, ResumeTrail, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
@@ -171,8 +171,8 @@ async def read_path(session: Session, store: Store, campaign: int, test: str, mo
     """Return how far the path of a test was read in a mounting; None if the ball-bar's box was restarted since."""
 
     def look() -> ReadProgress | None:
-        lines = (one.doc for one in store.checkpoints.of_campaign(campaign) if one.kind == RUN)
-        runs = [int(one["run"]) for one in lines if one["test"] == test and one["mounting"] == mounting]
+        lines = lines_of(store.checkpoints.of_campaign(campaign), RunLine)
+        runs = [one.run for one in lines if (one.test, one.mounting) == (test, mounting)]
         return path_progress(store, max(runs)) if runs else None
 
     found = await asyncio.to_thread(look) if session.ballbar is not None else None

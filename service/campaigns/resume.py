@@ -23,14 +23,12 @@ from abbe.service.campaigns.campaign_run import (
     resumed_item,
 )
 from abbe.service.devices.session import Session
-from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import RUNNING, CampaignRecord, CheckpointRecord
-from abbe.service.domain.owner import Owner
 from abbe.service.errors import PreconditionsChanged, UnsafeToMove
 from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
 from abbe.service.sequences.interlocks import check_interlocks, check_ours
-from abbe.service.sequences.journal import BEGUN, ENDED, HAND, RUN
+from abbe.service.sequences.journal import BEGUN, ENDED, BegunLine, HandLine, RunLine, lines_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import anew, remounted
 from abbe.service.sequences.steps import CampaignPlan
@@ -46,30 +44,30 @@ MOUNTS = ("MountBar", "MountLaser")
 class JournalEntries:
     """A campaign's journal: the latest ``begun`` line, the manual steps, and the lines of runs by run number."""
 
-    begun: Doc
+    begun: BegunLine
     ended: bool
-    hand: tuple[Doc, ...]
-    runs: dict[int, Doc]
+    hand: tuple[HandLine, ...]
+    runs: dict[int, RunLine]
 
 
 def read_journal(store: Store, campaign: CampaignRecord) -> JournalEntries:
     """Read the journal of a campaign. Raises PreconditionsChanged if there is none."""
     found: list[CheckpointRecord] = store.checkpoints.of_campaign(campaign.id)
-    begun = [one.doc for one in found if one.kind == BEGUN]
+    begun = lines_of(found, BegunLine)
     if not begun:
         raise PreconditionsChanged(
             f"campaign {campaign.name!r} has no journal",
             "it was imported, or measured by an older Abbe: measure it anew under another name",
         )
-    hand = tuple(one.doc for one in found if one.kind == HAND)
+    hand = tuple(lines_of(found, HandLine))
     last = max(k for k, one in enumerate(found) if one.kind == BEGUN)
     ended = any(one.kind == ENDED for one in found[last:])
-    return JournalEntries(begun[-1], ended, hand, {int(one.doc["run"]): one.doc for one in found if one.kind == RUN})
+    return JournalEntries(begun[-1], ended, hand, {one.run: one for one in lines_of(found, RunLine)})
 
 
 def begun_source(store: Store, name: str) -> RecipeSource:
     """Return the source of an interrupted campaign's plan. Raises PreconditionsChanged if the journal does not name it."""
-    source: Doc = read_journal(store, store.campaigns.find(name)).begun.get("source") or {}
+    source = read_journal(store, store.campaigns.find(name)).begun.source
     if "recipe" not in source:
         raise PreconditionsChanged(f"the journal of campaign {name!r} does not name its recipe", "give it: --recipe FILE.toml (or --helix)")
     return RecipeSource(**source)
@@ -91,7 +89,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     lines = read_journal(store, campaign)
     _same_plan(store, campaign, lines, site, plan)
     comp = await session.controller.comp_status()
-    expected = ExpectedTable(lines.begun["boot_id"], lines.begun["table_crc"])
+    expected = ExpectedTable(lines.begun.boot_id, lines.begun.table_crc)
     check_expected(expected, comp.boot_id, comp.bank_crc[comp.active_bank])
     messages = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
     status = await session.controller.status()
@@ -110,7 +108,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
 
 
 def _same_plan(store: Store, campaign: CampaignRecord, lines: JournalEntries, site: Site, plan: CampaignPlan) -> None:
-    owner = Owner(**lines.begun["owner"]) if "owner" in lines.begun else None
+    owner = lines.begun.owner
     if owner is not None and not lines.ended and not owner.is_gone():
         raise UnsafeToMove(f"campaign {campaign.name!r} is being measured (process {owner.pid} on {owner.host})", "wait until it has ended")
     for run in store.runs.all(campaign.id):
@@ -118,7 +116,7 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: JournalEntries, si
             raise UnsafeToMove(
                 f"run {run.label} of campaign {campaign.name} is being measured (process {run.owner.pid})", "wait until it has ended"
             )
-    if lines.begun["plan"] != plan_hash(plan):
+    if lines.begun.plan != plan_hash(plan):
         raise PreconditionsChanged(
             f"campaign {campaign.name!r} was begun with another recipe (or feed limit, or version of Abbe)",
             "resume with the original recipe, or measure a new campaign",
@@ -135,15 +133,15 @@ class _Finder:
     def __init__(self, store: Store, campaign: int, plan: CampaignPlan, lines: JournalEntries, states: dict[int, str]) -> None:
         self._store, self._campaign, self._lines, self._items = store, campaign, lines, items(plan)
         complete = {n: one for n, one in lines.runs.items() if states.get(n) == COMPLETE}
-        self.done = {str(one["test"]): n for n, one in complete.items()}
-        self.used = {(str(one["setup"]), int(one["mounting"])) for one in complete.values()}
+        self.done = {one.test: n for n, one in complete.items()}
+        self.used = {(one.setup, one.mounting) for one in complete.values()}
         self.mountings: dict[str, int] = {}
         self.mounted_us: dict[str, int] = {}
         for one in lines.hand:
-            setup, number = str(one["setup"]), int(one["mounting"])
+            setup, number = one.setup, one.mounting
             self.mountings[setup] = max(number, self.mountings.get(setup, 1))
-            if one["phase"] == "done" and one["what"] in MOUNTS:
-                self.mounted_us[setup if number == 1 else f"{setup}-{number}"] = int(one["ctrl_us"])
+            if one.phase == "done" and one.what in MOUNTS:
+                self.mounted_us[setup if number == 1 else f"{setup}-{number}"] = one.ctrl_us
 
     async def starts(self, session: Session, confirm: Confirm, messages: list[str]) -> dict[str, Item]:
         """Return the first remaining test of every begun set-up."""
@@ -156,11 +154,11 @@ class _Finder:
 
     async def _start(self, session: Session, item: Item, confirm: Confirm, messages: list[str]) -> Item:
         setup, number = item.setup, self.mountings[item.setup]
-        hand = [one for one in self._lines.hand if one["setup"] == setup and one["mounting"] == number]
+        hand = [one for one in self._lines.hand if (one.setup, one.mounting) == (setup, number)]
         why = ""
-        if hand[-1]["phase"] != "done":
+        if hand[-1].phase != "done":
             why = "its mounting was not confirmed as done"
-        elif hand[-1]["what"] == "Unmount":
+        elif hand[-1].what == "Unmount":
             why = "it was cleared away"
         else:
             item = await self._in_place(session, item, number, hand[-1])
@@ -181,10 +179,10 @@ class _Finder:
         messages.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
         return item
 
-    async def _in_place(self, session: Session, item: Item, number: int, last: Doc) -> Item:
+    async def _in_place(self, session: Session, item: Item, number: int, last: HandLine) -> Item:
         """Return the test from its last checkpoint, in the present mounting."""
         label = item.test.label
-        mounted_it = any(one["test"] == label and one["mounting"] == number and one["what"] in MOUNTS for one in self._lines.hand)
+        mounted_it = any((one.test, one.mounting) == (label, number) and one.what in MOUNTS for one in self._lines.hand)
         if number > 1 and mounted_it:
             whole = remounted(item.test, item.first, number)
             item = Item(item.test, item.first, whole, whole, number)
@@ -192,13 +190,13 @@ class _Finder:
             item = (
                 in_mounting(item, number) if number > 1 else Item(item.test, item.first, anew(item.test, 1), item.test, before=item.before)
             )
-        hand = int(last["step"]) if last["test"] == label else None
+        hand = last.step if last.test == label else None
         records = self._records(label, number) if await counting(session) else ()
         return resumed_item(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
 
     def _records(self, label: str, number: int) -> tuple[dict[str, Any], ...]:
         """Return the laser records of the last run of a test in this mounting."""
-        runs = [n for n, one in self._lines.runs.items() if one["test"] == label and one["mounting"] == number]
+        runs = [n for n, one in self._lines.runs.items() if (one.test, one.mounting) == (label, number)]
         if not runs:
             return ()
         return tuple(record for chunk in self._store.chunks.of_run(max(runs), LASER_CHANNEL) for record in decode_json(chunk.payload))

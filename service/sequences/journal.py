@@ -10,11 +10,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from abbe.service.capture.ingest import may_pass
 from abbe.service.capture.recorder import CATCH_UP_S
+from abbe.service.domain.document import Doc, record
 from abbe.service.domain.measured import CheckpointRecord
+from abbe.service.domain.owner import Owner
 from abbe.service.errors import StoreError
 from abbe.service.storage.store import Store
 
@@ -22,6 +24,69 @@ BEGUN, HAND, RUN, POINT, DONE, WAITS, GOES_ON, ENDED = "begun", "hand", "run", "
 INCIDENT = "incident"
 DETECTED, OUTCOME = "detected", "outcome"
 """The two lines of an incident: its detection and its outcome."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BegunLine:
+    """A process began to measure a campaign: hash and source of the plan, start of the controller, active table."""
+
+    plan: str
+    source: Doc = field(default_factory=dict)
+    boot_id: int = 0
+    table_crc: int = 0
+    owner: Owner | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HandLine:
+    """A manual step of a test: ``phase`` is "asked" or "done"; ``what``: class of the step; ``ctrl_us``: when it was done."""
+
+    test: str
+    setup: str
+    mounting: int
+    step: int
+    what: str
+    phase: str
+    ctrl_us: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunLine:
+    """A run of a test was opened in a mounting of its set-up."""
+
+    run: int
+    test: str
+    setup: str
+    mounting: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IncidentLine:
+    """A link failed (`DETECTED`) or recovered (`OUTCOME`, with its ``state`` and the number of single errors)."""
+
+    link: str
+    device: str
+    code: str
+    text: str
+    phase: str
+    run: str
+    state: str = ""
+    times: int = 1
+
+
+Line = TypeVar("Line", BegunLine, HandLine, RunLine, IncidentLine)
+_KINDS: dict[type[Any], str] = {BegunLine: BEGUN, HandLine: HAND, RunLine: RUN, IncidentLine: INCIDENT}
+
+
+def lines_of(journal: Iterable[CheckpointRecord], kind: type[Line]) -> list[Line]:
+    """All lines of one kind, oldest first.
+
+    Raises
+    ------
+    Unusable
+        Another version wrote a line in another form.
+    """
+    return [record(kind, one.doc, "the campaign's journal") for one in journal if one.kind == _KINDS[kind]]
 
 
 LONGEST_S = CATCH_UP_S
@@ -89,19 +154,17 @@ class Trouble:
 def troubles(journal: Iterable[CheckpointRecord]) -> list[Trouble]:
     """Group the incidents of a journal by link, device and code, in order of first occurrence."""
     found: dict[tuple[str, str, str], Trouble] = {}
-    for one in journal:
-        if one.kind == INCIDENT:
-            doc = one.doc
-            key = (str(doc["link"]), str(doc["device"]), str(doc["code"]))
-            trouble = found.setdefault(key, Trouble(*key))
-            trouble.last = str(doc["text"])
-            if doc["phase"] == DETECTED:
-                trouble.times += 1
-            elif doc["phase"] == OUTCOME:
-                trouble.ends[str(doc["state"])] = trouble.ends.get(str(doc["state"]), 0) + 1
-                trouble.errors += int(doc.get("times", 1))
-            if doc["run"] not in trouble.runs:
-                trouble.runs.append(str(doc["run"]))
+    for line in lines_of(journal, IncidentLine):
+        key = (line.link, line.device, line.code)
+        trouble = found.setdefault(key, Trouble(*key))
+        trouble.last = line.text
+        if line.phase == DETECTED:
+            trouble.times += 1
+        elif line.phase == OUTCOME:
+            trouble.ends[line.state] = trouble.ends.get(line.state, 0) + 1
+            trouble.errors += line.times
+        if line.run not in trouble.runs:
+            trouble.runs.append(line.run)
     for trouble in found.values():
         if (missing := trouble.times - sum(trouble.ends.values())) > 0:
             trouble.ends[UNKNOWN] = missing

@@ -33,6 +33,7 @@ from abbe.service.verification.verified_by import verified_by
 from tests.faults.sequencer_world import Bench, bench
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
 from tests.push.test_bad_tables_on_the_wire import tables
+from tests.run_documents import runs_of
 
 pytestmark = pytest.mark.timeout(120)
 HERE, THERE = "modbus+tcp://10.0.0.6:502", "modbus+tcp://10.0.0.7:502"
@@ -142,18 +143,18 @@ async def test_unverified_is_looked_up_over_all_journals_and_no_later_base_makes
 async def test_a_report_gives_no_verdict_on_an_unverified_table(store: Store) -> None:
     await pushed(store, "a", (OLD, NEW), UP_TO_ACTIVE, HERE)
     crc = next(iter(known_tables(store).unverified))
-    said = table_remarks(store, "a", [{"table": {"crc": crc, "bank": 1, "acting": True}}])
+    said = table_remarks(store, "a", runs_of([{"table": {"crc": crc, "bank": 1, "acting": True}}]))
     sign, word, text = said.verdict(("ok", "Within limits", "By the limits."))
     assert (sign, word) == ("bad", "Unverified table")
     assert "push 1 of machine 'a'" in text
-    strange = table_remarks(store, "a", [{"table": {"crc": 5, "acting": True}}, {"table": {"crc": 6, "acting": False}}])
+    strange = table_remarks(store, "a", runs_of([{"table": {"crc": 5, "acting": True}}, {"table": {"crc": 6, "acting": False}}]))
     assert strange.remarks == ("measured with a table that this database did not push (CRC 00000005): not accepted",)
     assert strange.verdict(("ok", "Within limits", "By the limits.")) == ("ok", "Within limits", "By the limits.")
 
 
 async def test_a_report_names_a_table_that_was_verified_on_another_machine(store: Store) -> None:
     await pushed(store, "a", (OLD, ACTING), KEPT, HERE)
-    used = [{"table": {"crc": crc32(ACTING), "acting": True}}]
+    used = runs_of([{"table": {"crc": crc32(ACTING), "acting": True}}])
     assert table_remarks(store, "a", used).remarks == ()
     remark = f"measured with a table (CRC {crc32(ACTING):08X}) that was verified on machine 'a' (push 1), not on this one"
     assert table_remarks(store, "b", used).remarks == (f"{remark}: not accepted",)
@@ -370,7 +371,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             told = JournalView.read(store, site.name).history()
             assert (told.now.how, told.pushes, f"{told.now.crc:08X}") == ("accepted", (), crc)
             await accept(controller, store, site, "eve")  # the same word by `abbe accept-table`
-            used = [{"table": {"crc": int(crc, 16), "acting": True}}]
+            used = runs_of([{"table": {"crc": int(crc, 16), "acting": True}}])
             assert "accepted by eve at " in table_remarks(store, site.name, used).remarks[0]
             assert table_remarks(store, "lathe", used).remarks == (
                 f"measured with a table (CRC {crc}) that was accepted on machine 'sim', not on this one: not accepted",

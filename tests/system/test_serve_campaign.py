@@ -159,7 +159,7 @@ def test_somebody_at_the_page_is_led_to_a_proposal(tmp_path: Path) -> None:
         assert http.get(f"/proposal?id={done['proposal']}", headers=who["mia"]).status_code == 200
         assert running.terminate()[0] == 0
     with Store.open(url) as store:
-        assert begun_source(store, first)["recipe"] == "identification"
+        assert begun_source(store, first).recipe == "identification"
         proposed = load(store, done["proposal"])
         assert (proposed.by, proposed.solution_id) == ("mia", done["solution"])
         assert proposal_status(store, done["proposal"], proposed, SystemClock().utc().timestamp()).word == "proposed"
