@@ -58,6 +58,7 @@ def main(argv: Sequence[str]) -> int:
 def _serve(argv: Sequence[str]) -> int:
     parser = _parser("simulators", "Simulated machine tool with ball-bar, laser, controller and fixture on real wires (127.0.0.1 only).")
     parser.add_argument("--speed", type=float, help="simulated seconds per second")
+    parser.add_argument("--boot-id", type=int, help="boot identity of the controller (default: another at each start)")
     parser.add_argument("--link-dir", type=Path, help="directory for stable links to the serial lines")
     parser.add_argument("--watch-stdin", action="store_true", help="end when standard input ends")
     parser.add_argument("--ballbar", choices=("pty", "tcp"), help="transport of the ball-bar")
@@ -71,7 +72,7 @@ def _serve(argv: Sequence[str]) -> int:
 def _overridden(scenario: Scenario, options: argparse.Namespace) -> Scenario:
     """Scenario with the options of the command line applied."""
     changes: dict[str, Any] = {}
-    for name in ("seed", "speed"):
+    for name in ("seed", "speed", "boot_id"):
         if getattr(options, name) is not None:
             changes[name] = getattr(options, name)
     for device in ("ballbar", "laser", "cnc", "fixture"):

@@ -105,10 +105,14 @@ class HiddenConfig:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit."""
+    """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit.
+
+    ``boot_id``: of the controller; 0: another at each start, as of a controller that was switched off in between.
+    """
 
     seed: int = 1
     speed: float = 1.0
+    boot_id: int = 0
     machine: MachineConfig = field(default_factory=MachineConfig)
     magnitudes: Magnitudes = field(default_factory=Magnitudes)
     ballbar: BallbarConfig = field(default_factory=BallbarConfig)
@@ -151,6 +155,8 @@ def check(scenario: Scenario) -> None:
         raise ScenarioError("speed: must be above 0")
     if scenario.seed < 0:
         raise ScenarioError("seed: must not be negative")
+    if not 0 <= scenario.boot_id < 2**32:
+        raise ScenarioError("boot_id: must have 32 bits")
     for name, value, allowed in (
         ("ballbar.transport", scenario.ballbar.transport, ("pty", "tcp")),
         ("laser.transport", scenario.laser.transport, ("tcp", "rtu")),

@@ -70,7 +70,7 @@ class Site:
         self._port = port
         self._plugged = False
         self.box = BallbarWire(self.world.ballbar, port, secrets.randbits(32), lambda: self.world.time_s)
-        self.registers = cnc = CncRegisters(self.world.controller, secrets.randbits(32), self.advance)
+        self.registers = cnc = CncRegisters(self.world.controller, scenario.boot_id or secrets.randbits(32), self.advance)
         laser = LaserRegisters(
             self.world.laser, secrets.randbits(32), self.advance, self.world.tool_position, clock_offset_us=LASER_CLOCK_US
         )

@@ -17,11 +17,9 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.registry import open_controller
-from abbe.service.config import load_machine
-from abbe.service.site import site_of
 from abbe.service.storage.store import Store
-from tests.pretended import as_if_commissioned_at
 from tests.scenarios.conftest import ABBE, Sims, simulated
+from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import one_line, position_and_counters, registers, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
@@ -29,15 +27,10 @@ pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 
 @pytest.fixture(scope="module")
 def identified(tmp_path_factory):
-    """A simulated machine and the campaigns `june` (identification) and `start` (verification), measured once for all tests here."""
+    """A simulated machine and the campaigns `june` (identification) and `start` (verification), measured once for all tests."""
     folder = tmp_path_factory.mktemp("identified")
-    with simulated(folder, "--speed", "60") as sims:
-        site = site_of(load_machine(sims.machine_file).machine)
-        with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-            asyncio.run(as_if_commissioned_at(sims.ready["cnc"], store, site))
-        for recipe, name in (("identification", "june"), ("verification", "start")):
-            words = [*ABBE, "measure", str(sims.machine_file), "--recipe", recipe, "--name", name]
-            subprocess.run(words, check=True, timeout=120, capture_output=True)
+    copy_identified(tmp_path_factory, folder)
+    with simulated(folder, *MACHINE, "--speed", "60") as sims:
         yield sims
 
 

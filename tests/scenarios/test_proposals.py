@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 
-from abbe.service.campaigns.measure import measure
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.correct import Correction, push
@@ -31,18 +30,14 @@ from abbe.service.domain.service_records import AlarmKind
 from abbe.service.errors import StoreError, TableRefused
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import Watching
-from abbe.service.sequences.recipes.campaigns import identification, verification
-from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
-from tests.pretended import as_if_commissioned
 from tests.scenarios.conftest import Sims, simulated
+from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import registers
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
-RATE_HZ = 50
-SIMS = ("--speed", "80", "--seed", "2")
 TWO = "[limits]\ntwo_people = true\n"
 
 
@@ -74,23 +69,13 @@ class Shop:
         return store.proposals.add(one.machine, one.solution_id, one.doc, one.digest)
 
 
-async def measured(site: Site, store: Store) -> None:
-    full = identification(site.machine, rate_hz=RATE_HZ, name="june")
-    tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
-    site = replace(site, watching=Watching(unknown_s=5.0))
-    async with open_session(site.urls) as session:
-        await as_if_commissioned(session.controller, store, site)
-        await measure(session, store, site, CampaignPlan("june", tests), progress=ignore_progress)
-        await measure(session, store, site, verification(site.machine, rate_hz=RATE_HZ, name="start"), progress=ignore_progress)
-
-
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with simulated(tmp_path_factory.mktemp("proposals"), *SIMS, extra=TWO) as sims:
+    folder = tmp_path_factory.mktemp("proposals")
+    copy_identified(tmp_path_factory, folder)
+    with simulated(folder, *MACHINE, "--speed", "80", extra=TWO) as sims:
         loaded = load_machine(sims.machine_file)
         site = site_of(loaded.machine)
-        with Store.open(loaded.database_url) as store:
-            asyncio.run(measured(site, store))
         before = controller_words(sims)
         code = run(["comp", "propose", str(sims.machine_file), "june"])
         yield Shop(sims, site, loaded.database_url, before, code)
@@ -243,7 +228,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
 
 
 def test_a_restarted_control_with_the_same_table_and_generation_is_refused(shop, tmp_path):
-    with simulated(tmp_path, *SIMS) as restarted, Store.open(shop.url) as store:
+    with simulated(tmp_path, *MACHINE, "--boot-id", "0", "--speed", "80") as restarted, Store.open(shop.url) as store:
         number = shop.copy(store)
         approve(store, number, "anna", 24.0, SystemClock())
         before = controller_words(restarted)

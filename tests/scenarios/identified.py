@@ -1,0 +1,50 @@
+"""One identification and one verification of a simulated machine, measured once in a run of the tests for all files that begin there."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from abbe.service.campaigns.measure import measure
+from abbe.service.config import load_machine
+from abbe.service.devices.session import open_session
+from abbe.service.domain.progress import ignore_progress
+from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.recipes.campaigns import identification, verification
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, site_of
+from abbe.service.storage.store import Store
+from tests.built_once import once_per_run
+from tests.pretended import as_if_commissioned
+from tests.scenarios.conftest import simulated
+
+MACHINE = ("--seed", "2", "--boot-id", "20260601")
+"""The simulated machine; its controller counts as switched on all the time."""
+RATE_HZ = 50
+
+
+def copy_identified(factory: pytest.TempPathFactory, folder: Path) -> None:
+    """Put the campaigns `june` (identification) and `start` (verification) of `MACHINE` into the database of a folder."""
+    made, _ = once_per_run(factory, "identified", _identify)
+    shutil.copytree(made, folder, dirs_exist_ok=True, ignore=lambda _, names: [n for n in names if not n.startswith("abbe.sqlite3")])
+
+
+def _identify(folder: Path) -> None:
+    with simulated(folder, *MACHINE, "--speed", "80") as sims:
+        loaded = load_machine(sims.machine_file)
+        with Store.open(loaded.database_url) as store:
+            asyncio.run(_measure(site_of(loaded.machine), store))
+
+
+async def _measure(site: Site, store: Store) -> None:
+    full = identification(site.machine, rate_hz=RATE_HZ, name="june")
+    tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
+    site = replace(site, watching=Watching(unknown_s=5.0))
+    async with open_session(site.urls) as session:
+        await as_if_commissioned(session.controller, store, site)
+        await measure(session, store, site, CampaignPlan("june", tests), progress=ignore_progress)
+        await measure(session, store, site, verification(site.machine, rate_hz=RATE_HZ, name="start"), progress=ignore_progress)
