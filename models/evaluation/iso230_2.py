@@ -20,7 +20,7 @@ POSITIONS = 5
 
 @dataclass(frozen=True, slots=True)
 class Approaches:
-    """What was read at the positions of one axis (or of a diagonal).
+    """Readings at the positions of one axis (or of a diagonal).
 
     ``position_mm``: shape (m,), growing; ``forward_mm`` and ``backward_mm``: deviations (m, n), NaN where an approach is missing.
     """
@@ -50,7 +50,7 @@ class Approaches:
 
 @dataclass(frozen=True, slots=True)
 class ScaleBudget:
-    """What the repeats do not show. Standard uncertainties.
+    """Standard uncertainties that the repeats do not show.
 
     ``per_length``: of the length scale, mm per mm (wavelength, expansion of the scales); ``reading_mm``: of the mean of a position, common
     to none of the others (resolution, drift of the environment).
@@ -70,7 +70,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Positioning:
-    """Everything ISO 230-2 says of a bidirectional test. Arrays have the shape (m,); ``None``: one cycle alone has no scatter.
+    """All figures of ISO 230-2 of a bidirectional test. Arrays have the shape (m,); ``None``: one cycle has no scatter.
 
     ``mean_forward_mm``, ``mean_backward_mm``, ``mean_mm``: mean deviations; ``reversal_mm``: B_i; ``s_forward_mm``, ``s_backward_mm``:
     estimators of the standard uncertainty of positioning. The rest are the figures of the standard by their symbols; ``lowest`` and
@@ -100,7 +100,7 @@ class Positioning:
     most: int
 
     def departures(self) -> tuple[str, ...]:
-        """In words, what of the test is not as ISO 230-2 wants it."""
+        """Texts of the test's departures from ISO 230-2."""
         m = self.position_mm.size
         travel = float(np.ptp(self.position_mm))
         needed = max(POSITIONS, int(np.ceil(POSITIONS * travel * 1e-3 - 1e-9)))

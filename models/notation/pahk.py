@@ -31,7 +31,7 @@ class PahkType:
 
     @property
     def work_side(self) -> F1:
-        """Which of X, Y, Z lie between bed and workpiece, shape (3,), 0 or 1."""
+        """Axes between bed and workpiece, shape (3,), 0 or 1."""
         side = np.zeros(3)
         side[list(split_chain(self.chain)[0])] = 1.0
         return side
@@ -99,7 +99,7 @@ def parameter_signs(kind: PahkType) -> F2:
 
 
 def squareness_slopes(kind: PahkType) -> F3:
-    """How alpha, beta1, beta2 enter the ISO translations per mm of own travel, shape (3 axes, 3 directions, 3 parameters).
+    """ISO translations per mm of own travel and unit of alpha, beta1, beta2, shape (3 axes, 3 directions, 3 parameters).
 
     Y is the datum; the X line runs along (1, -alpha, 0), the Z line along (-beta1, -beta2, 1) (math.md 1, 2; P (2), (3) with the erratum
     that Lz holds -beta1 Z). On the workpiece side the lateral entry is the table's and changes sign.

@@ -1,4 +1,4 @@
-"""Circles and arcs on the ball-bar's sphere (ISO 230-4), and how a path is entered, left, and reached from another."""
+"""Circles and arcs on the ball-bar's sphere (ISO 230-4), and the ways into a path, out of it, and from another one."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]
 def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
     """Standard deviation of every component of the predicted map per unit of reading noise, shape (m, 3) (math.md 4.6 "noise gain").
 
-    What the readings do not show at all (singular values below 1e-9) is taken as zero and counts nothing; the frame's gauge is included.
+    Combinations that leave no trace in the readings (singular values below 1e-9) count as zero; the frame's gauge is included.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
 def shortest_solution(a: F2, y: F1, scale: F1) -> F1:
     """Least squares without a prior: of all best parameters those with the smallest sum of (parameter / scale)**2.
 
-    Where the rank is not full the answer depends on ``scale`` alone, i.e. on nothing that was measured (math.md 5.5).
+    Without full rank the result also depends on ``scale``, which no measurement determines (math.md 5.5).
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Ball-bar helix solution with the six linear parameters and the set-up unknowns (Yang and Kim eq (4)-(9); math.md 4.2 to 4.5).
 
 The paper fits six parameters and takes the mounting as perfect: 10 um of cup offset then fakes about 100 urad (math.md 4.5). The default
-here is the ten-parameter fit: scales EXX.1 EYY.1 EZZ.1 (mm/mm), squareness C0Y B0Z A0Z (rad), cup offset (mm), bar length error (mm).
-One helix cannot tell a common scale from the bar's length: the bar's stated length uncertainty is the prior that closes the gap, and the
+here is the ten-parameter fit: scales EXX.1 EYY.1 EZZ.1 (mm/mm), squareness C0Y B0Z A0Z (rad), cup offset (mm), bar length error (mm). One
+helix cannot separate a common scale from the bar's length: the bar's stated length uncertainty is the prior that closes the gap, and the
 solution says so. All figures of one helix hold about its own sphere only.
 """
 
@@ -30,7 +30,7 @@ LOST = ("backlash_X", "backlash_Y", "backlash_Z")
 
 @dataclass(frozen=True)
 class HelixSolution:
-    """Estimate, what it was seen from, and the rank of the data alone.
+    """Estimate, its data, and the rank of the data without priors.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ class _HelixTask:
 
 
 def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
-    """Gauss-Newton on the exact bar length, then widened by what the misfit demands."""
+    """Gauss-Newton on the exact bar length; the covariance is then widened by the misfit."""
     if len(deviation_mm) < len(task.names):
         raise ValueError(f"helix: {len(deviation_mm)} readings cannot carry {len(task.names)} unknowns")
     linear = task.names == LINEAR  # the paper's fit is linear; a cup offset bends the sphere
@@ -196,7 +196,7 @@ def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
 
 
 def _demanded_variance(estimate: ParameterEstimate) -> float:
-    """How much more variance than stated the misfit demands: what six linear parameters cannot follow is no white noise.
+    """Factor on the stated variance that the misfit demands: errors that six linear parameters cannot follow are no white noise.
 
     Neighbouring residuals of a real machine are alike, so n readings are worth n (1 - r) / (1 + r), r their correlation at lag one (the
     integrated autocorrelation was tried and covers less: the fit has taken the slow part out of the residual). A curvature that cup offset

@@ -41,7 +41,7 @@ def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
 
 
 def singular_values(a: F2) -> F1:
-    """Singular values alone, largest first; raises as `svd`."""
+    """Singular values only, largest first; raises as `svd`."""
     try:
         return np.asarray(scipy.linalg.svd(a, compute_uv=False, check_finite=False))
     except scipy.linalg.LinAlgError:
@@ -157,7 +157,7 @@ class Combination:
 
     @property
     def members(self) -> tuple[str, ...]:
-        """Names of the members that matter, largest first."""
+        """Names of the relevant members, largest first."""
         return _members(self.weights)
 
 
@@ -192,12 +192,12 @@ def taking_part(names: tuple[str, ...], null_space: F2) -> frozenset[str]:
 
 
 def combinations_of(names: tuple[str, ...], null_space: F2) -> tuple[Combination, ...]:
-    """A null space, shape (p, k), as sparse combinations in words."""
+    """A null space, shape (p, k), as sparse combinations with their text."""
     return tuple(_sentence(names, v) for v in sparse_rows(null_space.T))
 
 
 def project_out(a: F2, nuisance: F2) -> F2:
-    """Design with everything that set-up unknowns could explain taken out: (I - N N+) a."""
+    """Design without the part that set-up unknowns could explain: (I - N N+) a."""
     if nuisance.shape[1] == 0:
         return a
     norm = np.linalg.norm(nuisance, axis=0)

@@ -40,7 +40,7 @@ class ResidualTest:
 def residual_tests(runs: tuple[RunData, ...], whitened: tuple[F1, ...], weight: tuple[F1, ...]) -> tuple[ResidualTest, ...]:
     """Test the residuals of all runs (divided by their standard deviation and corrected for leverage; outliers left out).
 
-    Flagged lines say what a person should look at, e.g. "r07: residuals along X are alike over 12 mm: more than the model follows".
+    Flagged lines name what to check, e.g. "r07: residuals along X are alike over 12 mm: more than the model follows".
     """
     found = [t for run, z, w in zip(runs, whitened, weight, strict=True) for t in _of_run(run, z, w > 0.5)]
     return _holm(found)
@@ -67,7 +67,7 @@ def _size(label: str, z: F1) -> ResidualTest:
 
 
 def _signs(label: str, z: F1) -> ResidualTest:
-    """Runs test of Wald and Wolfowitz: how often the residuals change their sign."""
+    """Runs test of Wald and Wolfowitz: number of sign changes of the residuals."""
     up = z > np.median(z)
     n1, n2 = int(up.sum()), int((~up).sum())
     count = 1 + int((np.diff(up.astype(int)) != 0).sum())
@@ -130,7 +130,7 @@ def _holm(tests: list[ResidualTest]) -> tuple[ResidualTest, ...]:
 
 
 def inflation(z: tuple[F1, ...]) -> float:
-    """How many times more readings there are than independent ones: 1 + 2 sum of the autocorrelation, at least 1.
+    """Ratio of all readings to independent ones: 1 + 2 sum of the autocorrelation, at least 1.
 
     Summed over all runs of an instrument up to the first lag that noise explains.
     """
@@ -172,7 +172,7 @@ class Outlier:
 
 
 def leverage(a: F2, root: F2) -> F1:
-    """Share of each reading's variance that the fit takes, shape (n,): squared length of the rows of ``a @ root.T``.
+    """Share of each reading's variance that the fit absorbs, shape (n,): squared length of the rows of ``a @ root.T``.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ def increments(readings_mm: dict[str, F1], order: str = "XYZ") -> dict[str, F2]:
 
 
 def project_eq6(e_mm: F3, inc_mm: F1) -> dict[str, F2]:
-    """What the four diagonals read of given displacement errors, eq (4) to (6), normalised like `increments`: shape (3 axes, n) each, mm.
+    """Diagonal readings for given displacement errors, eq (4) to (6), normalised like `increments`: shape (3 axes, n) each, mm.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
 
 
 def wang_four(q: dict[str, F2], inc_mm: F1) -> F3:
-    """The same by least squares over all four diagonals: half the variance of (7) (math.md 5.1, not in the paper).
+    """`wang_eq7` by least squares over all four diagonals: half the variance of (7) (math.md 5.1, not in the paper).
 
     Parameters, result (shape (3, 3, n + 1), mm), errors: as `wang_eq7`. Uncertainty from noise: `u_wang_four`.
     """
@@ -163,7 +163,7 @@ def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -
 
 
 def demeaned(q: dict[str, F2]) -> dict[str, F2]:
-    """Step readings with the mean of every series (axis and diagonal) taken out: the paper's remedy for mirror tilt (IV.C; math.md 5.4).
+    """Step readings without the mean of every series (axis and diagonal): the paper's remedy for mirror tilt (IV.C; math.md 5.4).
 
     It removes the tilt and with it all twelve slopes: what `wang_eq7` then returns has no scale and no squareness left, which the paper
     does not say. ``q`` and the result: dict of arrays (3 axes, n), mm, normalised by `increments`.
@@ -172,7 +172,7 @@ def demeaned(q: dict[str, F2]) -> dict[str, F2]:
 
 
 def closure_mm(q: dict[str, F2]) -> F2:
-    """ppp - npp - pnp - ppn per axis and interval: what the redundant fourth diagonal tells (math.md 5.1, 5.2, 5.4; not in the paper).
+    """ppp - npp - pnp - ppn per axis and interval: closure by the redundant fourth diagonal (math.md 5.1, 5.2, 5.4; not in the paper).
 
     Zero for pure translations, visible for mirror tilt; angular errors show with one step's size only.
 

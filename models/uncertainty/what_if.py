@@ -42,7 +42,7 @@ class ForecastFigure:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """A figure before and after, and what is gained: mean over the draws and standard uncertainty, mm."""
+    """A figure before and after, and the gain: mean over the draws and standard uncertainty, mm."""
 
     name: str
     before_mm: float
@@ -60,7 +60,7 @@ def volume_figures(known: KnownField, nodes: int = 6) -> list[ForecastFigure]:
 
 
 def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
-    """Rms length of the deviation over an even grid as it is expected, unknown part included, and its standard uncertainty, mm.
+    """Expected rms length of the deviation over an even grid, unknown part included, and its standard uncertainty, mm.
 
     The square is a quadratic form of a normal vector, so both have a closed form; the same as the first of `volume_figures` by draws.
     """
@@ -89,7 +89,7 @@ def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions
 
 
 def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: float = 3.0, positions: int = 180) -> ForecastFigure:
-    """Rms reading of a ball-bar along the helix about a cup, centre and length of the bar fitted away."""
+    """Rms reading of a ball-bar along the helix about a cup, fitted centre and bar length removed."""
     at = helix_points(centre_mm, radius_mm, turns=turns, n=positions, law="area", axis=2)
     n = (at - centre_mm) / radius_mm
     reading = np.einsum("mi,mip->mp", n, known.per_unit(at))
@@ -99,7 +99,7 @@ def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: f
 
 
 def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure], *, draws: int = DRAWS, seed: int = SEED) -> list[Forecast]:
-    """Figures of the machine as it is, and with a part of the estimate corrected.
+    """Figures of the machine without correction, and with a part of the estimate corrected.
 
     Parameters
     ----------

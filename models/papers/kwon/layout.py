@@ -39,7 +39,7 @@ that changes by 10 um per mm of height changes by 0.05 um over it."""
 
 
 def term_name(term: Exponents) -> str:
-    """As people write it: ``1``, ``X``, ``X Y^2``."""
+    """Usual notation: ``1``, ``X``, ``X Y^2``."""
     parts = [f"{letter}^{k}" if k > 1 else letter for letter, k in zip("XYZ", term, strict=True) if k]
     return " ".join(parts) or "1"
 
@@ -123,12 +123,12 @@ class Planes:
 
     @property
     def terms(self) -> tuple[Exponents, ...]:
-        """Monomials that the planes can tell apart: powers of the axis below the number of planes."""
+        """Monomials that the planes can separate: powers of the axis below the number of planes."""
         return tuple(t for t in CUBIC if t[self.axis] < len(self.levels_mm))
 
     @property
     def tilt_text(self) -> str:
-        """The slope in words, empty for planes square to the axis."""
+        """Text of the slope, empty for planes square to the axis."""
         return "".join(f" {s:+.4g} {letter}" for s, letter in zip(self.slope, "XYZ", strict=True) if s)
 
 
@@ -183,7 +183,7 @@ def _levels(offset_mm: F1, tolerance_mm: float, count: int) -> tuple[float, ...]
 
 @dataclass(frozen=True)
 class Layout:
-    """Where points lie, and what that allows.
+    """Positions of points, and the terms they allow.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class Layout:
 
     @property
     def plane_mm(self) -> F1 | None:
-        """a, b, c of the one plane Z = a + b X + c Y on which all points lie, shape (3,); None when there is none that faces Z."""
+        """a, b, c of the one plane Z = a + b X + c Y on which all points lie, shape (3,); None if there is none that Z crosses."""
         at = self.planes
         return np.array([at.levels_mm[0], *at.slope[:2]]) if at and at.axis == 2 and len(at.levels_mm) == 1 else None
 
@@ -228,7 +228,7 @@ class Layout:
 
     @property
     def plane_text(self) -> str:
-        """Where the points lie, in words."""
+        """Text of the positions of the points."""
         at = self.planes
         if at is None:
             return f"points between Z = {self.low_mm[2]:.6g} and {self.high_mm[2]:.6g} mm"
@@ -240,7 +240,7 @@ class Layout:
 
 
 def layout(points_mm: F2, tolerance_mm: float | None = None) -> Layout:
-    """Look at the points only, not at values.
+    """Analyse the points; values are not needed.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Cubic response surface of one error component: fit, coefficients, analysis of variance, prediction with uncertainty.
 
-Source: Kwon 2004 (26)-(28), math.md 6. The degrees of freedom are those that the points really give.
+Source: Kwon 2004 (26)-(28), math.md 6. The degrees of freedom follow from the points.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MARGIN = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Anova:
-    """Table 2 as it should be: regression and residual about the mean.
+    """Table 2 corrected: regression and residual about the mean.
 
     Attributes
     ----------
@@ -56,17 +56,17 @@ class Anova:
 
     @property
     def ms_res(self) -> float:
-        """Mean square of the residual: the variance left."""
+        """Mean square of the residual: the remaining variance."""
         return self.ss_res / self.df_res
 
     @property
     def residual_sd(self) -> float:
-        """Standard deviation left, in the unit of the values."""
+        """Remaining standard deviation, in the unit of the values."""
         return float(np.sqrt(self.ms_res))
 
     @property
     def undefined(self) -> str:
-        """Why there is no F, in one line; empty where there is one."""
+        """Reason why there is no F, in one line; empty if there is one."""
         return "the values do not vary beyond rounding: there is nothing to explain, F is 0/0" if np.isnan(self.f) else ""
 
     def critical(self, alpha: float = 0.01) -> float:

@@ -137,7 +137,7 @@ def length_random_error_mm(kind: PahkType, ends_mm: F2, random: tuple[RandomErro
 
 
 def shared_variables(ends_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which of the 21 parameters are the same variable at both ends of a length, shape (21,): squareness, and functions of resting axes."""
+    """Which of the 21 parameters are the same variable at both ends of a length, shape (21,): squareness, and functions of axes at rest."""
     rest = np.repeat(ends_mm[0] == ends_mm[1], 3)
     return np.concatenate([rest, rest, np.ones(3, dtype=bool)])
 
@@ -175,7 +175,7 @@ def squareness_diagonals_mm(type_name: str, volume_mm: F1, squareness_rad: F1) -
 
 
 def best_assignment(type_name: str, volume_mm: F1, squareness_rad: F1, diagonals_mm: Sequence[float]) -> tuple[float, dict[str, float]]:
-    """How near four diagonal deviations of unknown order come to three squareness errors.
+    """Smallest misfit between four diagonal deviations of unknown order and three squareness errors.
 
     All 24 orders and both senses of angle are tried; every trial gives its squareness by the scale-free contrasts (math.md 5.3).
 

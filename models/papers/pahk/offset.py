@@ -1,6 +1,6 @@
 """Parameter-offset (Abbe) transformation of all ten types from one derivation (math.md 2.1; P (9), (10), (A3), (A6), (A9)).
 
-An instrument cannot stand at the origin: along axis j it sees the deviation on the line through (Xo, Yo, Zo), which holds the axis' own
+An instrument cannot stand at the origin: along axis j it measures the deviation on the line through (Xo, Yo, Zo), which holds the axis' own
 function AND levers times angular errors. Rule G gives what it sees for any chain. Because rule G is linear, the part that the angular
 errors alone cause IS the transformation: subtract it and the functions refer to the origin. So the ten printed sets of rules are one
 function here, and the terms that the paper lost (the slopes m[.], XoEy(Y) in (A3), signs in (A6), (A9), math.md 3) cannot get lost.
@@ -25,7 +25,7 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class OffsetSetup:
-    """Where the instrument measured.
+    """Positions of the measuring lines.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def line_positions_mm(tables: ParameterTables, setup: OffsetSetup, axis: int) ->
 
 
 def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, axis: int, still_rad: F2 | None = None) -> F2:
-    """Deviation (actual minus nominal, rule G) that an instrument meets along the measuring line of an axis.
+    """Deviation (actual minus nominal, rule G) along the measuring line of an axis.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: OffsetSetu
 
 
 def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
-    """What instruments on the lines of a setup would report for parameters that refer to the origin.
+    """Readings of instruments on the lines of a set-up for parameters that refer to the origin.
 
     Definition (math.md 2.1): positioning is the deviation along the line less its value at the start; straightness the deviation across
     less its least-squares line, as the table's own motion on a workpiece-side axis; squareness minus the sum of the two slopes, in the
@@ -141,7 +141,7 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, sti
 
 
 def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
-    """What to add to values measured off the origin: the Abbe terms of P (9), (10), (A3), (A6), (A9), from the angular errors alone.
+    """Corrections of values measured off the origin: the Abbe terms of P (9), (10), (A3), (A6), (A9), from the angular errors only.
 
     Derived from rule G in place of the printed sets, which lack the slope terms of squareness and have wrong signs in (A6), (A9) (math.md
     2.1 and 3); agrees with math.md 2.1 for all ten types.

@@ -3,7 +3,7 @@
 A parameter may act through more than one lever: in MB1 Ey(X) enters dX with (Z + Zp). Its coefficients belong together before they are
 squared; the paper squares Z and Zp apart, which is too small or too large whenever both are non-zero (`printed_eq5_mm`).
 
-Coverage: nothing here knows whether an R is one or two standard deviations. Quadrature keeps the factor, so results have the coverage of
+Coverage: an R may be one or two standard deviations. Quadrature keeps the factor, so results have the coverage of
 the inputs. Pahk's "repeatability" is 2 sigma, the largest over the positions: `in_coverage` converts.
 """
 
@@ -92,7 +92,7 @@ def parameter_jacobian(kind: PahkType, axes_mm: F2, probe_mm: F1 | None = None) 
 
 
 def iso_parameter_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> F3:
-    """The same for any of the 24 chains in ISO names: EXX EYX EZX EXY ... ECZ (rotations after translations), C0Y, B0Z, A0Z.
+    """`parameter_jacobian` of any of the 24 chains in ISO names: EXX EYX EZX EXY ... ECZ (rotations after translations), C0Y, B0Z, A0Z.
 
     Returns
     -------

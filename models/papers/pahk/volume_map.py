@@ -105,7 +105,7 @@ class ParameterTables:
 
 @dataclass(frozen=True)
 class VolumetricMap:
-    """Nominal grid and what becomes of it.
+    """Nominal and deformed grid.
 
     Parameters
     ----------
@@ -122,12 +122,12 @@ class VolumetricMap:
 
     @property
     def nominal_mm(self) -> F3:
-        """Where the functional point should be."""
+        """Nominal positions of the functional point."""
         return self.axes_mm + self.tool_mm
 
     @property
     def deformed_mm(self) -> F3:
-        """Where the functional point is."""
+        """Actual positions of the functional point."""
         return self.nominal_mm + self.deviation_mm
 
     def exaggerated_mm(self, factor: float) -> F3:

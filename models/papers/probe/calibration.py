@@ -61,7 +61,7 @@ def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROU
 
 
 def _levels(name: str, angles_rad: F1, tolerance_rad: float) -> tuple[F1, Indices]:
-    """Different angles, increasing, and which of them each given angle is."""
+    """Different angles, increasing, and the index of each given angle among them."""
     order = np.argsort(angles_rad, kind="stable")
     ranked = angles_rad[order]
     level = np.concatenate([[0], np.cumsum(np.diff(ranked) > 2.0 * tolerance_rad)])
@@ -76,7 +76,7 @@ def _levels(name: str, angles_rad: F1, tolerance_rad: float) -> tuple[F1, Indice
 
 
 def _around(longitudes_rad: F1, tolerance_rad: float) -> tuple[F1, Indices]:
-    """As `_levels` for angles that go round: where a longitude lies across zero, the turn is cut at its largest gap instead."""
+    """As `_levels` for periodic angles: the turn is cut at its largest gap, because a group may lie across zero."""
     slack, turn = 2.0 * tolerance_rad, np.mod(longitudes_rad, 2.0 * np.pi)
     ranked = np.sort(turn)
     gaps = np.diff(ranked, append=ranked[0] + 2.0 * np.pi)
@@ -217,7 +217,7 @@ def _columns(normal: F2) -> F2:
 
 
 def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
-    """A lobing function less what a sphere fit over the same directions takes for centre and radius (least squares on nx, ny, nz, 1).
+    """A lobing function without what a sphere fit over the same directions absorbs in centre and radius (least squares on nx, ny, nz, 1).
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
 
 @dataclass(frozen=True)
 class ProbeCalibration:
-    """What a master sphere tells about a probe.
+    """Calibration of a probe on a master sphere.
 
     ``probe_mm`` is the lobing at the touched directions, positive where the reading is too near the sphere's centre. It is known only
     modulo the four functions `ABSORBED`: a true lobing with a share of nx, ny, nz moved the centre, one with a constant the radius.

@@ -61,7 +61,7 @@ def to_probe(frame: F3, machine: F2) -> F2:
 def to_machine(frame: F3, probe: F2) -> F2:
     """Components in machine coordinates of vectors given in the probe frame, v = Tp v'; shapes (..., 3, 3) and (..., 3).
 
-    P (12) prints this product as the way into the probe frame; the columns of Tp are the probe's axes, so it is the way out (math.md 3).
+    P (12) prints this product as leading into the probe frame; the columns of Tp are the probe's axes, so it leads out of it (math.md 3).
     """
     out: F2 = np.einsum("...ij,...j->...i", np.asarray(frame, dtype=np.float64), finite_vectors(probe))
     return out
@@ -239,7 +239,7 @@ def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
 
 
 def printed_eq17_mm(deviation_mm: F2, probe_mm: F1, outward: F2, m: Reading17) -> F2:
-    """P (17), delta - Probe M, for either meaning of M; the map is indexed by the outward direction in both.
+    """P (17), delta - Probe M, for both definitions of M; the map is indexed by the outward direction in both.
 
     ``"approach"`` (M = -n) is `combined_deviation_mm`. ``"outward"`` (M = n) moves the point the wrong way; it stands here because the
     text does not say which is meant (math.md 3, CONV).
@@ -274,7 +274,7 @@ def contact_point_mm(reading_mm: F2, combined_mm: F2, effective_radius_mm: float
 
 
 def unit_vectors(value: F2) -> F2:
-    """Vectors that are of length one.
+    """Checked unit vectors.
 
     Raises
     ------
