@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.volume import unit_deviation, volume_frame
-from abbe.service import cli
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.domain.solution_file import SolutionFile, StoredPrediction
 from abbe.service.identification.solve import solve_runs
@@ -24,9 +23,8 @@ SEED = 7
 
 
 @pytest.fixture(autouse=True)
-def own_place(tmp_path, monkeypatch):
+def own_database(monkeypatch):
     monkeypatch.delenv("ABBE_DB", raising=False)
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -47,18 +45,8 @@ def thinned(run):
     return run | {"columns": {k: v[::every] for k, v in run["columns"].items()}}
 
 
-@pytest.fixture
-def abbe(capsys):
-    def call(*words):
-        code = cli.run([str(w) for w in words])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
-
-
-def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(abbe, folder, tmp_path):
-    code, out, err = abbe("solve", folder, "--report", "page.html")
+def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(command, folder, tmp_path):
+    code, out, err = command("solve", folder, "--report", "page.html")
     assert code == 0
     text = " ".join(out.split())
     for words in (
@@ -88,8 +76,8 @@ def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(abbe, folder, t
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
 
 
-def test_json_keeps_to_its_schema_and_holds_the_truth(abbe, folder):
-    code, out, _ = abbe("solve", folder, "--json")
+def test_json_keeps_to_its_schema_and_holds_the_truth(command, folder):
+    code, out, _ = command("solve", folder, "--json")
     doc = json.loads(out)
     SolutionFile.model_validate_json(out)
     assert code == 0
@@ -114,8 +102,8 @@ def test_json_keeps_to_its_schema_and_holds_the_truth(abbe, folder):
     assert np.sqrt(np.diag(field_at @ covariance @ field_at.T)) * 1e3 == pytest.approx(worst["u_um"], rel=0.01)
 
 
-def test_grid_and_tables_on_request(abbe, small, tmp_path):
-    code, out, err = abbe("solve", small, "--grid", "grid.csv", "--nodes", 4, "--tables")
+def test_grid_and_tables_on_request(command, small, tmp_path):
+    code, out, err = command("solve", small, "--grid", "grid.csv", "--nodes", 4, "--tables")
     assert code == 0, err
     text = " ".join(out.split())
     rows = np.loadtxt(tmp_path / "grid.csv", delimiter=",", skiprows=1)
@@ -140,23 +128,23 @@ def trials_agree(text):
         assert float(found) == pytest.approx(float(half), rel=0.15)
 
 
-def test_trials_on_request_for_six_parameters_which_give_no_grid_where_they_do_not_fit(abbe, small, tmp_path):
+def test_trials_on_request_for_six_parameters_which_give_no_grid_where_they_do_not_fit(command, small, tmp_path):
     """Trials of all 21 motions: tests/models/uncertainty/test_uncertainty_trials.py."""
-    code, out, err = abbe("solve", small, "--model", "rigid6", "--monte-carlo")
+    code, out, err = command("solve", small, "--model", "rigid6", "--monte-carlo")
     assert code == 0, err
     trials_agree(" ".join(out.split()))
-    code, out, err = abbe("solve", small, "--model", "rigid6", "--grid", "grid.csv")
+    code, out, err = command("solve", small, "--model", "rigid6", "--grid", "grid.csv")
     assert (code, out) == (2, "")
     assert "error CMP-001: no grid from a solution with open flags" in err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_residuals_are_one_line_per_run(abbe, folder, tmp_path):
+def test_residuals_are_one_line_per_run(command, folder, tmp_path):
     site, runs = measured(SEED, "one_tool")
     wave = next(r for r in runs if r["test"] == "ballbar_helix")
     columns = wave["columns"]
     columns["deviation_mm"] = [v + 2e-3 * np.sin(x / 9.0) for v, x in zip(columns["deviation_mm"], columns["x_mm"], strict=True)]
-    code, out, _ = abbe("solve", write_folder(tmp_path / "wave", site.doc, runs))
+    code, out, _ = command("solve", write_folder(tmp_path / "wave", site.doc, runs))
     assert code == 0
     lines = out.split("residuals that are not noise:")[1].split("these runs cannot tell")[0].splitlines()
     named = [line.split(":")[0] for line in lines if line.startswith("- ")]
@@ -164,12 +152,12 @@ def test_residuals_are_one_line_per_run(abbe, folder, tmp_path):
     assert len(named) == len(set(named))
 
 
-def test_a_stored_campaign_is_solved_twice_and_recognised(abbe, small, tmp_path):
+def test_a_stored_campaign_is_solved_twice_and_recognised(command, small, tmp_path):
     with Store.open("sqlite:///a.sqlite3") as store:
         import_folder(store, small)
     six = ("--db", "sqlite:///a.sqlite3", "--model", "rigid6")
-    first = json.loads(abbe("solve", "c1", "--json", *six)[1])
-    code, out, _ = abbe("solve", small, *six)
+    first = json.loads(command("solve", "c1", "--json", *six)[1])
+    code, out, _ = command("solve", small, *six)
     assert code == 0
     assert f"the same readings and model as solution {first['solution_id']}" in out
     with Store.open("sqlite:///a.sqlite3") as store:
@@ -181,29 +169,29 @@ def test_a_stored_campaign_is_solved_twice_and_recognised(abbe, small, tmp_path)
         assert solution.doc["versions"]["abbe"]
         assert solution.doc["model"] == "rigid6"
     assert kept[0].doc["inputs"] == kept[1].doc["inputs"]
-    other = json.loads(abbe("solve", "c1", "--json", "--db", "sqlite:///a.sqlite3")[1])
+    other = json.loads(command("solve", "c1", "--json", "--db", "sqlite:///a.sqlite3")[1])
     assert other["model"].startswith("rigid21/")
     assert other["same_as"] == []
     assert {n for n in first["parameters"] if n[0] == "E" or n in ("C0Y", "B0Z", "A0Z")} == {"EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z"}
 
 
-def test_what_is_refused_is_one_line_and_leaves_nothing(abbe, tmp_path):
+def test_what_is_refused_is_one_line_and_leaves_nothing(command, tmp_path):
     site, runs = measured(SEED, "one_tool")
     runs[2]["columns"]["deviation_mm"] = [v / 25.4 for v in runs[2]["columns"]["deviation_mm"]]
     bad = write_folder(tmp_path / "bad", site.doc, runs)
-    code, out, err = abbe("solve", bad, "--db", "sqlite:///b.sqlite3", "--report", "page.html")
+    code, out, err = command("solve", bad, "--db", "sqlite:///b.sqlite3", "--report", "page.html")
     line = err.splitlines()[-1]
     assert (code, out) == (2, "")
     assert line.startswith(f"error SOL-003: run {runs[2]['run_id']}: ")
     assert "inches" in line
     assert "--without" in line
     assert [p.name for p in tmp_path.iterdir()] == ["bad"]
-    assert abbe("solve", bad, "--without", runs[2]["run_id"], "--model", "rigid6")[0] == 0
+    assert command("solve", bad, "--without", runs[2]["run_id"], "--model", "rigid6")[0] == 0
 
 
-def test_a_real_axis_with_a_coarse_sensor_and_few_readings_is_solved(abbe, shared):
+def test_a_real_axis_with_a_coarse_sensor_and_few_readings_is_solved(command, shared):
     """Its repeats are alike to the last digit, and 24 readings are too few for 21 error motions: the six are solved, and that is told."""
-    code, out, err = abbe("solve", shared / "data" / "foreign" / "bifrost" / "11361-axis1-resolver", "--json")
+    code, out, err = command("solve", shared / "data" / "foreign" / "bifrost" / "11361-axis1-resolver", "--json")
     assert code == 0, err
     doc = json.loads(out)
     assert doc["model"].startswith("rigid6")
@@ -211,37 +199,37 @@ def test_a_real_axis_with_a_coarse_sensor_and_few_readings_is_solved(abbe, share
     assert doc["parameters"]["backlash_X"]["value"] == pytest.approx(-0.2e-3, abs=0.1e-3)
 
 
-def test_a_bad_run_in_the_store_stores_no_solution(abbe, tmp_path):
+def test_a_bad_run_in_the_store_stores_no_solution(command, tmp_path):
     site, runs = measured(SEED, "one_tool")
     again = json.loads(json.dumps(runs[1])) | {"run_id": "twin"}
     with Store.open("sqlite:///c.sqlite3") as store:
         import_folder(store, write_folder(tmp_path / "twice", site.doc, [*runs, again]))
-    code, out, err = abbe("solve", "c1", "--db", "sqlite:///c.sqlite3")
+    code, out, err = command("solve", "c1", "--db", "sqlite:///c.sqlite3")
     assert (code, out) == (2, "")
     assert f"run twin: its readings are those of run {runs[1]['run_id']}" in err
     with Store.open("sqlite:///c.sqlite3") as store:
         assert store.solutions.all() == []
 
 
-def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(abbe, small, tmp_path):
+def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(command, small, tmp_path):
     site, runs = measured(SEED, "one_tool")
     runs = [thinned(run) for run in runs]
     runs[-1]["columns"]["deviation_mm"][7] += 1e-3
     with Store.open("sqlite:///d.sqlite3") as store:
         import_folder(store, write_folder(tmp_path / "other", site.doc, runs))
-    code, _, err = abbe("solve", small, "--model", "rigid6", "--db", "sqlite:///d.sqlite3")
+    code, _, err = command("solve", small, "--model", "rigid6", "--db", "sqlite:///d.sqlite3")
     assert code == 2
     assert "another campaign 'c1'" in err
     assert "the machine (chain" not in err  # its readings do
 
 
-def test_another_machine_with_the_same_readings_is_another_campaign(abbe, small, tmp_path):
+def test_another_machine_with_the_same_readings_is_another_campaign(command, small, tmp_path):
     site, runs = measured(SEED, "one_tool")
     doc = json.loads(json.dumps(site.doc))
     doc["pivots_mm"] = {a: [0.0, 0.0, 700.0] for a in "XYZ"}
     with Store.open("sqlite:///e.sqlite3") as store:
         import_folder(store, write_folder(tmp_path / "other", doc, [thinned(run) for run in runs]))
-    code, _, err = abbe("solve", small, "--model", "rigid6", "--db", "sqlite:///e.sqlite3")
+    code, _, err = command("solve", small, "--model", "rigid6", "--db", "sqlite:///e.sqlite3")
     assert code == 2
     assert "the machine (chain, strokes, pivots or tool) differs" in err
 
@@ -249,9 +237,9 @@ def test_another_machine_with_the_same_readings_is_another_campaign(abbe, small,
 @pytest.mark.parametrize(
     ("words", "told"), [(("nowhere",), "STO-001"), (("--without", "r77"), "no run r77"), (("--model", "rigid99"), "rigid99")]
 )
-def test_mistakes_are_one_line(abbe, folder, words, told):
+def test_mistakes_are_one_line(command, folder, words, told):
     target = () if words == ("nowhere",) else (folder,)
-    code, out, err = abbe("solve", *target, *words)
+    code, out, err = command("solve", *target, *words)
     assert (code, out) == (2, "")
     assert told in err.splitlines()[-1]
 

@@ -17,7 +17,7 @@ from abbe.service.reference.papers.yang import bar_line_um, restored_x_mm
 from abbe.service.reference.printed import values
 from abbe.service.reference.text import minus, short
 from abbe.service.rendering.document import Picture
-from abbe.service.rendering.plots.curves import Comparison, comparison_plot
+from abbe.service.rendering.plots.curves import ComparedReadings, comparison_plot
 from abbe.service.rendering.plots.isometric import lobing_plot, surface_plot
 from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot
 from abbe.service.rendering.plots.volume import deformed_grid
@@ -115,7 +115,7 @@ def _machine(cmm: Cmm) -> str:
 def _laser_and_bar() -> Picture:
     x = np.array(restored_x_mm())
     laser, bar, _ = yang_printed.TABLE2["dxx"]
-    data = Comparison(
+    data = ComparedReadings(
         "X in mm",
         x,
         "laser, Table 3",

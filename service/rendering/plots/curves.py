@@ -153,7 +153,7 @@ LINES = ("s-c2", "s-c3 dash", "s-c4 dots")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class ComparedReadings:
     """Readings over a position with the lines that describe them. Values in um.
 
     ``lines``: up to three names with values at every position; the lower panel compares the readings with the first one.
@@ -166,7 +166,7 @@ class Comparison:
     lines: tuple[tuple[str, Array], ...]
 
 
-def comparison_plot(data: Comparison, *, key: str, heading: str) -> str:
+def comparison_plot(data: ComparedReadings, *, key: str, heading: str) -> str:
     """Upper panel: readings and lines; lower panel: readings minus the first line."""
     top, upper_height, gap, lower_height = 56.0, 250.0, 30.0, 120.0
     apart = data.readings_um - data.lines[0][1]

@@ -275,13 +275,6 @@ def test_a_helix_that_is_none_is_one_line(abbe: Abbe, machine: Path, helix: str)
     assert said.startswith("error CFG-001: ")
 
 
-PLACES = {
-    "ascii": {"PYTHONIOENCODING": "ascii"},
-    "POSIX": {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-    "latin-1": {"PYTHONIOENCODING": "latin-1"},
-}
-
-
 COMMANDS = ("effects backlash", "effects", "--help", "comp formats", "check-config machine.toml", "import µ→")
 
 
@@ -294,20 +287,23 @@ def judge_letters(words: str, place: str, out: bytes, err: bytes, code: int | No
         assert ("µm".encode("latin-1") if place == "latin-1" else b"30.0 um") in out
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_a_place_that_has_no_letters_gets_plain_ones(machine: Path, place: str) -> None:
+def test_a_place_that_has_no_letters_gets_plain_ones(machine: Path) -> None:
+    """A whole process; the streams themselves: `test_every_command_writes_plain_letters_where_there_are_no_others`."""
     words = COMMANDS[0]
     command = [sys.executable, "-m", "abbe.service.cli", *words.split()]
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG"))} | PLACES[place]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG"))}
+    environment |= {"LC_ALL": "POSIX", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(command, cwd=machine.parent, env=environment, capture_output=True, check=False, timeout=60)
-    judge_letters(words, place, done.stdout, done.stderr, done.returncode)
+    judge_letters(words, "POSIX", done.stdout, done.stderr, done.returncode)
 
 
-@pytest.mark.parametrize("words", COMMANDS)
-def test_every_command_writes_plain_letters_where_there_are_no_others(machine: Path, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
+@pytest.mark.parametrize(("words", "place"), [(COMMANDS[0], "latin-1"), *((words, "ascii") for words in COMMANDS)])
+def test_every_command_writes_plain_letters_where_there_are_no_others(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, words: str, place: str
+) -> None:
     """In this process, on streams as a place without letters has them."""
     monkeypatch.chdir(machine.parent)
-    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors=how) for how in ("strict", "backslashreplace"))
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding=place, errors=how) for how in ("strict", "backslashreplace"))
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", out)
         patch.setattr(sys, "stderr", err)
@@ -316,4 +312,4 @@ def test_every_command_writes_plain_letters_where_there_are_no_others(machine: P
         out.flush()
         err.flush()
     written = [stream.buffer.getvalue() for stream in (out, err) if isinstance(stream.buffer, io.BytesIO)]
-    judge_letters(words, "ascii", *written, int(ended.value.code or 0))
+    judge_letters(words, place, *written, int(ended.value.code or 0))

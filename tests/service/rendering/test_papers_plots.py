@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from abbe.service.rendering.plots.curves import Comparison, comparison_plot
+from abbe.service.rendering.plots.curves import ComparedReadings, comparison_plot
 from abbe.service.rendering.plots.isometric import VIEW, Paper, ViewWindow, depth, lobing_plot, surface_plot
 from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot, level_lines
 from abbe.service.rendering.plots.volume import deformed_grid
@@ -125,7 +125,7 @@ def test_deformed_grid_states_its_magnification_and_draws_it():
 
 def test_comparison_reports_the_largest_distance():
     x = np.array([0.0, 10.0, 20.0])
-    data = Comparison("X in mm", x, "readings", np.array([0.0, 3.0, -4.0]), (("line", np.zeros(3)), ("other", x)))
+    data = ComparedReadings("X in mm", x, "readings", np.array([0.0, 3.0, -4.0]), (("line", np.zeros(3)), ("other", x)))
     svg = comparison_plot(data, key="k", heading="H")
     sound(svg)
     assert "largest 4.00 µm" in svg

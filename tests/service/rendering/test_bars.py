@@ -1,19 +1,35 @@
-"""Pictures of what the readings tell."""
+"""Bars: nothing left of zero, figures rounded to their uncertainty, lengths as the shares; the noise gain names unit and plane."""
 
 import re
 import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from abbe.service.rendering.model import MotionShare, Slice
-from abbe.service.rendering.plots.bars import share_plot
+from abbe.service.rendering.model import Contribution, MotionShare, Slice
+from abbe.service.rendering.plots.bars import LABELS, WIDTH, contribution_bars, share_plot
 from abbe.service.rendering.plots.maps import gain_map
 
-ROWS = [MotionShare("EXX", 0.99, "observed"), MotionShare("EYX", 0.4, "weak"), MotionShare("EAX", 0.97, "not observable")]
+RANKED = [Contribution("EYY", 45.8512, 10.3), Contribution("EXX", 1.234, 4.0), Contribution("backlash X", 0.004, 0.18)]
+
+
+def test_whiskers_of_sizes_end_at_zero():
+    picture = contribution_bars(RANKED)
+    across = [float(x) for x in re.findall(r'x[12]="([-0-9.]+)"', picture)]
+    assert min(across) >= LABELS - 0.01
+    assert max(across) <= WIDTH
+
+
+def test_figures_are_rounded_to_their_uncertainty():
+    picture = contribution_bars(RANKED)
+    assert "46 ± 21 µm" in picture
+    assert "45.85" not in picture
+
+
+SHARES = [MotionShare("EXX", 0.99, "observed"), MotionShare("EYX", 0.4, "weak"), MotionShare("EAX", 0.97, "not observable")]
 
 
 def test_bars_are_as_long_as_the_share_and_only_observed_motions_are_called_fit_for_a_table():
-    picture = share_plot(ROWS)
+    picture = share_plot(SHARES)
     ET.fromstring(picture)
     assert "1 of 3 may stand in a table of their own: EXX." in picture
     width = {tip.split(":")[0]: float(w) for w, tip in re.findall(r'<rect [^>]*width="([\d.]+)"[^>]*><title>([^<]*)</title>', picture)}
