@@ -20,7 +20,7 @@ ROOT = Path(abbe.service.__file__).parent
 ONLY_LOOKS = {
     ("scheduler/ready.py", "look_at"): "reads the status",
     ("core/table_watch.py", "look_at_table"): "reads which table is in force",
-    ("cli/tables/table.py", "accept_table"): "a person vouches",
+    ("cli/tables/comp_push.py", "accept_table"): "a person vouches",
     ("compensation/rollback.py", "ordered_rollback"): "goes through `rollback`, which recovers",
     ("demo/demo.py", "run_demo"): "a control of its own, begun with this database",
     ("demo/demo_serve.py", "run_served_demo"): "the same",

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 from abbe.service.formats.controls import CONTROLS
-from abbe.service.formats.proof import all_proofs
 from abbe.service.formats.registry import FORMATS
+from tests.service.formats.proof import all_proofs
 from tests.written_page import run
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "reference" / "formats.md"

@@ -9,9 +9,9 @@ import pytest
 
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable, correction_at
-from abbe.service.formats.proof import all_proofs
 from abbe.service.formats.registry import FORMATS
 from tests.service.formats.page import PAGE, page
+from tests.service.formats.proof import all_proofs
 
 # controllers.md 5.7, by hand: what +10 µm of error at 100 mm must be in each file.
 STEP = {
@@ -208,7 +208,7 @@ X EXX EYX EZX EAX EBX ECX
 
 def test_isg_example_is_read_number_by_number() -> None:
     """Page 296429067. Its numbers have no one way of writing (0.02, 0.00): it comes back equal in value, not in bytes."""
-    from abbe.service.formats.proof import SETTINGS
+    from tests.service.formats.proof import SETTINGS
 
     form = FORMATS["isg"]
     comp = form.read((TextFile("volcomp.csv", ISG),), SETTINGS)

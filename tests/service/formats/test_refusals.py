@@ -52,7 +52,7 @@ BAD_FILES = [
 
 @pytest.mark.parametrize(("key", "name", "text", "said"), BAD_FILES)
 def test_bad_file_is_named_with_its_line(key: str, name: str, text: str, said: str) -> None:
-    from abbe.service.formats.proof import SETTINGS
+    from tests.service.formats.proof import SETTINGS
 
     with pytest.raises(TableFileError, match=said):
         FORMATS[key].read((TextFile(name, text),), SETTINGS)
