@@ -94,7 +94,7 @@ class Snapshot:
     """State of the core, sent at least once a second."""
 
     __pydantic_config__ = _STRICT
-    kind: Literal["moment"]
+    kind: Literal["snapshot"]
     changes: Number
     check: RunningCheck | None
     devices: Annotated[tuple[DeviceStatus, ...], Field(max_length=50)]

@@ -169,7 +169,7 @@ class SnapshotSource:
         devices = tuple(replace(d, role=d.role[:WORD], url=d.url[:TEXT], text=d.text[:TEXT]) for d in board.devices)
         attention = tuple(text[:TEXT] for text in board.attention)
         return Snapshot(
-            "moment",
+            "snapshot",
             board.changes,
             self._check(),
             devices,

@@ -72,7 +72,7 @@ class Pushes(Repository):
             head = connection.execute(query).scalar()
             if head is not None and head != entry.prev:
                 raise StoreError(
-                    f"push {entry.push} of {entry.machine}: somebody else has written into the journal meanwhile",
+                    f"push {entry.push} of {entry.machine}: another process has written into the journal meanwhile",
                     "another process pushes or recovers on this machine: wait until it has ended",
                 )
             return insert_row(connection, push_entries, **PUSH_ENTRY.values(entry, "number"))

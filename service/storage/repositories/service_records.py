@@ -131,7 +131,7 @@ class Alarms(Repository):
         Raises
         ------
         StoreError
-            Somebody else wrote this entry meanwhile.
+            Another process wrote this entry meanwhile.
         """
 
         def work(connection: Connection) -> AlarmEntryRecord:
@@ -141,9 +141,7 @@ class Alarms(Repository):
             try:
                 entry_id = insert_row(connection, alarm_entries, **ALARM_ENTRY.values(entry, "id"))
             except IntegrityError:
-                raise StoreError(
-                    f"alarm {number} of {machine} was changed by somebody else meanwhile", "look at it, then try again"
-                ) from None
+                raise StoreError(f"another process changed alarm {number} of {machine} meanwhile", "look at it, then try again") from None
             for topic, message in messages:
                 queue_message(connection, topic, {"alarm": number, **message}, self._db.now())
             return replace(entry, id=entry_id)

@@ -35,7 +35,7 @@ from tests.service.core.fakes import FakeClock, settle, utc
 
 NOW = utc(2026, 11, 22, 6)
 MOMENT = m.Snapshot(
-    "moment",
+    "snapshot",
     3,
     RunningCheck(
         id="0123456789ab",
