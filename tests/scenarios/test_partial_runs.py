@@ -55,10 +55,10 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
         whole = next(r for r in store.runs.all() if r.status == "complete")
         run = load_run(store, whole.id)
         assert not_judged(run) == ""
-        assert "state" not in run
+        assert run.state is None
         assert "helix rms" in [f.symbol for f in stored_report(store, whole, Rules()).figures]
         campaign = stored_report(store, store.campaigns.find("june"), Rules())
-        pieces = (run.get("timing") or {}).get("pieces")
+        pieces = run.timing.pieces
         said = "went on with it, its readings count there" if pieces else "it is not in the figures"
         assert any(said in line for line in campaign.remarks)
     capsys.readouterr()
