@@ -149,7 +149,7 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[str, Any]) -> ConfigError:
-    # A mistyped key is both unknown and missing: the unknown one says more.
+    # A mistyped key is both unknown and missing: naming the unknown one helps more.
     first, more = min(errors, key=lambda one: one["type"] not in UNKNOWN_KEY), len(errors) - 1
     location = first["loc"]
     source = f"{PREFIX} environment" if _contains(environment, location) else str(path)

@@ -217,7 +217,7 @@ class Fixture:
         return {"accesses": [[a.time_s, a.kind, a.bank, a.first, list(a.words), a.by, a.taken, a.owner, a.active, a.gen] for a in found]}
 
     async def _air(self, request: Answer) -> Answer:
-        """Somebody opens the gate: the air is warmer by so much from now on."""
+        """Open the shop gate: from now on the air is warmer by this much."""
         self._world.warm_air(_number(request, "plus_c"))
         return {}
 

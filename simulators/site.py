@@ -82,7 +82,7 @@ class Site:
         return None if self._links is None else self._links / name
 
     async def start(self) -> dict[str, Any]:
-        """Open all wires; gives what a host needs to know. Raises OSError when a port is taken."""
+        """Open all connections and return their addresses for a host. Raises OSError if a port is in use."""
         self._begin_s = asyncio.get_running_loop().time()
         scenario = self._scenario
         if self._links is not None:

@@ -131,7 +131,7 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
 def check_clock(device: str, device_us: int) -> None:
     """Raise WrongDevice for a device time since power-on of more than 100 years: its four registers must be in the wrong order."""
     if device_us > _LONGEST_US:
-        detail = f"its clock says {device_us:#018x} us since it was switched on: int64: the registers of 64-bit values are swapped"
+        detail = f"its clock reads {device_us:#018x} us since it was switched on: int64: the registers of 64-bit values are swapped"
         raise WrongDevice(device, "identify", detail, _SET_ORDER)
 
 

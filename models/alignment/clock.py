@@ -120,7 +120,7 @@ def _edge_of_delays(lowest: F1) -> tuple[float, float]:
 
 
 def _edge(x: F1, y: F1) -> tuple[int, int]:
-    """The edge of the lower convex hull over the mean of x, as two indices."""
+    """Indices of the two ends of that edge of the lower convex hull which spans the mean of x."""
     some = np.unique([a + int(np.argmin(y[a:b])) for a, b in pairwise(np.linspace(0, x.size, min(BLOCKS, x.size) + 1).astype(int))])
     rough = _hull(x, y, np.unique(np.concatenate([[0], some, [x.size - 1]])))
     # what lies above the hull of some of the points is no corner of the hull of all

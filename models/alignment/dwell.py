@@ -246,7 +246,7 @@ class PlannedDwell:
 
 @dataclass(frozen=True, slots=True)
 class DwellReading:
-    """One planned reading as found: mean, standard uncertainty, window, samples."""
+    """A reading found for a planned point: mean, standard uncertainty, time window and number of samples."""
 
     value: float
     u: float
@@ -358,7 +358,7 @@ def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: 
         ]
         if not any(abs(by - move) <= 0.5 * abs(move) for move in moves):
             at_s = after.start_s - found[0].start_s
-            raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, which nobody planned")
+            raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, which is not in the plan")
 
 
 def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[int, Standstill], ...]:

@@ -95,7 +95,7 @@ def _mean_over_others(field: Field, stroke_mm: F2, axis: int, positions_mm: F1, 
 
 
 def _towards_diagonals(field: Field, stroke_mm: F2, nodes: int, order: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """What has to be added to the main effects, in Legendre polynomials of each axis: shape (3 axes, order, 3, m)."""
+    """Additions to the main effects that serve the diagonals, as Legendre coefficients per axis, shape (3 axes, order, 3, m)."""
     volume = volume_grid(stroke_mm, max(nodes, order + 2))  # fewer nodes than polynomials would not hold them between the nodes
     lines = np.concatenate([np.linspace(*diagonal_ends(stroke_mm, d), DIAGONAL_POINTS) for d in DIAGONALS])
     points = np.concatenate([volume, lines])

@@ -130,7 +130,7 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
     wanted = np.eye(3)[axis]
     name = AXES[axis]
     if 2.0 * u.max() > 0.5 * allowed * max(1.0, float(np.abs(moved).max())):
-        return f"{name}: the readings tell the response only to {200.0 * u.max():.0f} % (k = 2): nothing is proved"
+        return f"{name}: the readings tell the response only to {200.0 * u.max():.0f} % (k = 2), which proves nothing"
     if (np.abs(moved - wanted) <= allowed).all():
         return ""
     main = int(np.argmax(np.abs(moved)))

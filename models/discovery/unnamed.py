@@ -88,7 +88,7 @@ class _Plan:
 _AGAIN = _Plan(
     ("longer_session",),
     ("something of the machine", "something of that session"),
-    f"{{run}} again, later, {REPEATS} times in one set-up that nobody touches: what comes back belongs to the machine, what does not "
+    f"{{run}} again, later, {REPEATS} times in one undisturbed set-up: what comes back belongs to the machine, what does not "
     "belonged to that session",
 )
 _PERIOD = _Plan(
@@ -136,7 +136,7 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
     Returns
     -------
     NextTest or None
-        None without structures. ``separates`` says in words what it may be. How far the two come apart is not known: nobody knows what
+        None without structures. ``separates`` says in words what it may be. How far the two differ is not known: it is unknown what
         the structure would do elsewhere, so there are no sigmas.
     """
     if not structures:
@@ -186,5 +186,5 @@ def _once_minutes(like: Path) -> float:
 
 
 def _repeat_minutes(like: Path) -> float:
-    """A wait, one set-up, the repeats."""
+    """Items of the test: a wait, one set-up and the repeats."""
     return WAIT_MIN + _once_minutes(like) + (REPEATS - 1) * _run_minutes(like)

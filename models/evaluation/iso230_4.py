@@ -18,7 +18,7 @@ from abbe.models.solvers.observations import reading_noise_mm
 BINS = 360
 """Angles at which the two paths are compared: the mean of each degree."""
 FULL_RAD = np.deg2rad(350.0)
-"""A path that covers less is an arc: its least squares centre is worse known, and it is said."""
+"""A path that covers less is an arc: its least-squares centre is less certain, and the result states that it is an arc."""
 ZONE_POINTS = 2000
 """Readings that the minimum zone is looked for in: the highest and lowest of each of half so many stretches."""
 

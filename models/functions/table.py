@@ -62,17 +62,17 @@ class Table:
 
     @property
     def parameters(self) -> F1:
-        """The values."""
+        """Linear parameters: the values of the table."""
         return self.value
 
     @property
     def breaks_mm(self) -> F1:
-        """The positions."""
+        """Positions at which the curve may bend: those of the table."""
         return self.position_mm
 
     @property
     def degree(self) -> int:
-        """1 or 3."""
+        """Degree of the polynomials between the positions: 1 or 3."""
         return 1 if self.interpolation == "linear" else 3
 
     def __call__(self, x_mm: ArrayLike) -> F1:

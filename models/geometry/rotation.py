@@ -119,12 +119,12 @@ def turn_small(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
 
 
 def turned_by(rotation: RotationForm, rotation_rad: F2, v_mm: F2, *, work_side: bool) -> F2:
-    """(R − I) v of a carriage whose ISO rotation, tool relative to workpiece, is E, in one of the three exact forms.
+    """Displacement (R − I) v of v by a carriage with the ISO rotation E (tool relative to workpiece), in one of three exact forms.
 
     Parameters
     ----------
     rotation : "vector", "zyx" or "small"
-        Rotation by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation; or the papers' I + [E]×.
+        What R is: the rotation by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own angles; or I + [E]× as in the papers.
     rotation_rad, v_mm : arrays, shape (n, 3)
     work_side : bool
         A work-side carriage's own rotation is −E, and its transform is inverted exactly (math.md 2: p ← T⁻¹(p − L)). For the rotation by

@@ -269,7 +269,7 @@ class Opening:
 
     @property
     def text(self) -> str:
-        """For example +Z."""
+        """The direction as text, for example +Z."""
         return f"{'+' if self.side > 0 else '-'}{AXES[self.axis]}"
 
 
@@ -281,7 +281,7 @@ def opening(machine: Machine, vertical: int = 2) -> Opening:
     longest = int(np.argmax(np.abs(machine.tool_mm)))
     sizes = np.sort(np.abs(machine.tool_mm))
     if sizes[2] < SHORTEST_TOOL_MM:
-        reason = f"hemispheres open along +{AXES[vertical]}, the vertical axis: without tool_mm nothing says where the spindle is"
+        reason = f"hemispheres open along +{AXES[vertical]}, the vertical axis: without tool_mm the direction of the spindle is unknown"
         return Opening(vertical, 1, f"{reason}; if it is horizontal, state tool_mm in the machine file, else it may meet the cup")
     found = Opening(longest, -1 if machine.tool_mm[longest] > 0 else 1)
     if sizes[1] < OBLIQUE * sizes[2]:

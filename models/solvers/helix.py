@@ -58,7 +58,7 @@ class HelixSolution:
             return ()
         return (
             f"the fit is badly conditioned: {self.condition:.0f}, the limit is {CONDITION_LIMIT:.0f}. Set-up, scales and squareness can "
-            "hardly be told apart: the path has fewer than 3 turns or too small a part of the hemisphere (math.md 4.5)",
+            "hardly be distinguished: the path has fewer than 3 turns or too small a part of the hemisphere (math.md 4.5)",
         )
 
 

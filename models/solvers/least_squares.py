@@ -263,5 +263,5 @@ def _sentence(names: tuple[str, ...], v: F1) -> Combination:
         text = f"{shown[0]} leaves no trace in these data"
     else:
         more = f" and {len(members) - 4} more" if len(members) > 4 else ""
-        text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be told apart"
+        text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be distinguished"
     return Combination(parts, text)

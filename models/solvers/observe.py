@@ -399,7 +399,7 @@ class _Laser:
         return [f"tilt_{s}_1", f"tilt_{s}_2"], f"cosine_{s}", f"zero_{label}", f"drift_{label}"
 
     def _mirror(self) -> tuple[F1, F2, F1]:
-        """Normal of the mirror less the nominal beam, the two directions of tilt, and (1 + scale), (1 + cosine)."""
+        """Mirror normal minus nominal beam direction, the two tilt directions, and the factors (1 + scale) and (1 + cosine)."""
         tilt, cosine, _, _ = self._names()
         assert self.run.beam is not None
         across = perpendicular(self.run.beam)

@@ -119,9 +119,9 @@ def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
     """Shapes of an error motion and their variances: the prior covariance of its Legendre coefficients of order 2 to ``order``.
 
     An error motion is equally large and equally smooth everywhere on its stroke, its line taken away. Independent Legendre coefficients
-    would not say so: all polynomials are largest at the ends of the stroke. So the coefficients are those of a stationary process with a
-    squared exponential correlation of about ``length`` strokes (log-normal, `LENGTH_SPREAD`: one length alone would pretend to know how a
-    motion goes on where nothing was measured), whose independent shapes are the eigenvectors of their covariance.
+    would not: all polynomials are largest at the ends of the stroke. So the coefficients are those of a stationary process with a
+    squared exponential correlation of about ``length`` strokes (log-normal, `LENGTH_SPREAD`: a single length would pretend to know how a
+    motion continues where nothing was measured), whose independent shapes are the eigenvectors of their covariance.
 
     Returns
     -------

@@ -97,10 +97,10 @@ def _alike(label: str, name: str, z: F1, at: F1, unit: str) -> ResidualTest:
     span = float(np.median(at[max(length, 1) :] - at[: -max(length, 1)]))
     along = "in time" if name == "time" else f"along {name[-1]}"
     if length == 0:
-        text = f"{label}: neighbouring residuals {along} oppose each other"
+        text = f"{label}: neighbouring residuals {along} alternate in sign"
     else:
         far = f"over {span:.3g} {unit}" if span > STILL else "at one place"
-        text = f"{label}: residuals {along} are alike {far}: more than the model follows"
+        text = f"{label}: residuals {along} are correlated {far}: the model misses something there"
     return ResidualTest(label, name, q, p, p, False, text)
 
 

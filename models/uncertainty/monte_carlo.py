@@ -150,8 +150,10 @@ def numerical_tolerance(u: F1, digits: int) -> F1:
 
 @dataclass(frozen=True)
 class Validation:
-    """Whether the law of propagation may be used: differences of the interval's ends from Monte Carlo, shape (m,), against the
-    tolerance."""
+    """Check of the law of propagation against Monte Carlo, shapes (m,).
+
+    ``low``, ``high``: by how much the two ends of the coverage interval differ between the two methods.
+    """
 
     low: F1
     high: F1

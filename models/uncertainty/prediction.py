@@ -234,7 +234,7 @@ def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFre
 
 
 def _not_negative(covariance: F3) -> F3:
-    """The nearest covariance without negative variances, (m, 3, 3): that sizes are uncertain must not make any prediction better."""
+    """The nearest covariance without negative variances, (m, 3, 3): uncertain prior sizes must never make a prediction better."""
     value, vector = np.linalg.eigh(covariance)
     return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))
 

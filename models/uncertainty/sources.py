@@ -195,7 +195,7 @@ def omitted_terms(order: int, orders_above: int) -> tuple[Term, ...]:
 
 
 def omitted_prior_sd(solution: JointSolution, above: tuple[Term, ...]) -> F1:
-    """Prior standard deviation of the omitted terms, shape (len(above),): the documented one, scaled as the solver scaled that motion's.
+    """Prior standard deviation of the omitted terms, shape (len(above),): the documented value times the solver's scale for that motion.
 
     The solver may have found that this machine's errors are larger or smaller than the documented priors; the omitted orders of a motion
     follow its highest order that was kept.

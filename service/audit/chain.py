@@ -26,7 +26,7 @@ def key_name(key: bytes) -> str:
 
 
 def mac_of(key: bytes, digest: str) -> str:
-    """Seal of a record: nobody can forge a chain without the key."""
+    """Seal of a record: without the key a chain cannot be forged."""
     return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
 
 

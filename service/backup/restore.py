@@ -102,7 +102,7 @@ def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Tar
     if users := processes_using(database):
         raise BackupRefused(f"{database} is in use by process {users[0]}", "stop the service first: systemctl stop abbe")
     if database.exists() and is_locked(database):
-        raise BackupRefused(f"{database} is in use: somebody writes it", "stop the service first: systemctl stop abbe")
+        raise BackupRefused(f"{database} is in use by another process", "stop the service first: systemctl stop abbe")
     targets = _Targets(database, segment_folder(into.url, into.capture), *files_of(sqlite_base(database)))
     existing = targets.existing()
     if existing and not replace:

@@ -74,9 +74,7 @@ def _against_feed(run: Run) -> list[CampaignIssue]:
     ratio, slowest = float(t[-1] - t[0] - waited) / wanted, SLOWEST["ballbar" if run.is_bar else "laser"]
     if FASTEST <= ratio <= slowest:
         return []
-    unit = next(
-        (text for factor, text in TIME_UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is not what it says"
-    )
+    unit = next((text for factor, text in TIME_UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is wrong")
     what = f"it took {ratio:.2g} times as long as its path at its feed_mm_min: {unit}"
     return [
         CampaignIssue(run.run_id, what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False)

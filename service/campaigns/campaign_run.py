@@ -27,7 +27,7 @@ from abbe.service.storage.store import Store
 BALLBAR = "ballbar"
 """Value in ``[limits] continue_after``."""
 MOST_BREAKS = 5
-"""Most restarts of a test after losses of the box; then a person has to look."""
+"""How often a test restarts after the ball-bar box was lost; after that a person has to look."""
 BREAKS = (LinkDown, ReplyTimeout, Rebooted)
 
 

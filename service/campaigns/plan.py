@@ -230,7 +230,7 @@ def goal_lines(plan: Plan) -> list[str]:
         return [f"{here}; about {goal.minutes_needed:.0f} minutes would do", bound]
     if goal.limit_mm >= goal.wanted_mm:
         return [f"{here} and cannot be reached with these instruments", bound]
-    return [f"{here}, nor in a working day", bound]
+    return [f"{here}; a working day is too short, too", bound]
 
 
 def step_rows(plan: Plan) -> list[tuple[str, ...]]:

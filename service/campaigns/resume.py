@@ -172,10 +172,10 @@ class _Finder:
             self.mountings[setup] = number + 1
             return mounted_anew(item, number + 1)
         kept = len(item.resume_trail.carried)
-        how = f"goes on after point {kept}, which is read again" if kept else "begins again"
+        how = f"resumes after point {kept}, which is read again" if kept else "begins again"
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
-            how = f"goes on at {at} of its path, a stretch of which is read again"
+            how = f"resumes at {at} of its path, a stretch of which is read again"
         messages.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
         return item
 

@@ -175,10 +175,10 @@ async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s:
         try:
             done = await finish_when_safe(session.controller, store, site, limit_s=wait_s, clock=SystemClock(), notify=print_line)
         except asyncio.CancelledError as ended:
-            ended.add_note("the unverified table is STILL ACTIVE; the next abbe command takes it back before anything else")
+            ended.add_note("the unverified table is STILL ACTIVE; the next abbe command rolls it back before anything else")
             raise
         except Exception as ended:
-            for note in (*notes, "the unverified table may still be active; the next abbe command takes it back before anything else"):
+            for note in (*notes, "the unverified table may still be active; the next abbe command rolls it back before anything else"):
                 ended.add_note(note)
             raise
         print_line(f"rolled back: {done or 'nothing was left to roll back'}")

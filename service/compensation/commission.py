@@ -64,7 +64,7 @@ class CommissioningContext:
         """Read all places with test tables in force; afterwards the old ones are in force again, whatever happens."""
         now = await read_base(self.session.controller)
         if now.crc != base.crc:
-            raise TableMismatch("somebody changed the active table during commissioning", "begin again")
+            raise TableMismatch("the active table was changed during commissioning", "start commissioning again")
         found: list[PlaceReadings] = []
 
         async def read() -> Verdict:

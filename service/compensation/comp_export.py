@@ -423,7 +423,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     found = contents(path)
     claims = check(sealed, found, expected, now)
     if {f.name: f.text for f in read} != {name: io.StringIO(held.decode("utf-8"), None).read() for name, held in found.items()}:
-        raise SignatureRefused(f"{path} was changed while it was read", "try again; nothing was taken in")
+        raise SignatureRefused(f"{path} was changed while it was read", "try again; nothing was imported")
     return SealStatus(claims, f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)")
 
 

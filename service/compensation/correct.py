@@ -111,7 +111,7 @@ async def push(context: PushContext, admission: Admission, before: list[Run]) ->
         A person asked for it; the old table is in force.
     """
     proposed = admission.precheck.proposed
-    context.progress(Progress("solve", 0.0, 1.0, None, "once more, for what the newest run says of it"))
+    context.progress(Progress("solve", 0.0, 1.0, None, "again, with the newest run"))
     made = StoredProposal(
         admission.precheck.number, proposed, await solve_again(context.store, context.site, proposed.campaign, proposed.base_tables)
     )
@@ -232,12 +232,12 @@ async def _push_and_verify(work: _PushQuestions, wanted: WantedTable) -> tuple[P
             context.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
             pushed = await pushing.bring(wanted, questions)
     if work.after is None or work.decision is None:
-        raise TakenBack(f"the table was taken back: {pushed.why}", "look at the control's convention: abbe comp commission")
+        raise TakenBack(f"the table was rolled back: {pushed.why}", "look at the control's convention: abbe comp commission")
     decision = work.decision if pushed.kept == work.decision.keep else VerificationDecision(pushed.kept, pushed.why)
     try:
         await _store_verification(context, work.verified_as, pushed, work.after, decision)
     except AbbeError as error:  # the table is decided and acts; only the record is missing
-        error.add_note(f"the table is {'kept and in force' if decision.keep else 'taken back'}: {decision.text}")
+        error.add_note(f"the table is {'kept and in force' if decision.keep else 'rolled back'}: {decision.text}")
         raise
     return pushed, work.after, decision
 

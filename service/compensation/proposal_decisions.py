@@ -73,7 +73,7 @@ def _pushed(own: Journal, journal: JournalView) -> ProposalStatus | None:
         return ProposalStatus("rolled back", f"by push {last.push} itself: {f.why}")
     if last.state is not PushState.KEEP:
         open_ = "" if last.state in TERMINAL else "; the next command that uses the machine finishes it"
-        return ProposalStatus("pushed", f"push {last.push} stands at {last.state}{open_}")
+        return ProposalStatus("pushed", f"push {last.push} is in state {last.state}{open_}")
     later = [j for n, j in journal.pushes.items() if n > last.push and j[-1].state is PushState.KEEP]
     if not later:
         return ProposalStatus("kept", f"push {last.push}: {f.verify}")
@@ -89,7 +89,7 @@ def valid_approval(
     proposed: Proposed, approvals: Sequence[ProposalApproval], now_s: float, *, two_people: bool
 ) -> tuple[ProposalApproval | None, str]:
     """The last valid approval; otherwise None and the reason."""
-    why = "nobody has approved it: abbe comp approve"
+    why = "not approved yet: run abbe comp approve"
     for row in reversed(approvals):
         if two_people and same_person(row.name, proposed.by):
             why = f"{row.name} proposed it and cannot approve it"
@@ -150,7 +150,7 @@ def _against_approval(number: int, proposed: Proposed, name: str, now_s: float) 
     if now_s >= proposed.valid_until_s:
         yield f"the measurement of proposal {number} is older than {proposed.limits.age_h:g} h", "measure again"
     if proposed.two_people and same_person(name, proposed.by):
-        yield f"{name} proposed it: this machine needs a second person to approve", "let somebody else approve it"
+        yield f"{name} proposed it: this machine needs a second person to approve", "ask another person to approve it"
 
 
 def reject(store: Store, number: int, name: str, reason: str, clock: Clock, account: str | None = None) -> ProposalRejection:

@@ -115,7 +115,7 @@ def mark_of(boots: Iterable[int | None]) -> str:
 async def candidate_context(
     site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
 ) -> CandidateContext:
-    """This machine, its controller and its table in force, now. ``attended``: a person who may approve is at the machine."""
+    """The present state of this machine, its controller and its table in force. ``attended``: an authorised approver is at the machine."""
     journal = await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)
     month_ago = {} if attended else _on_grid(_month_ago(journal, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}

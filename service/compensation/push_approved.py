@@ -139,5 +139,5 @@ async def _finish_when_safe(context: PushContext, order: PushOrder, error: Still
     try:
         done = await order.control.unless_aborted(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return JobOutcome("failed", f"{with_notes(error)}; {with_notes(again)}; it is taken back as soon as it can be")
+        return JobOutcome("failed", f"{with_notes(error)}; {with_notes(again)}; it will be rolled back as soon as possible")
     return JobOutcome("rolled back", f"{with_notes(error)}; {done or 'nothing was left to roll back'}")

@@ -33,7 +33,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed, push_log
 
-MAKE_READY = "make the machine ready (interlocks, link); the next abbe command takes it back before anything else"
+MAKE_READY = "make the machine ready (interlocks, link); the next abbe command rolls it back before anything else"
 UNTRUSTED_CONTROL = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"
 MAY_BE_ACTIVE = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
@@ -152,7 +152,7 @@ class Pushing:
             raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
         _under_way.add(key)
         # Refuse new pauses first, then wait for a pending one: no pause can come between and hold an unverified table in force.
-        self.control.no_pause_reason = "a table that nobody has verified may be in force: stop it, or let it end"
+        self.control.no_pause_reason = "an unverified table may be in force: stop the push, or let it finish"
         try:
             await self.control.gate()
             book = await StoreBook.new(self.store, self.site.name, self.clock, self.site.control)
@@ -250,7 +250,7 @@ class Pushing:
             if known.base_crc != wanted.base.crc or known.base_image != wanted.base.image:
                 return ["BASE: the active table is not the one that was in force while this one was made"]
             if (known.boot, known.gen) != (wanted.base.status.boot_id, wanted.base.status.gen):
-                return ["GENERATION: the controller restarted, or somebody wrote into a bank, since the base was read"]
+                return ["GENERATION: the controller restarted, or a bank was changed, since the base was read"]
             return questions.validate()
 
         async def approve(journal: Journal) -> Approval:

@@ -43,7 +43,7 @@ async def recover(controller: TableController, store: Store, site: Site, *, acce
     Parameters
     ----------
     accept_by : str
-        Person who vouches for a table in force that this database did not push; empty: nobody does.
+        Person who vouches for a table in force that this database did not push; empty: none.
 
     Raises
     ------

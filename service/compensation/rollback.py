@@ -148,7 +148,7 @@ def known_images(journal: JournalView) -> set[bytes]:
 
 
 def check_known(journal: JournalView, base: Base) -> None:
-    """Refuse to overwrite a table that a person or another program put there before somebody has looked at it.
+    """Refuse to overwrite a table written by a person or another program, until a person has checked it.
 
     Raises
     ------

@@ -39,7 +39,7 @@ log = structlog.get_logger("abbe.orders")
 CAMPAIGN: Final = "campaign"
 ROLLBACK: Final = "rollback"
 PUSH: Final = "push"
-NO_PAUSE = "a table is being changed: stop it, or let it end"
+NO_PAUSE = "a table is being changed: stop the rollback, or let it finish"
 OrderedRollback = Callable[[RollbackOrder], Awaitable[JobOutcome]]
 """``await rollback(order)``: restores the previous table; returns the outcome as far as it learned it."""
 Push = Callable[[PushOrder], Awaitable[JobOutcome]]
@@ -286,7 +286,7 @@ def _answer(request: int, outcome: Outcome, text: str) -> Answer:
 
 
 def may(store: Store, who: str, need: Permission) -> bool:
-    """Return whether ``who`` (``user:NAME`` or ``token:NAME/TOKEN``) is a user who may log in and whose role has the right ``need``."""
+    """Return whether ``who`` (``user:NAME`` or ``token:NAME/TOKEN``) can log in and has a role with the right ``need``."""
     name = person(who)
     user = store.people.find(name) if name else None
     if user is None or user.disabled_utc is not None:

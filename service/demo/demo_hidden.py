@@ -116,7 +116,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
     result.job, result.journal = job, journal
     result.finding = await _search(job, journal, progress)
     ids = await measure(session, store, site, new_measurement(site.machine, rate_hz=rate, name=ANEW), progress=progress)
-    progress(Progress("prediction", 0.0, 1.0, None, "the new measurement against what the model says"))
+    progress(Progress("prediction", 0.0, 1.0, None, "comparing the new measurement with the model"))
     new = await asyncio.to_thread(from_store, store, ANEW)
     model = current(store, site.name)
     result.anew = await asyncio.to_thread(validate_on, old, new, job.effects, model, thin=few)

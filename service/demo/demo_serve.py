@@ -142,7 +142,7 @@ def free_port(wanted: int) -> int:
 
 
 def add_approver(store: Store, clock: Clock) -> str:
-    """Add a user who may approve; return the new password, which is stored only as a hash."""
+    """Add a user with the right to approve; return the new password, which is stored only as a hash."""
     password = secrets.token_urlsafe(12)
     People(store, clock).add(USER, "approver", password)
     return password

@@ -34,9 +34,9 @@ KNOWN = (
     "centre_mm", "radius_mm", "turns", "axis", "opens", "law", "even", "chord_mm", "rate_hz", "length_calibrated", "u_length_mm",
 )  # fmt: skip
 """Keys of a stored set-up that define its helix: without all of them the path or the bar is unknown."""
-NO_HELIX = "the run is no helix: the sequencer repeats nothing else"
-NO_PATH = "what is stored of the helix does not say what path it was, or it was of another tool"
-TURNED = "somebody has to turn the bar or change its ball in between"
+NO_HELIX = "the run is not a helix, and the sequencer can repeat only a helix"
+NO_PATH = "the stored set-up does not define the path of the helix, or the helix was measured with another tool"
+TURNED = "a person has to turn the bar or change its ball in between"
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class FoundTest(FileObject):
 
 
 class FoundAgreement(FileObject):
-    """Agreement of a run that was never fitted, if nothing is missing: rms over the allowed one, and probability of as much by chance."""
+    """Test of a run that was never fitted: ``times``: its rms over the allowed one; ``p``: probability of so large an rms by chance."""
 
     run: str
     times: float = Field(ge=0)

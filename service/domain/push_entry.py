@@ -14,7 +14,7 @@ class PushState(StrEnum):
     SNAPSHOT = "SNAPSHOT"
     """The table in force was read twice; the entry holds it in full."""
     REJECTED = "REJECTED"
-    """Validation or approval said no; nothing was written."""
+    """Validation failed or approval was refused; nothing was written."""
     VALIDATED = "VALIDATED"
     APPROVED = "APPROVED"
     LEASED = "LEASED"

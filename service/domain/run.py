@@ -388,7 +388,8 @@ class Run:
             )
         except (AttributeError, KeyError, TypeError, ValueError) as err:
             raise StoreError(
-                f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document lacks or garbles {err}", "it was not written by Abbe"
+                f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document has a missing or invalid field {err}",
+                "it was not written by Abbe",
             ) from None
 
     def to_document(self) -> Doc:

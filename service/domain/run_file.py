@@ -142,7 +142,7 @@ class CampaignFile(FileObject):
         for what, names in (("run_id", [run.run_id for run in self.runs]), ("file", [run.file for run in self.runs])):
             twice = next((name for name in names if names.count(name) > 1), None)
             if twice is not None:
-                raise ValueError(f"runs: {what} {twice!r} stands there twice, expected different ones")
+                raise ValueError(f"runs: {what} {twice!r} appears twice, expected different ones")
         if "campaign.json" in {run.file for run in self.runs} | {self.current_model.errors}:
             raise ValueError("runs: a file is named 'campaign.json', expected another name")
         return self

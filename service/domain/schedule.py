@@ -138,7 +138,7 @@ def complete(window: Window) -> Window:
     if not ((all(by_cron) and not any(weekly)) or (all(weekly) and not any(by_cron))):
         raise ValueError("expected either cron and hours, or days, start and end")
     if any(wall is not None and wall.tzinfo is not None for wall in (window.start, window.end)):
-        raise ValueError("expected start and end without an offset: timezone says it")
+        raise ValueError("expected start and end without a UTC offset: timezone defines it")
     return window
 
 

@@ -119,7 +119,7 @@ class OutlierFound(FileObject):
 
 
 class ResidualTestResult(FileObject):
-    """One test of one run's residuals; ``text`` says what was found, empty where nothing was."""
+    """One test of one run's residuals; ``text``: what was found; empty if nothing."""
 
     run: str
     test: str

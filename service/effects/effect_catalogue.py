@@ -99,7 +99,7 @@ def checked(effects: tuple[Effect, ...], taken: Iterable[str]) -> tuple[Effect, 
     """
     fault = _fault(list(effects), set(taken))
     if fault:
-        raise EffectPluginBroken(f"effect left out: {fault}", "docs/how-to/own-effect.md says what an effect must hold")
+        raise EffectPluginBroken(f"effect left out: {fault}", "docs/how-to/own-effect.md lists what an effect must define")
     return effects
 
 

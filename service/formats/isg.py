@@ -122,7 +122,7 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
         raise file.wrong(line, f"heading {' '.join(names)}: {strange[0] if strange else 'more than one argument'} cannot be read")
     again = [n for n in names if n in curves or n in square]
     if again or not rows:
-        raise file.wrong(line, f"{again[0]} stands in two blocks" if again else "there are no rows under this heading")
+        raise file.wrong(line, f"{again[0]} appears in two blocks" if again else "there are no rows under this heading")
     for n, cells in rows:
         if len(cells) != len(names):
             raise file.wrong(n, f"{len(cells)} values for {len(names)} columns")

@@ -65,7 +65,7 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
     try:
         return await _proposed(context, by)
     except REFUSALS as no:
-        return JobOutcome("ended", f"no proposal: {no}; campaign {name!r} stays, and `abbe solve` shows what it says")
+        return JobOutcome("ended", f"no proposal: {no}; campaign {name!r} is kept; `abbe solve` shows its result")
     except BaseException as error:
         error.add_note(f"campaign {name!r} is measured: `abbe comp propose MACHINE.toml {name!r}` solves it and proposes")
         raise

@@ -134,7 +134,7 @@ def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
             return _begin_restaging(step.truth, other)
     return record(
         PushState.OPERATOR,
-        why="the old table is no longer in its bank, and somebody else wrote another one there",
+        why="the old table is no longer in its bank: another program overwrote it",
         **mismatch_doc(f, truth),
     )
 

@@ -49,7 +49,7 @@ class Book(Protocol):
         ...
 
     async def append(self, journal: Journal, state: PushState, doc: Doc) -> PushEntry:
-        """Write the next entry; on return it is on disk. Raises otherwise, or if somebody else wrote an entry meanwhile."""
+        """Write the next entry; on return it is on disk. Raises otherwise, or if another process wrote an entry meanwhile."""
         ...
 
 
@@ -116,13 +116,13 @@ def no_actors() -> PushActors:
     """Actors for a recovery, which asks no question: every answer is no."""
 
     async def no_reason(journal: Journal) -> list[str]:
-        return ["nobody is there to check it"]
+        return ["no one is present to check it"]
 
     async def no_approval(journal: Journal) -> o.Approval | None:
         return None
 
     async def no_verdict(journal: Journal) -> o.Verdict:
-        return o.Verdict(False, "nobody is there to measure it")
+        return o.Verdict(False, "no one is present to measure it")
 
     return PushActors(no_reason, no_approval, no_verdict, no_verdict)
 
@@ -187,7 +187,7 @@ class ControllerPort:
             return o.Done(await self._actors.validate(journal))
         if kind is OperationKind.APPROVE:
             approval = await self._actors.approve(journal)
-            return o.Refused("nobody approved it") if approval is None else o.Done(approval)
+            return o.Refused("it was not approved") if approval is None else o.Done(approval)
         return o.Done(await self._while_leased(self._actors.probe if kind is OperationKind.PROBE else self._actors.verify, journal))
 
     async def _while_leased(self, question: Callable[[Journal], Awaitable[o.Verdict]], journal: Journal) -> o.Verdict:

@@ -39,7 +39,7 @@ class OperationOrder:
     level : int
         Capability level of the controller (`abbe.service.push.limits`).
     attended : bool
-        A person who may approve is at the machine.
+        An authorised approver is at the machine.
     chunk_words : int
         Registers of one write, even.
     table : int
@@ -322,7 +322,7 @@ class StoreBook:
             return cls(store, chain, clock, 1, GENESIS, ())
         last = (await book.entries())[-1]
         if last.state not in TERMINAL or last.state is PushState.OPERATOR:
-            raise UnsafeToMove(f"push {last.push} of {chain} stands at {last.state}", "finish it first")
+            raise UnsafeToMove(f"push {last.push} of {chain} is in state {last.state}", "finish it first")
         return cls(store, chain, clock, last.push + 1, last.digest, ())
 
     async def entries(self) -> Journal:
@@ -337,7 +337,7 @@ class StoreBook:
         JournalBroken
             This state cannot follow.
         StoreError
-            Somebody else has written an entry meanwhile, or the database refuses it.
+            Another process has written an entry meanwhile, or the database refuses it.
         """
         entry = follow(journal, self._push, state, doc, utc=utc_text(self._clock.utc()), head=self._head, machine=self._machine)
         await self._store.write(self._store.pushes.append, entry)

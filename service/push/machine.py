@@ -171,7 +171,7 @@ def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
     if in_force(f, truth) != "base" or truth.active != f.base_bank:
         return "the table in force is not the approved base any more"
     if truth.gen != gen:
-        return "somebody else changed a bank"
+        return "a bank was changed from outside"
     if truth.owner != f.owner:
         return "the lease is lost"
     return f"not safe now: {truth.unsafe}" if truth.unsafe else ""
@@ -261,7 +261,7 @@ def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushS
         if truth is None:
             return Operation(OperationKind.LOOK)
         if (truth.boot, truth.gen) != (f.boot, f.probation_gen) or in_force(f, truth) != "candidate":
-            return record(PushState.ROLLBACK, why="the controller restarted, or somebody changed a table, during probation")
+            return record(PushState.ROLLBACK, why="the controller restarted, or a table was changed from outside, during probation")
         return record(PushState.ROLLBACK, why=f"not safe now: {truth.unsafe}") if truth.unsafe else Operation(question)
     if isinstance(known.verdict, Done) and isinstance(known.verdict.value, Verdict) and known.verdict.value.passed:
         return record(then, **{question.value: known.verdict.value.text})
@@ -281,7 +281,7 @@ def _keep(f: PushFacts, known: Knowledge) -> Operation:
     if step.state is not PushState.PROBATION:
         return step
     if (step.doc or {}).get("probation_gen") != f.probation_gen:
-        return record(PushState.ROLLBACK, why="somebody changed a table while it was verified")
+        return record(PushState.ROLLBACK, why="a table was changed from outside during the verification")
     return record(PushState.KEEP)
 
 

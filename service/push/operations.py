@@ -171,7 +171,7 @@ class Knowledge(NamedTuple):
     approved_until_s : float
         Monotonic time at which the approval ends.
     wrote_last : bool
-        This process wrote the last journal entry: nobody has done yet what it permits.
+        This process wrote the last journal entry, so the operation that the entry permits has not been done yet.
     rested : bool
         This process has just recorded that rollback is blocked: it does not retry by itself.
     stop : str

@@ -30,7 +30,7 @@ class Image:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The reason why staging failed. ``foreign``: somebody else has written into the bank."""
+    """The reason why staging failed. ``foreign``: another program has written into the bank."""
 
     why: str
     foreign: bool = False
@@ -44,7 +44,7 @@ class Coherent:
 
 
 def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
-    """Next operation of a full read between two looks; None: the looks differ, so somebody changed something in between.
+    """Next operation of a full read between two looks; None: the looks differ, so something changed in between.
 
     ``count``: registers to read, 0 for the length in the image's header. ``again``: read a second time and decode independently.
     """
@@ -85,9 +85,9 @@ def _chunk(image: Image, known: Knowledge) -> Operation | Failed:
         return Operation(OperationKind.READ_CHUNK, bank=image.bank, first=first, count=len(data) // 2, data=data)
     if known.truth is None:
         return Operation(OperationKind.LOOK)
-    # Overwrite foreign content only while the generation proves that nobody else has written.
+    # Overwrite foreign content only while the generation proves that no other program has written.
     if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):
-        return Failed("somebody else wrote into the bank, or the controller restarted; what it holds now was left alone", foreign=True)
+        return Failed("another program wrote into the bank, or the controller restarted; the bank was left unchanged", foreign=True)
     if known.rewrites_here >= REWRITES_PER_CHUNK or known.rewrites >= REWRITES:
         return Failed(f"registers {first}.. do not hold what was written, also after {known.rewrites_here} repeats")
     return write

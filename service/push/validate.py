@@ -105,7 +105,7 @@ class CandidateContext:
     now_s : float
         Seconds UTC.
     attended : bool
-        A person who may approve is at the machine.
+        An authorised approver is at the machine.
     last_push_s : float
         Time of the last unattended push; minus infinity for never.
     """
@@ -246,7 +246,7 @@ def _seal(c: Candidate) -> Iterator[str]:
     if c.digest != digest:
         yield "HASH: the table is not the one that its digest was computed from"
     if not c.seal.role:
-        yield "UNSIGNED: nobody vouches for it"
+        yield "UNSIGNED: it has no signature"
     elif c.seal.role not in SIGNERS:
         yield f"ROLE: signed by a {c.seal.role}, only a metrologist may"
     elif c.seal.digest != digest:

@@ -75,8 +75,8 @@ class VolumeMap:
     """Deviation (actual minus nominal, best-fit rigid motion removed) at the nodes of an even grid over the strokes, X slowest.
 
     Nodes lie at every combination of ``x_mm``, ``y_mm``, ``z_mm``. ``motions``: the motions that make up the map. ``deviation_um``: dX, dY,
-    dZ; ``expanded_um``: their U and that of the length, k = 2. ``told``: whether the 95 % ellipsoid around the deviation excludes zero;
-    otherwise neither error nor direction is known. ``hidden``: motions without a map of their own.
+    dZ; ``expanded_um``: their U and that of the length, k = 2. ``told`` (significant): whether the 95 % ellipsoid around the deviation
+    excludes zero; otherwise neither error nor direction is known. ``hidden``: motions without a map of their own.
     """
 
     solution: int

@@ -31,7 +31,7 @@ class PredictedRms:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalSummary(StoredResult):
-    """Proposed tables. ``state`` changed: somebody altered the stored row, so its content is unknown. ``by``: account of the proposer."""
+    """Proposed tables. ``state`` changed: the stored row was altered, so its content is unknown. ``by``: account of the proposer."""
 
     solution: int
     state: ProposalState

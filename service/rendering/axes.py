@@ -209,5 +209,5 @@ def draw_sequence(svg: Svg, at: XY, cell: float, top: float, unit: str) -> None:
 
 
 def sequence_level(size: float, top: float) -> int:
-    """Number of the colour of a size, 1 to 5."""
+    """Level of a size on the colour scale, 1 to 5."""
     return 1 + min(SEQUENCE - 1, int(SEQUENCE * size / top))

@@ -82,7 +82,7 @@ def discovery_report(store: Store, number: int, rules: Rules) -> Document:
     finding = next((step.finding for step in steps if step.finding is not None), None)
     start = steps[0].start if steps else None
     if finding is None or start is None:
-        raise StoreError(f"discovery {number} has not ended", "give the same abbe discover command again: it goes on there")
+        raise StoreError(f"discovery {number} has not ended", "repeat the same abbe discover command: it resumes there")
     name = next(c.name for c in store.campaigns.all() if c.id == record.campaign_id)
     campaign = from_store(store, name)
     found = _Found(finding, campaign, thinned(campaign.runs), start.flags, [(step.state, step.why) for step in steps])

@@ -34,7 +34,7 @@ VERDICTS: dict[str, tuple[Sign, str]] = {"pass": ("ok", "Passed"), "fail": ("bad
 ENDS: dict[PushState, tuple[Sign, str]] = {
     PushState.KEEP: ("ok", "Kept"),
     PushState.ACCEPTED: ("open", "Accepted by a person"),
-    PushState.ROLLED_BACK: ("bad", "Taken back: the old table is in force"),
+    PushState.ROLLED_BACK: ("bad", "Rolled back: the old table is in force"),
     PushState.REJECTED: ("open", "Refused: nothing was written"),
     PushState.ABORTED: ("open", "Never in force: the old table stayed"),
     PushState.OPERATOR: ("bad", "A person has to look"),
@@ -178,7 +178,7 @@ def _verdict(journal: Sequence[PushEntry], known: PushFacts) -> tuple[Sign, str,
     state = journal[-1].state
     sign, word = ENDS.get(state, ("open", "Not ended"))
     why = known.why or known.verify or "; ".join(known.reasons)
-    return sign, word, (why or f"it stands at {state}") + ("" if state in TERMINAL else f" (state {state})")
+    return sign, word, (why or f"it is in state {state}") + ("" if state in TERMINAL else f" (state {state})")
 
 
 def _chain(entries: Sequence[PushEntry]) -> list[str]:

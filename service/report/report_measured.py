@@ -229,7 +229,7 @@ def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Run]) -> list[st
     for label, _, _, state, why in states:
         reason = f": {why}" if why else ""
         if label in whole:
-            out.append(f"run {label} is {state}{reason}; {whole[label]} went on with it, its readings count there")
+            out.append(f"run {label} is {state}{reason}; {whole[label]} continued it, and its readings count there")
         elif label in short:
             out.append(f"run {label} is {short.pop(label)}, it is not in the figures{reason}")
         elif state != "complete":

@@ -112,7 +112,7 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
         raise FileFormatError(f"{path}: covariance.parameters: expected a list of names, got {short_repr(names)}", 'e.g. ["C0Y", "EXX.1"]')
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
-        raise FileFormatError(f"{path}: covariance.parameters: {twice!r} stands there twice", "name each parameter once")
+        raise FileFormatError(f"{path}: covariance.parameters: {twice!r} appears twice", "name each parameter once")
     return tuple(names)
 
 

@@ -131,7 +131,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
         raise FileFormatError(f"{path}: line 1: columns are not separated by commas", "write x_mm,y_mm,z_mm and decimal points")
     twice = next((name for name in header if header.count(name) > 1), None)
     if twice is not None:
-        raise FileFormatError(f"{path}: column {twice!r} stands there twice", "leave one out")
+        raise FileFormatError(f"{path}: column {twice!r} appears twice", "leave one out")
     for name in header:
         if name not in KNOWN and name.lower().partition("_")[0] in _MEANT:
             wanted = next(

@@ -322,6 +322,6 @@ class _ApprovedPush(_AlarmJob):
         return await super().end(outcome)
 
     async def interrupted(self) -> None:
-        """Record its state by the journal; without enough time the next start does."""
+        """Record the state that the push journal shows; if time runs out, the next start does it."""
         if self._is_begun:
             await self._manager.interrupted(self._found, self._after)

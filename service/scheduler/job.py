@@ -46,7 +46,7 @@ class Job(ABC, Generic[T]):
     """Whether the work ends by itself when aborted; otherwise it is cancelled."""
 
     async def begin(self) -> None:
-        """Record the begin. If this fails, the work is not started."""
+        """Record that the job begins; if this fails, do not start the work."""
 
     @abstractmethod
     async def do(self, progress: ProgressSink, control: Control) -> T:

@@ -120,17 +120,17 @@ def whole_span(name: str, first: datetime, last: datetime) -> SlotOutcome:
 
 
 def caught_up(name: str, instead: Sequence[datetime], by: datetime) -> tuple[str, str]:
-    """Return code and sentence of the one alarm for all slots that one run stands for."""
+    """Return the code and text of the single alarm for all missed slots that one run makes up for."""
     slots = (
         f"{len(instead)} slots from {instead[0]:%F %R} to {instead[-1]:%F %R} UTC were"
         if len(instead) > 1
         else f"slot {instead[0]:%F %R} UTC was"
     )
-    return "SCH-005", f"{name}: {slots} missed; the run of slot {by:%F %R} UTC stands for them"
+    return "SCH-005", f"{name}: {slots} missed; the run of slot {by:%F %R} UTC replaces them"
 
 
 def still_waits(waiting: Waiting, hindrance: Hindrance) -> tuple[str, str]:
-    """Return code and sentence for a slot that must be caught up but cannot start yet."""
+    """Return the code and text of the alarm for an overdue slot that cannot start yet."""
     return "SCH-006", f"{_slot(waiting.schedule.name, waiting.slot)} is late and waits: {hindrance.text}"
 
 

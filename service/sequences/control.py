@@ -57,7 +57,7 @@ class Prompts:
 
 
 T = TypeVar("T")
-STOPPED = Stopped("stopped as asked", "`abbe measure MACHINE.toml --resume CAMPAIGN` goes on from here")
+STOPPED = Stopped("stopped as asked", "`abbe measure MACHINE.toml --resume CAMPAIGN` resumes it")
 ABORTED = Aborted("aborted as asked: the axes were stopped where they were", "look at the machine, then `abbe measure --resume`")
 
 
@@ -99,7 +99,7 @@ class Control:
         """Resume after a pause, once the preconditions are checked again."""
         if self._pause:
             self._pause = False
-            if self._now.state == State.PAUSING:  # taken back before it took effect
+            if self._now.state == State.PAUSING:  # withdrawn before it took effect
                 self._set(replace(self._now, state=State.RUNNING, why=""))
             self._ask()
 

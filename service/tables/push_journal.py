@@ -236,7 +236,7 @@ class JournalView:
         """
         kept = [j for j in self.pushes.values() if ended_as(j) is PushState.KEEP]
         if not kept:
-            raise TableRefused("no push of this machine was kept: there is nothing to take back", NOTHING)
+            raise TableRefused("no push of this machine was kept: there is nothing to roll back", NOTHING)
         if self.origin(kept[-1]).kind == KIND:
             raise TableRefused(
                 f"the last kept push ({kept[-1][-1].push}) was a rollback itself",
@@ -253,7 +253,7 @@ class JournalView:
             None is possible; the message gives the reason.
         """
         if not self.entries:
-            raise TableRefused("no push of this machine is in the journal: there is nothing to take back", NOTHING)
+            raise TableRefused("no push of this machine is in the journal: there is nothing to roll back", NOTHING)
         crc, settled = self.wanted
         if crc is None or not settled:
             text = outcome_of(self._of(self.entries[-1].push)).text
@@ -321,7 +321,7 @@ def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
 def _other(push: PushedTable) -> str:
     at = f" at {push.control}" if push.control else ""
     what = "its table was never verified; if this is that control, nothing is measured on it"
-    return f"push {push.push} of machine {push.machine!r}{at} stands at {push.state}: {what}"
+    return f"push {push.push} of machine {push.machine!r}{at} is in state {push.state}: {what}"
 
 
 def ended_as(journal: Journal) -> PushState:
@@ -360,10 +360,10 @@ def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome
         case PushState.OPERATOR:
             return JobOutcome(OPEN, f"{operator_needed(journal)}; a person has to look")
         case state if state in BEFORE_ACTIVATION:
-            return JobOutcome(OPEN, f"{name} stands at {state}: {names.old} is in force; the next start closes the journal")
+            return JobOutcome(OPEN, f"{name} is in state {state}: {names.old} is in force; the next start closes the journal")
     pending = f" ({known.pending})" if known.pending else ""
     return JobOutcome(
-        OPEN, f"{name} stands at {last.state}{pending}: an unverified table may be in force; it is taken back before anything else"
+        OPEN, f"{name} is in state {last.state}{pending}: an unverified table may be in force; it is rolled back before anything else"
     )
 
 

@@ -113,7 +113,7 @@ def _whose(store: Store, site: Site, push: PushedTable) -> str:
 
 def _remedy(site: Site, push: PushedTable) -> str:
     if push.may_be_active and push.state != PushState.OPERATOR and push.machine != site.name:
-        return f"start any command with the machine file of {push.machine!r}, which takes it back; or {LOOK_REMEDY}"
+        return f"start any command with the machine file of {push.machine!r}, which rolls it back; or {LOOK_REMEDY}"
     return LOOK_REMEDY
 
 

@@ -1,1 +1,1 @@
-"""Who may do what: users, roles, passwords, sessions, tokens. Knows neither web nor command line."""
+"""Access rights: users, roles, passwords, sessions and tokens, independent of the web and the command line."""

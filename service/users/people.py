@@ -193,7 +193,7 @@ class People:
     def _keep_an_admin(self, user: UserRecord) -> None:
         others = [u for u in self._store.people.all() if u.id != user.id and u.role == Role.ADMIN and u.disabled_utc is None]
         if user.role == Role.ADMIN and user.disabled_utc is None and not others:
-            raise UserRefused(f"{user.name!r} is the only admin", "make somebody else admin first: abbe user role")
+            raise UserRefused(f"{user.name!r} is the only admin", "make another user admin first: abbe user role")
 
     def check(self, name: str, password: str) -> UserRecord | None:
         """The user, if the password matches and the user is enabled; else None. An unknown user takes the same time."""

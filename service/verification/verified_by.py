@@ -33,7 +33,7 @@ _TEXTS: dict[str, str] = {
     "push": "verified by push {number} of {when}, which measured before and after; not checked since",
     "rollback": "unverified since the rollback of {when} (push {number})",
     "accepted": "unverified since a person accepted the table, {when}",
-    "changed": "unverified since somebody else changed the table in force",
+    "changed": "unverified since the table in force was changed from outside",
     "other": "unverified: check {number} of {when} was measured with another table than the one in force",
     "open": "unverified: push {number} of {when} is not finished",
     "never": "not checked yet",

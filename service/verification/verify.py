@@ -93,7 +93,7 @@ def check_before(before: VerificationFigures) -> None:
         A figure is no number, or no air temperature is recorded.
     """
     what = "" if before.finite else "a figure of it is no number"
-    what = what or ("" if before.air_c is not None else "no reading of it says how warm the air was")
+    what = what or ("" if before.air_c is not None else "no air temperature was recorded")
     if what:
         raise TableRefused(f"nothing can be compared with the verification before: {what}", "measure it again; nothing was written")
 

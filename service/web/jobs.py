@@ -22,7 +22,7 @@ STATUS = {"unknown": 404, "busy": 409, "forbidden": 403, "conflict": 409}
 NUMBER = Path(pattern="^[0-9a-f]{12}$", description="Number of the job")
 PROMPT = Path(ge=1, le=10**6, description="Number of the prompt, from the state of the job")
 REFUSALS: dict[int | str, dict[str, object]] = {
-    401: {"model": Problem, "description": "Nobody is logged in"},
+    401: {"model": Problem, "description": "No user is logged in"},
     403: {"model": Problem, "description": "The role does not allow it"},
     404: {"model": Problem, "description": "There is no such job"},
     409: {"model": Problem, "description": "Not now: the machine measures; the job has ended, cannot pause, or asks for something else"},

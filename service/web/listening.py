@@ -35,7 +35,7 @@ def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Se
     host : str
         Address to listen on.
     admins : callable
-        Number of admins with a password who may log in; called only if needed. Other users could not lock anybody out.
+        Number of admins who have a password and can log in; called only if needed. Other users do not count: they cannot manage access.
     tls : bool
         Whether a certificate is configured.
     names : sequence of str

@@ -120,7 +120,7 @@ class BallbarDevice:
         self.settings = Settings()
 
     def push(self, *, out: bool) -> None:
-        """Somebody leans on the bar, so that it is out of its range, or lets go."""
+        """Push the bar out of its range (``out``), or release it."""
         self.settle()
         self._pushed = out
 

@@ -38,7 +38,7 @@ class Conditions:
 
 
 class Rig:
-    """One machine under measurement. Runs follow each other: the axes remember where they came from and the clock goes on."""
+    """One machine under measurement. Runs follow each other: the axes keep the direction of their last motion, and the clock runs on."""
 
     def __init__(self, scenario: Scenario, conditions: Conditions | None = None) -> None:
         self.scenario = scenario

@@ -28,7 +28,7 @@ class Window:
     bits: int = OUT_OF_RANGE
 
     def applied(self, sample: Sample) -> Sample:
-        """The sample as the box sends it."""
+        """The sample with the window's status bits if it lies inside the window."""
         if not self.begin <= sample.seq < self.end:
             return sample
         return replace(sample, status=sample.status | self.bits, reading_nm=0 if self.bits & NO_BAR else 1_000_000)
@@ -114,7 +114,7 @@ class FaultyBox:
         await self.line.open(self._received)
 
     async def unplug(self) -> None:
-        """Pull the cable; the box has a battery and goes on."""
+        """Pull the cable; the box has a battery and keeps running."""
         await self.line.close()
 
     async def run(self, samples: int) -> None:

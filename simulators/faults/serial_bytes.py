@@ -27,12 +27,12 @@ class Sample:
 
 
 def sample_of(frame: bytes) -> Sample | None:
-    """What is in a whole frame, None when it is not a SAMPLE."""
+    """Content of a whole frame; None if it is not a SAMPLE."""
     return Sample(*_SAMPLE.unpack_from(frame, 4)) if frame[2] == SAMPLE else None
 
 
 def cut(data: bytes) -> list[bytes]:
-    """The frames in honest bytes, as the box writes them."""
+    """Split undamaged bytes into frames, as the box writes them."""
     found, at = [], 0
     while at < len(data):
         end = at + data[at + 3] + _OVERHEAD

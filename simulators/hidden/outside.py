@@ -39,7 +39,7 @@ def ball_form(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("interference_burst")
 def interference_burst(e: Hidden, track: Track, out: Bend) -> None:
-    """Somebody welds next door: for about width_s around t0_s the bar's readings swing at f_hz."""
+    """Welding next door: for about width_s around t0_s the bar's readings swing at f_hz."""
     if track.kind == "bar":
         away = track.t_s - e["t0_s"]
         swing = np.sin(2.0 * np.pi * e["f_hz"] * away + e.rng(32).uniform(0.0, 6.28))

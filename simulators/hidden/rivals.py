@@ -30,7 +30,7 @@ class FittedRuns:
     model: Model
 
     def stack(self, of_run: Callable[[Run], F]) -> F:
-        """Columns (n, k) of all runs under each other."""
+        """Stack the columns (n, k) of all runs, one run below the other."""
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:

@@ -40,7 +40,7 @@ def picked(seed: int) -> Scenario:
 
 
 def winner(seed: int, paths: list[Path]) -> Path:
-    """The scenario that draws the highest lot with a seed."""
+    """The scenario that this seed picks at random: each file draws a number, the highest wins."""
 
     def lot(path: Path) -> float:
         return float(np.random.default_rng([STREAM_PICK, abs(seed), zlib.crc32(path.name.encode())]).random())

@@ -150,7 +150,7 @@ async def going_on(b: Bench, store: Store, plan: CampaignPlan, confirm=decline) 
 async def test_after_an_e_stop_a_laser_run_goes_on_and_says_so(place):
     b, store = place
     found = await going_on(b, store, await broken_off(b, store))
-    assert found.messages[-1].startswith("set-up S is still mounted: test goes on after point")
+    assert found.messages[-1].startswith("set-up S is still mounted: test resumes after point")
     assert statuses(store) == [("test", "failed"), ("test-2", "complete")]
 
 

@@ -115,7 +115,7 @@ async def test_broken_twice_it_reads_what_it_reads_in_one_go(place):
     plan = helix()
     await broken(b, store, plan, 9.0)
     said = await resumed_item(b, store, plan, again_s=6.0)
-    assert "test goes on at" in said
+    assert "test resumes at" in said
     await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}
@@ -147,7 +147,7 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
             b.session, store, b.site, plan, options=MeasureOptions(After(plan, b, 9.0, lambda: b.sim.world.ballbar.push(out=True)))
         )
     b.sim.world.ballbar.push(out=False)
-    assert "test goes on at" in await resumed_item(b, store, plan)
+    assert "test resumes at" in await resumed_item(b, store, plan)
     assert load_run(store, runs(store)[-1].id).columns.valid.all()
 
 
@@ -178,7 +178,7 @@ async def test_a_knocked_cup_is_seen_on_the_stretch_and_nothing_is_joined(place)
     bar = b.sim.world.ballbar
     outwards = b.sim.world.controller.position_mm - np.array([300.0, 250.0, 100.0])
     bar._cup_mm = bar._cup_mm + 0.004 * outwards / np.linalg.norm(outwards)
-    assert "test goes on at" in await resumed_item(b, store, plan)
+    assert "test resumes at" in await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
     assert "otherwise than before the break" in runs(store)[1].reason
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}  # nothing is kept that the cup could contradict

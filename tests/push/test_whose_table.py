@@ -89,7 +89,7 @@ async def test_a_new_name_continues_the_history_of_its_control(store: Store) -> 
 
 async def test_an_open_push_of_the_control_is_finished_before_one_under_a_new_name(store: Store) -> None:
     await pushed(store, "mill-a", (OLD, NEW), UP_TO_ACTIVE, HERE)
-    with pytest.raises(UnsafeToMove, match="push 1 of mill-a stands at PROBATION"):
+    with pytest.raises(UnsafeToMove, match="push 1 of mill-a is in state PROBATION"):
         await StoreBook.new(store, "mill-A", SystemClock(), HERE)
     await StoreBook.new(store, "mill-B", SystemClock(), THERE)  # another control is not kept from anything
 
@@ -176,9 +176,9 @@ async def test_a_dry_run_and_an_approval_warn_of_every_table_that_may_be_in_forc
     await pushed(store, "a", (OLD, NEW), UP_TO_ACTIVE, HERE)
     await pushed(store, "b", (OLD, THIRD), TAKEN_BACK, THERE)
     (own,) = open_pushes(store, "renamed", HERE)
-    assert own.startswith("push 1 stands at PROBATION: an unverified table may be in force")
+    assert own.startswith("push 1 is in state PROBATION: an unverified table may be in force")
     (other,) = open_pushes(store, "b", THERE)
-    assert other.startswith(f"push 1 of machine 'a' at {HERE} stands at PROBATION: its table was never verified")
+    assert other.startswith(f"push 1 of machine 'a' at {HERE} is in state PROBATION: its table was never verified")
 
 
 # ---- before anything moves ------------------------------------------------------------------------------------------------
@@ -421,7 +421,7 @@ async def test_where_a_person_has_to_look_the_other_machine_s_file_is_no_remedy(
             await pushed(store, "A", (OLD, image), (*UP_TO_ACTIVE, PushState.OPERATOR), HERE)
             with pytest.raises(TableMismatch, match="is that of push 1 of machine 'A'") as refused:
                 await recover(left.b.session.controller, store, left.b.site)
-            assert "which takes it back" not in str(refused.value)
+            assert "which rolls it back" not in str(refused.value)
             assert "abbe accept-table" in str(refused.value)
 
 

@@ -147,7 +147,9 @@ def test_a_rehearsal_says_from_the_journal_what_stands_open_under_the_old_name(a
     process = abbe("measure", killed.machine(tmp_path, "mill-A"), "--dry-run")
     _, err = process.communicate(timeout=120)
     assert process.returncode == 0
-    assert re.search(r"warning: push 1 stands at PROBED: an unverified table may be in force; it is taken back before anything else", err)
+    assert re.search(
+        r"warning: push 1 is in state PROBED: an unverified table may be in force; it is rolled back before anything else", err
+    )
     assert table(killed.sims) == killed.after
 
 

@@ -59,7 +59,7 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
         assert "helix rms" in [f.symbol for f in stored_report(store, whole, Rules()).figures]
         campaign = stored_report(store, store.campaigns.find("june"), Rules())
         pieces = run.timing.pieces
-        said = "went on with it, its readings count there" if pieces else "it is not in the figures"
+        said = "continued it, and its readings count there" if pieces else "it is not in the figures"
         assert any(said in line for line in campaign.remarks)
     capsys.readouterr()
     cli(["show", "june/helix", "--machine", str(sims.machine_file), "--json"])

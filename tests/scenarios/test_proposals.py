@@ -119,7 +119,7 @@ CHANGED: dict[str, tuple[Callable[[Site], Site], float, str]] = {
     "another limit": (lambda s: replace(s, limits=replace(s.limits, value_mm=0.2)), 0.0, "LIMITS: .*value_mm 0.1 then, 0.2 now"),
     "an old measurement": (lambda s: s, 73.0, "STALE: measured 73"),
     "too few runs for these limits": (lambda s: replace(s, limits=replace(s.limits, runs=99)), 0.0, "RUNS"),
-    "nobody's approval": (lambda s: s, 0.0, "APPROVAL: nobody has approved it"),
+    "nobody's approval": (lambda s: s, 0.0, "APPROVAL: not approved yet"),
 }
 
 
@@ -147,7 +147,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
         number = shop.copy(store)
         alone = replace(shop.site, limits=replace(shop.site.limits, walk_mm=0.001))
         against = asyncio.run(unattended(alone, number))
-        assert any(reason.startswith("APPROVAL: nobody has approved it") for reason in against)
+        assert any(reason.startswith("APPROVAL: not approved yet") for reason in against)
         assert any(reason.startswith("POLICY WALK: ") for reason in against)
         before = next_approved(store, "sim", [], SystemClock().utc().timestamp())
         assert before is None or before.proposal != number  # of this file's other tests

@@ -251,7 +251,7 @@ async def test_a_push_cut_short_before_it_was_kept_is_taken_back_at_the_next_sta
             patch.setattr(StoreBook, "append", dies)
             with pytest.raises(StoreError) as raised:
                 await push(session.controller, store, site, steep(site), probe=meanwhile)
-            assert "takes it back before anything else" in raised.value.__notes__[0]
+            assert "rolls it back before anything else" in raised.value.__notes__[0]
         assert last(store) == state
         if state is PushState.PROBED:  # whoever looks now sees the new table; it is not that one which is vouched for
             said = await accept(session.controller, store, site)

@@ -30,7 +30,7 @@ def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on(abbe, start_
     _, err = interrupt(process, signal.SIGINT)
     assert process.returncode == 130, err
     assert axes_at_rest(sims)
-    assert err.splitlines()[-1] == "stopped: `abbe measure MACHINE.toml --resume CAMPAIGN` goes on from here"
+    assert err.splitlines()[-1] == "stopped: `abbe measure MACHINE.toml --resume CAMPAIGN` resumes it"
     (run,) = runs_of(sims.machine_file.parent)
     assert (run.label, run.status) == ("helix", "stopped")
     again = abbe("measure", str(sims.machine_file), "--resume", "june")

@@ -83,5 +83,5 @@ def test_ctrl_c_ends_the_waiting_and_the_table_waits_for_the_next_command(stoppe
     command, _ = stopped
     command.process.send_signal(signal.SIGINT)
     assert command.process.wait(timeout=within(10)) == 130
-    assert "STILL ACTIVE; the next abbe command takes it back" in command.said("err")
+    assert "STILL ACTIVE; the next abbe command rolls it back" in command.said("err")
     assert last_state(tmp_path) == "ROLLBACK_PENDING"

@@ -73,7 +73,7 @@ def test_a_stop_in_the_middle_of_a_push(tmp_path: Path, open_: bool) -> None:
         else:
             assert (state, said["word"], words) == ("ROLLBACK_PENDING", "open", ["open"])
             assert in_force(sims) != before
-            assert "an unverified table may be in force; it is taken back before anything else" in texts[0]
+            assert "an unverified table may be in force; it is rolled back before anything else" in texts[0]
             sims.ask("reset")
         with closing(start(tmp_path, sims)) as again:
             if open_:

@@ -42,7 +42,7 @@ GROWS = "what grows with the feed (lag, servo mismatch, vibration of the drives)
 TURNS = "what differs between the way there and the way back over the same points (lost motion, lateral play) looks like geometry"
 LENGTH = "what belongs to the bar (its length, its balls, its temperature) looks like an error of the machine"
 SLOW = "what comes slowly (axes, spindle and air that warm up) looks like geometry, or like a set-up"
-SCALE = "an error of all scales together is told by the bar's own length alone, and the search does not use the bar's certificate"
+SCALE = "only the bar's calibrated length shows an error common to all scales, and the search does not use the bar's certificate"
 MOVING = "what shows in motion on a curve only (reversals of two axes, servo mismatch, lag) leaves no trace"
 
 

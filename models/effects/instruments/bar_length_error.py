@@ -1,4 +1,4 @@
-"""Length error of the ball-bar: the bar is not as long as its certificate says."""
+"""Length error of the ball-bar: the bar's actual length differs from its certificate."""
 
 from __future__ import annotations
 

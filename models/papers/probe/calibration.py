@@ -69,7 +69,7 @@ def _levels(name: str, angles_rad: F1, tolerance_rad: float) -> tuple[F1, Indice
     wide = next((g for g in groups if g[-1] - g[0] > 2.0 * tolerance_rad * (1.0 + 1e-9)), None)
     if wide is not None:
         span = f"{np.rad2deg(wide[0]):.6g} to {np.rad2deg(wide[-1]):.6g} degrees"
-        raise ValueError(f"lobing map: touches at every {name} from {span} cannot be told apart with this tolerance")
+        raise ValueError(f"lobing map: touches at every {name} from {span} cannot be distinguished with this tolerance")
     index = np.empty(angles_rad.size, dtype=np.intp)
     index[order] = level
     return np.array([float(np.median(g)) for g in groups]), index

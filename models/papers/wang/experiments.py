@@ -32,11 +32,11 @@ class WangPlan:
     orders : tuple of str
         Step orders; the four diagonals are run once in each.
     tilts : bool
-        Whether the mirror of each of them is tilted by two unknown angles, or ideal.
+        Whether the mirror of each diagonal is tilted by two unknown angles; otherwise it is ideal.
     axes : str
         Axes measured by the laser alone.
     edges : tuple of int
-        Edges on which: 0 where the other axes stand at 0, 1 where they stand at the end.
+        Edges along which those axes are measured: 0 with the other axes at 0, 1 with the other axes at their far end.
     """
 
     travel_mm: F1

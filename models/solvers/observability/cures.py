@@ -145,7 +145,7 @@ def on_opposite_edges(machine: Machine, axis: int, places: tuple[F1, ...]) -> bo
 class Addition:
     """One possible addition: the cause that it removes, the cure as text, and its virtual runs or knowledge.
 
-    ``ending``: how "cannot be told apart" goes on without it.
+    ``ending``: the rest of the sentence after "cannot be distinguished" if it is left out.
     """
 
     key: str

@@ -76,7 +76,7 @@ def sentence(terms: tuple[Term, ...], family: Family, ending: str = "") -> str:
     if not family.exact and len(parts) > LISTED:
         count = family.vectors.shape[1]
         return f"{count} mixture{'s' if count > 1 else ''} of {len(parts)} motions ({', '.join(family.motions)}) leave no trace{ending}"
-    return f"{_upper(', '.join(parts[:-1]))} and {parts[-1]} cannot be told apart{ending}{_proportion(terms, family)}"
+    return f"{_upper(', '.join(parts[:-1]))} and {parts[-1]} cannot be distinguished{ending}{_proportion(terms, family)}"
 
 
 def _orders(terms: tuple[Term, ...], family: Family, motion: str) -> list[int]:

@@ -372,7 +372,7 @@ def motions(machine: Machine, terms: tuple[Term, ...], covariance: F2, prior: F2
 
 def _reason(hidden: tuple[str, ...], share: float, status: Status) -> str:
     if hidden:
-        return f"{', '.join(hidden)} cannot be told apart from other errors by these readings"
+        return f"{', '.join(hidden)} cannot be distinguished from other errors by these readings"
     if status == "observed":
         return ""
     return f"only {100.0 * share:.0f} % of what is known of it comes from the readings, the rest is an assumption"

@@ -184,7 +184,7 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
         except KeyboardInterrupt:
             state = journal.steps[-1].state if journal.steps else "nothing"
             kept = (
-                f"discovery {journal.id} stands at {state}; the same command resumes there"
+                f"discovery {journal.id} is in state {state}; the same command resumes there"
                 if journal.id
                 else "without --db nothing of a folder is kept"
             )

@@ -1,1 +1,1 @@
-"""Commands about compensation tables: propose, approve, push, take back."""
+"""Commands about compensation tables: propose, approve, push, roll back."""

@@ -95,7 +95,7 @@ def rollback(
         last = store.pushes.entries(site.name, site.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
         if not (finished and to is None) and not yes and not await _confirmed(to):
-            raise ConfigError("nothing was taken back", "answer yes, or add --yes if no one is at the console")
+            raise ConfigError("nothing was rolled back", "answer yes, or add --yes if no one is at the console")
         async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
             if finished and to is None:
                 return f"push {last[0].push} was open and is finished; to go further back, run the command again"

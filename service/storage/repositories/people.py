@@ -44,7 +44,7 @@ class People(Repository):
         return self._first(USER, users.c.name == name)
 
     def active_admins(self) -> int:
-        """Count the admins who may log in: not disabled, and with the hash of a password."""
+        """Count the admins who can log in: those not disabled who have a password."""
         query = select(func.count()).select_from(users)
         query = query.where(users.c.disabled_utc.is_(None), users.c.role == "admin", users.c.password.like("$argon2%"))
         return int(self._db.read(lambda connection: connection.execute(query).scalar_one()))

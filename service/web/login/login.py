@@ -83,7 +83,7 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
 
 def _add_reading(app: FastAPI, auth: Authenticator) -> None:
     refusals: dict[int | str, dict[str, object]] = {
-        401: {"model": Problem, "description": "Nobody is logged in"},
+        401: {"model": Problem, "description": "No user is logged in"},
         403: {"model": Problem, "description": "The role does not allow it"},
         429: {"model": Problem, "description": "Too many requests"},
         503: {"model": Problem, "description": "The store does not answer"},

@@ -88,7 +88,7 @@ def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
         return RunScreen(record, run_document(store, record, rules)[1])
     except AbbeError as error:
         return RunScreen(record, None, error.detail)
-    except (KeyError, TypeError, ValueError, IndexError) as error:  # another version wrote the document, or somebody edited it
+    except (KeyError, TypeError, ValueError, IndexError) as error:  # another version wrote the document, or it was edited
         return RunScreen(record, None, f"{type(error).__name__}: {error}")
 
 
@@ -152,7 +152,7 @@ def compare_screen(store: Store, numbers: Sequence[int], translate: Translate, r
         curves = [] if why else [curve(one) for one in loaded]
     except AbbeError as error:
         return CompareScreen(choices, runs, trouble=error.detail)
-    except MALFORMED as error:  # another version wrote the document, or somebody edited it
+    except MALFORMED as error:  # another version wrote the document, or it was edited
         return CompareScreen(choices, runs, trouble=f"{type(error).__name__}: {error}")
     if why:
         return CompareScreen(choices, runs, trouble=why)

@@ -62,7 +62,7 @@ def test_three_jittered_columns_do_not_carry_a_cube() -> None:
     line = (-1.0, 0.0, 1.0)
     points = np.array([[x, y, 5.0] for x in line for y in line] * 3)
     points[:, :2] += 1e-6 * np.random.default_rng(4).normal(size=(27, 2))
-    with pytest.raises(SurfaceNotDetermined, match=r"\^3.* cannot be told apart"):
+    with pytest.raises(SurfaceNotDetermined, match=r"\^3.* cannot be distinguished"):
         fit_surface(points, noise(27))
 
 
@@ -131,7 +131,7 @@ def test_points_on_other_surfaces_are_refused() -> None:
     ball /= np.linalg.norm(ball, axis=1)[:, None]
     for points in (cross, ball):
         assert layout(points).rank == 16
-        with pytest.raises(SurfaceNotDetermined, match=r"for 20 terms, but .*cannot be told apart|leaves no trace"):
+        with pytest.raises(SurfaceNotDetermined, match=r"for 20 terms, but .*cannot be distinguished|leaves no trace"):
             fit_surface(points, noise(len(points)))
 
 

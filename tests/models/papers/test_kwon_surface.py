@@ -105,7 +105,7 @@ def test_tilted_plane() -> None:
 
 def test_points_that_do_not_carry_a_cubic() -> None:
     three = np.array([[x, y, Z] for x in (-1.0, 0.0, 1.0) for y in np.linspace(-1, 1, 9)])
-    with pytest.raises(SurfaceNotDetermined, match=r"27 points for 10 terms.*X\^3.*cannot be told apart"):
+    with pytest.raises(SurfaceNotDetermined, match=r"27 points for 10 terms.*X\^3.*cannot be distinguished"):
         fit_surface(three, np.ones(27))
     with pytest.raises(SurfaceNotDetermined, match="more points than terms"):
         fit_surface(planes(Z)[::9][:9], np.ones(9))

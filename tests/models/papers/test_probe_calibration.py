@@ -242,7 +242,7 @@ def test_directions_that_form_no_pattern_are_said():
         (PATTERN[:, :1], values, 1e-9, "do not fit together"),
         (PATTERN, values * np.nan, 1e-9, "finite"),
         (PATTERN, values, 0.0, "tolerance positive"),
-        (many, values, 0.02, "touches at every colatitude from 17.8763 to 85.9437 degrees cannot be told apart"),
+        (many, values, 0.02, "touches at every colatitude from 17.8763 to 85.9437 degrees cannot be distinguished"),
         (PATTERN, values, np.deg2rad(10), "touches at every colatitude"),
         (PATTERN[100:], values[100:], 1e-9, "exactly one touch at the pole, got 1 of 1 there"),
     ):

@@ -76,7 +76,7 @@ def test_residuals_of_a_good_solution_are_noise_and_those_of_a_poor_one_are_not(
     poor = solve_joint(MACHINE, runs, order=2)
     flagged = [t for t in poor.residual_tests if t.flagged]
     assert len(flagged) > 10
-    assert any("alike over" in t.text and t.text.startswith(t.run) for t in flagged)
+    assert any("correlated over" in t.text and t.text.startswith(t.run) for t in flagged)
 
 
 def test_residual_tests_name_run_and_direction(runs):

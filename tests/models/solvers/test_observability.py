@@ -228,7 +228,7 @@ def test_motions_with_hidden_parts_and_motions_without_information_are_kept_out_
     report = observability(YANG, ONE, terms=2)
     by_name = {m.name: m for m in report.motions}
     assert by_name["ECY"].status == "not observable"
-    assert "cannot be told apart" in by_name["C0Y"].reason
+    assert "cannot be distinguished" in by_name["C0Y"].reason
     for m in report.motions:
         assert (m.name in observable_motions(report.motions)) == (m.status == "observed")
         assert not (m.hidden and m.name in observable_motions(report.motions, weak=True))

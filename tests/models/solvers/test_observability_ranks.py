@@ -89,11 +89,11 @@ def test_null_vectors_of_every_single_tool_experiment():
         assert "The slope of the yaw of Y (ECY) leaves no trace" in said  # ezy alone
         # eyy 1 goes with Sxy 0.303, eyx 1 with dxx -0.3: in our units over the stroke
         assert (
-            "the squareness of X and Y (C0Y) cannot be told apart with one tool length: 10 µrad of EBY over the stroke look like -3.03"
+            "the squareness of X and Y (C0Y) cannot be distinguished with one tool length: 10 µrad of EBY over the stroke look like -3.03"
             in said
         )
         assert (
-            "the slope of the pitch of X (EBX) cannot be told apart with one tool length: 10 µm of EXX over the stroke look like 66.7"
+            "the slope of the pitch of X (EBX) cannot be distinguished with one tool length: 10 µm of EXX over the stroke look like 66.7"
             in said
         )
 
@@ -101,7 +101,7 @@ def test_null_vectors_of_every_single_tool_experiment():
 def test_null_vectors_of_one_helix():
     said = texts(YANG, ONE)
     assert "10 µrad of EAZ over the stroke look like -2.05 µrad of A0Z" in said  # exz 1, Syz 0.2047
-    assert "The scale of X (EXX), the scale of Y (EYY) and the scale of Z (EZZ) cannot be told apart" in said
+    assert "The scale of X (EXX), the scale of Y (EYY) and the scale of Z (EZZ) cannot be distinguished" in said
     assert "no bar length here is calibrated" in said
 
 

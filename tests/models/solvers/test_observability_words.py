@@ -58,7 +58,7 @@ def test_a_pair_with_its_proportion():
     found = said({"EAX.1": 1.0, "C0Y": -4.0})
     # 1 rad of EAX.1 is 2 rad over the stroke and goes with -4 rad of C0Y: so 10 urad of it look like 20 urad of C0Y
     assert found[0][2] == (
-        "The slope of the roll of X (EAX) and the squareness of X and Y (C0Y) cannot be told apart: "
+        "The slope of the roll of X (EAX) and the squareness of X and Y (C0Y) cannot be distinguished: "
         "10 µrad of EAX over the stroke look like 20 µrad of C0Y"
     )
     with_length = said({"EXX.1": 1.0, "EBX.1": -0.01})[0][2]
@@ -86,8 +86,8 @@ def test_what_was_told_is_not_told_again():
     told = null_space({"ECY.1": 1.0})
     found = families(TERMS, basis, ONES, found=told)
     assert [f.motions for f in found] == [("EXX", "EYY", "EZZ")]
-    assert "cannot be told apart" in sentence(TERMS, found[0], " with one tool length")
-    assert sentence(TERMS, found[0], " with one tool length").endswith("(EZZ) cannot be told apart with one tool length")
+    assert "cannot be distinguished" in sentence(TERMS, found[0], " with one tool length")
+    assert sentence(TERMS, found[0], " with one tool length").endswith("(EZZ) cannot be distinguished with one tool length")
 
 
 def test_mixtures_of_many_motions_are_counted():

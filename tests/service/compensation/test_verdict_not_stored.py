@@ -23,7 +23,7 @@ NONE = np.zeros(0)
 AFTER = VerificationFigures(
     {name: VerificationFigure(0.004, 0.001, NONE, NONE) for name in DIAGONALS}, VerificationFigure(0.002, 0.001, NONE, NONE)
 )
-WORDS = {True: "the table is kept and in force: as decided", False: "the table is taken back: as decided"}
+WORDS = {True: "the table is kept and in force: as decided", False: "the table is rolled back: as decided"}
 
 
 @pytest.mark.parametrize("kept", [True, False])

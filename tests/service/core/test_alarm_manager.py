@@ -331,7 +331,7 @@ Heard = Exception | JobOutcome
             "the old table is in force again",
         ),
         ((*IN_FORCE, Push.ROLLBACK, Push.ROLLED_BACK), ArithmeticError("no number"), "rolled back", "no number"),
-        (IN_FORCE, StillActive("the door is open"), "open", "stands at PROBED: an unverified table may be in force"),
+        (IN_FORCE, StillActive("the door is open"), "open", "is in state PROBED: an unverified table may be in force"),
         (IN_FORCE, JobOutcome("rolled back", "as somebody thought"), "open", "an unverified table may be in force"),
         ((Push.SNAPSHOT, Push.VALIDATED), JobOutcome("failed", "no answer"), "open", "the old table is in force"),
         ((Push.SNAPSHOT, Push.REJECTED), JobOutcome("failed", "no answer"), "refused", "nothing was written"),
@@ -403,7 +403,7 @@ async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: B
 
     bench.push = push
     task = asyncio.create_task(bench.pushed())
-    await bench.until(lambda: JournalView.read(bench.store, "mill-7").open_push.startswith("push 1 stands at PROBED"))
+    await bench.until(lambda: JournalView.read(bench.store, "mill-7").open_push.startswith("push 1 is in state PROBED"))
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
@@ -449,7 +449,7 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
 
     monkeypatch.setattr(push_approved, "finish_when_safe", finish)
     aborted = await back(Control.abort)
-    assert (aborted.word, aborted.text.endswith("it is taken back as soon as it can be")) == ("failed", True)
+    assert (aborted.word, aborted.text.endswith("it will be rolled back as soon as possible")) == ("failed", True)
     assert await back(lambda control: safe.set()) == JobOutcome("rolled back", "the door is open; the old table was made active again")
 
 

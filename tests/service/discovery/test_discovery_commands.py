@@ -125,7 +125,7 @@ def test_ctrl_c_keeps_what_is_there_and_the_same_command_goes_on(abbe: Call, fin
     assert code == 130
     finds(Search())
     code, out, err = abbe("discover", folder, "--db", DB)
-    assert "stopped: discovery 1 stands at FITTED; the same command resumes there" in stopped
+    assert "stopped: discovery 1 is in state FITTED; the same command resumes there" in stopped
     assert (code, err.count("stopped")) == (0, 0)
     assert "stored: discovery 1, EXPLAINED" in out
 

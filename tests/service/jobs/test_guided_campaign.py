@@ -141,7 +141,7 @@ async def test_an_answer_that_is_no_is_the_end_s_text(monkeypatch: pytest.Monkey
     monkeypatch.setattr(work, "_measured", measured)
     monkeypatch.setattr(work, "make_proposal", refuse)
     led = await work.run_guided_campaign(pretended(), {}, "bob")
-    assert led == JobOutcome("ended", f"no proposal: {no}; campaign 'full 1' stays, and `abbe solve` shows what it says")
+    assert led == JobOutcome("ended", f"no proposal: {no}; campaign 'full 1' is kept; `abbe solve` shows its result")
 
 
 async def test_what_speaks_against_a_proposal_and_who_proposes_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,7 +149,7 @@ BAD_CAMPAIGNS = [
     (set_at("temperature_sensors", value="no"), "temperature_sensors: expected a boolean, got 'no'"),
     (set_at("runs", 0, "file", value="../r01.json"), r"runs\[1\].file: "),
     (set_at("runs", 0, "file", value="r99.json"), "r99.json: no such file"),
-    (set_at("runs", 1, "run_id", value="r01"), "run_id 'r01' stands there twice"),
+    (set_at("runs", 1, "run_id", value="r01"), "run_id 'r01' appears twice"),
     (set_at("runs", 1, "file", value="campaign.json"), "a file is named 'campaign.json'"),
     (set_at("current_model", "errors", value="none.json"), "none.json: no such file"),
     (

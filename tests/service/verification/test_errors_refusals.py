@@ -38,7 +38,7 @@ BAD_POINTS = [
     ("x,y,z\n1,2,3\n", "unknown unit suffix in 'x', expected 'x_mm'"),
     ("x_mm,y_mm,z_mm,tool_z_mm\n1,2,3,4\n", "column 'tool_x_mm' is missing"),
     ("x_mm,y_mm,z_mm,direction\n1,2,3,1\n", "unknown column 'direction'"),
-    ("x_mm,y_mm,z_mm,x_mm\n1,2,3,1\n", "column 'x_mm' stands there twice"),
+    ("x_mm,y_mm,z_mm,x_mm\n1,2,3,1\n", "column 'x_mm' appears twice"),
     ("x_mm;y_mm;z_mm\n1;2;3\n", "not separated by commas"),
     ("x_mm,y_mm,z_mm\n1,2,3\n\n1,,3\n", "y_mm, row 2 (line 4): expected a finite number, got ''"),
     ("x_mm,y_mm,z_mm\n1,2,nan\n", "z_mm, row 1 (line 2): expected a finite number, got 'nan'"),
@@ -116,7 +116,7 @@ BAD_ERRORS: list[tuple[Change, str]] = [
     (_set("covariance", value=GOOD | {"matrix": [[1e-12, 0], [0, -1e-12]]}), "matrix, row 2: the variance is negative"),
     (_set("covariance", value=GOOD | {"matrix": [[1, 0.5], [0.4, 1]]}), "it is not symmetric"),
     (_set("covariance", value=GOOD | {"matrix": [[1, 2], [2, 1]]}), "would have a negative variance"),
-    (_set("covariance", value=GOOD | {"parameters": ["C0Y", "C0Y"]}), "'C0Y' stands there twice"),
+    (_set("covariance", value=GOOD | {"parameters": ["C0Y", "C0Y"]}), "'C0Y' appears twice"),
 ]
 
 

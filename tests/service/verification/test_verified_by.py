@@ -213,7 +213,7 @@ def test_a_table_that_somebody_else_changed_is_unverified_until_a_person_has_loo
     """The core sees it at the controller; whoever reads the database knows it from the machine's own line."""
     world.push(OLD, NEW)
     world.check("pass", NEW)
-    text = f"{STRANGE_TABLE}: somebody else changed the compensation in force"
+    text = f"{STRANGE_TABLE}: the compensation in force was changed from outside"
     world.board.attention.append(text)
     assert world.status().verified.why == "changed"
     assert world.fleet().verdict == "pass"
@@ -226,7 +226,7 @@ def test_a_table_that_somebody_else_changed_is_unverified_until_a_person_has_loo
 def test_a_check_measured_after_what_the_service_saw_ends_it(world: World) -> None:
     """The service is gone, and so is what it said last: a check found the journal's table in force since."""
     world.push(OLD, NEW)
-    text = f"{STRANGE_TABLE}: somebody else changed the compensation in force"
+    text = f"{STRANGE_TABLE}: the compensation in force was changed from outside"
     world.store.heartbeats.put("mill-7", {"schema": 1, "state": "waiting", "due": [], "attention": [text]})
     world.check("pass")
     assert world.known().why == "changed", "with which table, nobody wrote down"
