@@ -109,10 +109,10 @@ def _reversed(some: _Candidates) -> _Candidates:
     return _Candidates(some.place[::-1], some.stand[::-1], some.off[::-1], some.reach[::-1])
 
 
-def _chain(some: _Candidates, alone: F1, about: tuple[F1, F1, float], *, mirrored: bool = False) -> tuple[F1, I1]:
+def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, mirrored: bool = False) -> tuple[F1, I1]:
     """Least cost of a chain that ends at each candidate, and the one before it (-1: none). ``mirrored``: from the end to the beginning."""
     targets, sides, noise = about
-    cost, back = alone.copy(), np.full(alone.size, -1, dtype=np.intp)
+    cost, back = single_cost.copy(), np.full(single_cost.size, -1, dtype=np.intp)
     sign = -1 if mirrored else 1
     at, side = targets[some.place], sides[some.place]
     for p in range(1, cost.size):
@@ -447,8 +447,8 @@ def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
     """Differences from the plan for people, one line each; standstills count from 1."""
     lines = [f"standstill {k + 1} of {len(planned)} (at {planned[k].target:.3f} mm) is missing" for k in found.missing]
     for after, stand in found.extra:
-        where = "before the first" if after < 0 else f"after standstill {after + 1}"
-        lines.append(f"an unplanned standstill at {stand.level:.3f} mm of the reading {where}, {stand.end_s - stand.start_s:.1f} s long")
+        place = "before the first" if after < 0 else f"after standstill {after + 1}"
+        lines.append(f"an unplanned standstill at {stand.level:.3f} mm of the reading {place}, {stand.end_s - stand.start_s:.1f} s long")
     lines += [f"standstill {k + 1} was not {planned[k].seconds:.1f} s long" for k in found.odd]
     return tuple(lines)
 

@@ -8,8 +8,8 @@ Tables of single error motions, for controls that store up to 21 of them and com
 One campaign with one tool does not determine every single motion: turning and shifting a carriage look alike at one tool length (math.md
 4.6). A motion that the data do not separate from others is not written under its name. The caller chooses by naming the motions:
 
-- only motions that are observable by themselves (`observable_alone`, the default): valid for every tool, but motions that are known only
-  together with a hidden one, or are mostly an assumption, stay uncorrected;
+- only motions that are observable by themselves (`individually_observable`, the default): valid for every tool, but motions that are known
+  only together with a hidden one, or are mostly an assumption, stay uncorrected;
 - `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Valid at this tool length only, and so labelled.
 
 In the first case every motion has its own estimate; in the second the written motions also carry the effect of the others at this tool.
@@ -144,13 +144,13 @@ def motion_tables(
 
 def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] | set[str] | None, any_tool: bool) -> frozenset[str]:
     """The motions to be written, if they may be."""
-    seen = observable_alone(solution) if motions is None or any_tool else frozenset(known)
-    wanted = seen if motions is None else frozenset(motions)
+    observable_names = individually_observable(solution) if motions is None or any_tool else frozenset(known)
+    wanted = observable_names if motions is None else frozenset(motions)
     if not wanted or not wanted <= known:
         raise ValueError(f"motion tables: {', '.join(sorted(wanted - known)) or 'no motion'} cannot be written")
-    if not wanted <= seen:
+    if not wanted <= observable_names:
         raise ValueError(
-            f"motion tables: {', '.join(sorted(wanted - seen))} cannot be written under their own names: the readings do not "
+            f"motion tables: {', '.join(sorted(wanted - observable_names))} cannot be written under their own names: the readings do not "
             "tell them apart from other motions. Measure with a second tool length, or make tables for this tool only (any_tool=False)"
         )
     return wanted
@@ -169,7 +169,7 @@ def _entries(sources: ErrorSources, name: str, grids: tuple[F1, F1, F1], keep: l
     return gradient @ sources.coefficients, np.sqrt(variances(sources, gradient))
 
 
-def observable_alone(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:
+def individually_observable(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:
     """Motions that the report on this solution calls observed (with ``weak``: or weak), by the same rule (`observable_motions`).
 
     None of their coefficients is in a hidden combination, and the readings carry at least 90 % (10 %) of their information.
@@ -338,7 +338,7 @@ def achievable(
     lsb_mm : float
         The controller's unit; 0: no rounding. Tables of single motions and squareness parameters are not rounded.
     observable : set of str, optional
-        Motions that are observable by themselves; default: `observable_alone`.
+        Motions that are observable by themselves; default: `individually_observable`.
     sources : ErrorSources, optional
         Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
     """
@@ -382,25 +382,25 @@ class _ResidualJudge:
         """Positioning alone, with squareness, and all nine."""
         nine = nine_tables(self.solution, counts, sources=self.sources)
         square = squareness_tables(self.solution, counts, sources=self.sources)
-        alone = positioning_only(nine)
-        stored = self._stored(alone)
+        positioning = positioning_only(nine)
+        stored = self._stored(positioning)
         return [
-            self.row("positioning tables", sum(counts), stored.correction_at, alone.correction_at),
+            self.row("positioning tables", sum(counts), stored.correction_at, positioning.correction_at),
             self.row(
                 "positioning tables and squareness",
                 sum(counts) + 3,
                 lambda p: stored.correction_at(p) + square.squareness_at(p),
-                lambda p: alone.correction_at(p) + square.squareness_at(p),
+                lambda p: positioning.correction_at(p) + square.squareness_at(p),
             ),
             self.row("nine tables", 3 * sum(counts), self._stored(nine).correction_at, nine.correction_at),
         ]
 
     def single_motions(self, counts: tuple[int, int, int], observable: frozenset[str] | None) -> list[Achievable]:
         """Tables of motions under their own names."""
-        seen = observable_alone(self.solution) if observable is None else observable
+        observable_names = individually_observable(self.solution) if observable is None else observable
         out = []
         for kind, motions, any_tool in (
-            ("tables of the motions that are observable by themselves", seen, True),
+            ("tables of the motions that are observable by themselves", observable_names, True),
             ("tables of single motions, right for this tool only", enough_for_the_field(self.solution), False),
         ):
             if motions:

@@ -103,8 +103,8 @@ def _towards_diagonals(field: Field, stroke_mm: F2, nodes: int, order: int) -> n
     left = field(points)
     columns = [np.ones((len(points), 1))]
     for a in range(3):
-        where, back = np.unique(points[:, a], return_inverse=True)
-        left = left - _mean_over_others(field, stroke_mm, a, where, nodes)[back]
+        coordinates, back = np.unique(points[:, a], return_inverse=True)
+        left = left - _mean_over_others(field, stroke_mm, a, coordinates, nodes)[back]
         columns.append(legendre_values(points[:, a], stroke_mm[a], order)[:, 1:])
     basis: F2 = np.concatenate(columns, axis=1)
     beta = np.linalg.lstsq(basis * weight[:, None], (left * weight[:, None, None]).reshape(len(points), -1), rcond=None)[0]

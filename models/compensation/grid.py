@@ -256,8 +256,8 @@ def compensable_nodes(
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)
     prediction = predict_deviation(error_sources(solution, inputs), points, frame=frame)
-    seen = unobserved_mm(solution, points, frame) <= np.linalg.norm(prediction.deviation_mm, axis=1)
-    return np.asarray((compensable_mask(prediction, k=k).points & seen).reshape(counts), dtype=bool)
+    observed = unobserved_mm(solution, points, frame) <= np.linalg.norm(prediction.deviation_mm, axis=1)
+    return np.asarray((compensable_mask(prediction, k=k).points & observed).reshape(counts), dtype=bool)
 
 
 def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:

@@ -149,7 +149,7 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
 
 
 SHOWN = 3
-SEEN_MM = 0.003
+OBSERVED_MM = 0.003
 """Least change at the strongest place; with less, drift within the tolerance could hide a reversed sign."""
 
 
@@ -161,7 +161,7 @@ class Probe:
     ----------
     expected_mm, measured_mm : array, shape (n,)
         Change of the reading at every place, positive: longer.
-    seen : tuple of bool
+    observed : tuple of bool
         For X, Y, Z: the table's effect on this axis is large enough at some place to show a wrong sign.
     agrees : bool
         At every place the reading changed as expected, within the larger of 2 um and 20 % of the largest expected change.
@@ -169,7 +169,7 @@ class Probe:
 
     expected_mm: F1
     measured_mm: F1
-    seen: tuple[bool, bool, bool]
+    observed: tuple[bool, bool, bool]
     agrees: bool
 
     @property
@@ -178,7 +178,7 @@ class Probe:
         off = np.abs(self.measured_mm - self.expected_mm)
         order = np.argsort(-np.nan_to_num(np.abs(self.expected_mm) if self.agrees else off, nan=np.inf), kind="stable")[:SHOWN]
         pairs = ", ".join(f"{1e3 * self.measured_mm[k]:+.1f} ({1e3 * self.expected_mm[k]:+.1f} expected)" for k in order)
-        axes = [axis for axis, seen in zip(AXES, self.seen, strict=True) if not seen]
+        axes = [axis for axis, observed in zip(AXES, self.observed, strict=True) if not observed]
         blind = f"; too small to prove the sign of {', '.join(axes)}" if axes else ""
         return f"the ball-bar's reading changed by {pairs} um{blind}"
 
@@ -221,5 +221,5 @@ def probe(each_mm: F2, before_mm: F1, after_mm: F1) -> Probe:
     allowed = max(FLOOR_MM, SHARE * float(np.abs(expected).max()))
     # A reversed sign changes the reading by twice the axis' share, which must exceed the tolerance.
     largest = np.abs(each_mm).max(axis=0)
-    x, y, z = ((largest >= SEEN_MM) & (2.0 * largest > 1.5 * allowed)).tolist()
+    x, y, z = ((largest >= OBSERVED_MM) & (2.0 * largest > 1.5 * allowed)).tolist()
     return Probe(expected, measured, (x, y, z), bool((np.abs(measured - expected) <= allowed).all()))

@@ -65,14 +65,14 @@ def agreements(
     """
     noise = {kind: _noise(problem, kind) for kind in problem.colours}
     root = _root(solved.theta_covariance)
-    seen = {r.path.setup for r in problem.runs}
+    fitted_setups = {r.path.setup for r in problem.runs}
     found, open_ = [], []
     for run in (r for r in problem.case.of("holdout") if r.deviation_mm is not None):
         label, known = run.path.label, noise.get(run.path.kind)
         if known is None:
             open_.append(Unjudged(label, NO_NOISE))
             continue
-        tested = _worse(*_white(problem, solved, root * np.sqrt(known.long), run, predicted_mm[label], seen), known)
+        tested = _worse(*_white(problem, solved, root * np.sqrt(known.long), run, predicted_mm[label], fitted_setups), known)
         if tested is None:
             open_.append(Unjudged(label, TOO_FEW))
         else:
@@ -104,7 +104,9 @@ def _noise(problem: WhitenedProblem, kind: str) -> _Noise | None:
     return _Noise(total / freedom, freedom, spread, max(long, 1.0))
 
 
-def _white(problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, seen: set[str]) -> tuple[F2, int]:
+def _white(
+    problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, fitted_setups: set[str]
+) -> tuple[F2, int]:
     """Whitened residual of a run's valid readings, then columns of the prediction's uncertainty (one standard deviation each).
 
     Also the number of columns, the last ones, that are the run's own unknowns. One standard deviation is that of the assumed noise;
@@ -112,9 +114,9 @@ def _white(problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun
     """
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
-    left = np.where(run.valid, left_over(run, predicted_mm, seen), 0.0)
+    left = np.where(run.valid, left_over(run, predicted_mm, fitted_setups), 0.0)
     keep = run.valid * lone(left, [p.n], [p.kind])
-    free = free_columns(run, seen)
+    free = free_columns(run, fitted_setups)
     columns = np.column_stack([gap, problem.base.linear(data, solved.theta)[1] @ root, FREE_MM * free]) * keep[:, None]
     white = unscaled(columns, [p.n], [p.kind], problem.colours) / problem.colours[p.kind].sd_mm
     return np.asarray(white[keep > 0]), free.shape[1]

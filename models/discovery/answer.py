@@ -54,7 +54,7 @@ class NamedEffect:
     coefficients, covariance : linear ones, in the units of the effect's columns.
     evidence : gain in log evidence (half the chi-square) after its price.
     alternatives : rivals that the data cannot exclude, (label, evidence lacking), best first.
-    where : where its signal is largest.
+    location : where its signal is largest.
     forms : freedoms of form in use.
     needed : rms of the holdout runs without this effect over that with it; 1 or less: not needed. None: no holdout run, or a variance
         effect, which moves no reading.
@@ -69,7 +69,7 @@ class NamedEffect:
     covariance: F2
     evidence: float
     alternatives: tuple[tuple[str, float], ...] = ()
-    where: Localization = field(default_factory=Localization)
+    location: Localization = field(default_factory=Localization)
     forms: tuple[str, ...] = ()
     needed: float | None = None
 
@@ -156,7 +156,7 @@ class Discovery:
         an unknown, residues of other effects.
     beside : structures without a name found beside names, (label, evidence), by evidence; the names do not explain their part of the gap.
     confounded_with : rivals of the names that the price rule does not exclude.
-    where : location of the gap of the present model (for "unknown": of the structure without a name).
+    location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : by role ("identify", "holdout").
     residual_before_mm, residual_after_mm, predicted_mm, predicted_before_mm : by run label; predictions also of sealed runs.
     noise_mm : of one reading, by "bar", "laser"; from repeats where these scatter less than the fit's residuals.
@@ -169,7 +169,7 @@ class Discovery:
 
     verdict: Verdict
     effects: tuple[NamedEffect, ...]
-    where: Localization
+    location: Localization
     next_test: NextTest | None
     gaps: Mapping[str, Gap]
     residual_before_mm: Mapping[str, F1]

@@ -17,7 +17,7 @@ UNNAMED = "unnamed_"
 """Prefix of the names of structures that the catalogue does not contain."""
 GENEROUS = 3.0
 """Prior standard deviation of a strength, as a multiple of the top of its usual range."""
-SEEN = 1e-5
+VISIBLE_SHARE = 1e-5
 """A candidate is invisible when the projection leaves less than this share of its square."""
 MOST_CACHED = 16
 """Picks whose columns are cached: a search returns to those it has just used."""
@@ -118,7 +118,7 @@ class Bank:
     parts: tuple[Short, ...]
     own: F1
     gram: tuple[F2, ...]
-    moment: F1
+    rhs: F1
     prior_sd: F1
     logs: F1
 
@@ -126,14 +126,14 @@ class Bank:
         """Reduction of chi-square by each group after ``rows`` (k, n) of earlier picks were projected out too, shape (groups,)."""
         short = rows.astype(np.float32)
         also = np.concatenate([np.zeros((len(rows), 0)), *(short @ part.T for part in self.parts)], axis=1)
-        moment = self.moment - also.T @ (rows @ y)
+        rhs = self.rhs - also.T @ (rows @ y)
         out = np.zeros(len(self.picks))
         for k in np.unique(self.size):
             at = np.flatnonzero(self.size == k)
             index = self.first[at][:, None] + np.arange(k)
             taken = also[:, index].transpose(1, 2, 0)
             gram = np.stack([self.gram[i] for i in at]) - taken @ taken.transpose(0, 2, 1)
-            out[at] = _gains(gram, moment[index], self.own[index], self.prior_sd[index])
+            out[at] = _gains(gram, rhs[index], self.own[index], self.prior_sd[index])
         return out
 
     def groups(self) -> Iterator[_Group]:
@@ -144,7 +144,7 @@ class Bank:
             if column in starts:
                 i = starts[column]
                 at = slice(column, column + int(self.size[i]))
-                yield _Group(after[: self.size[i]], self.own[at], self.gram[i], self.moment[at], float(self.logs[i]))
+                yield _Group(after[: self.size[i]], self.own[at], self.gram[i], self.rhs[at], float(self.logs[i]))
 
 
 @dataclass(frozen=True)
@@ -154,28 +154,28 @@ class _Group:
     rows: Short
     own: F1
     gram: F2
-    moment: F1
+    rhs: F1
     log: float
 
 
-def _gains(gram: np.ndarray, moment: F2, own: F2, prior_sd: F2) -> F1:
+def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
     """Gains of groups of one size: moment^T (gram + prior^-2)^-1 moment; columns that are hardly visible count as rounding errors."""
     k = gram.shape[1]
     eye = np.eye(k)
-    weight = prior_sd**-2.0 + SEEN * own + 1e-30
-    solved = np.linalg.solve(gram + weight[:, :, None] * eye, moment[:, :, None])[:, :, 0]
-    return np.asarray(np.maximum((solved * moment).sum(axis=1), 0.0))
+    weight = prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30
+    solved = np.linalg.solve(gram + weight[:, :, None] * eye, rhs[:, :, None])[:, :, 0]
+    return np.asarray(np.maximum((solved * rhs).sum(axis=1), 0.0))
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
     """Columns of all candidates that some run sees; groups of the problem's other live banks are reused."""
     asked = [p.start for p in picks]
-    held = [b for b in problem.banks if isinstance(b, Bank)]
-    same = next((b for b in held if list(b.known) == asked), None)
+    banks = [b for b in problem.banks if isinstance(b, Bank)]
+    same = next((b for b in banks if list(b.known) == asked), None)
     if same is not None:
         return replace(same, picks=tuple(p for p in picks if same.known[p.start] >= 0))
-    blind = {name for b in held for name, i in b.known.items() if i < 0}
-    old = {name: g for b in held for (name, g) in zip((n for n, i in b.known.items() if i >= 0), b.groups(), strict=True)}
+    blind = {name for b in banks for name, i in b.known.items() if i < 0}
+    old = {name: g for b in banks for (name, g) in zip((n for n, i in b.known.items() if i >= 0), b.groups(), strict=True)}
     kept: list[Pick] = []
     parts, groups = list[Short](), list[_Group]()
     for start in range(0, len(picks), PART):
@@ -191,7 +191,7 @@ def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
     bank = Bank(
         tuple(kept), {name: number.get(name, -1) for name in asked}, np.cumsum(size) - size, size, tuple(parts),
         np.concatenate([np.zeros(0), *(g.own for g in groups)]), tuple(g.gram for g in groups),
-        np.concatenate([np.zeros(0), *(g.moment for g in groups)]),
+        np.concatenate([np.zeros(0), *(g.rhs for g in groups)]),
         np.concatenate([np.zeros(0), *(p.prior_sd(problem, g.own.size) for p, g in zip(kept, groups, strict=True))]),
         np.array([g.log for g in groups]),
     )  # fmt: skip
@@ -206,8 +206,8 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
         return
     raw = np.asfortranarray(np.concatenate([b.T for _, b in blocks]).T)  # the layout in which filtering along the runs is fastest
     columns, projection = problem.white(raw), problem.projection
-    seen = projection.seen(columns)
-    moment = columns.T @ projection.y - seen.T @ projection.moment
+    coordinates = projection.coordinates(columns)
+    rhs = columns.T @ projection.y - coordinates.T @ projection.y_coordinates
     own = np.einsum("nk,nk->k", columns, columns)
     short = columns.T.astype(np.float32)
     size = np.abs(raw)
@@ -215,9 +215,9 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
     for p, block in blocks:
         at = slice(start, start + block.shape[1])
         start = at.stop
-        gram = columns[:, at].T @ columns[:, at] - seen[:, at].T @ seen[:, at]
-        sees = (size[:, at] > SEEN * size[:, at].max()).sum(axis=0)
-        yield p.start, _Group(short[at], own[at], gram, moment[at], float(np.log(np.maximum(sees, 2)).sum()))
+        gram = columns[:, at].T @ columns[:, at] - coordinates[:, at].T @ coordinates[:, at]
+        sees = (size[:, at] > VISIBLE_SHARE * size[:, at].max()).sum(axis=0)
+        yield p.start, _Group(short[at], own[at], gram, rhs[at], float(np.log(np.maximum(sees, 2)).sum()))
 
 
 def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
@@ -227,11 +227,11 @@ def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
     """
     projection = problem.projection
     columns = problem.white(pick.raw(problem))
-    seen, also = projection.seen(columns), rows @ columns
-    gram = columns.T @ columns - seen.T @ seen - also.T @ also
-    moment = columns.T @ projection.residual - also.T @ (rows @ projection.y)
+    coordinates, also = projection.coordinates(columns), rows @ columns
+    gram = columns.T @ columns - coordinates.T @ coordinates - also.T @ also
+    rhs = columns.T @ projection.residual - also.T @ (rows @ projection.y)
     sd = pick.prior_sd(problem, columns.shape[1])
-    return float(_gains(gram[None], moment[None], np.einsum("nk,nk->k", columns, columns)[None], sd[None])[0])
+    return float(_gains(gram[None], rhs[None], np.einsum("nk,nk->k", columns, columns)[None], sd[None])[0])
 
 
 def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
@@ -252,7 +252,7 @@ def rows_for(problem: WhitenedProblem, picks: Sequence[Pick]) -> F2:
     parts = [whitened(problem, p) for p in picks]
     columns, left = (np.concatenate([p[i] for p in parts], axis=1) for i in (0, 1))
     sd = np.concatenate([p.prior_sd(problem, part[0].shape[1]) for p, part in zip(picks, parts, strict=True)])
-    sd = np.minimum(sd, 1.0 / np.sqrt(SEEN * np.einsum("nk,nk->k", columns, columns) + 1e-300))
+    sd = np.minimum(sd, 1.0 / np.sqrt(VISIBLE_SHARE * np.einsum("nk,nk->k", columns, columns) + 1e-300))
     return rows_of(left, columns, sd)
 
 

@@ -65,12 +65,12 @@ class ChangeEvidence:
     size: float
 
 
-def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) -> list[ChangeEvidence]:
+def evidence_of(gram: F2, rhs: F1, base: F2, asked: Sequence[AskedChange]) -> list[ChangeEvidence]:
     """Ask every candidate alone.
 
     Parameters
     ----------
-    gram, moment : arrays, shape (p, p) and (p,)
+    gram, rhs : arrays, shape (p, p) and (p,)
         Normal equations of the whitened readings, less what is expected without any change.
     base : array, shape (p, k)
         Factor of the covariance of everything that is unknown without a change; it is integrated out.
@@ -84,25 +84,25 @@ def evidence_of(gram: F2, moment: F1, base: F2, asked: Sequence[AskedChange]) ->
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
     low = scipy.linalg.cholesky(inside, lower=True)
-    half = scipy.linalg.solve_triangular(low, base.T @ np.column_stack([gram, moment]), lower=True)
+    half = scipy.linalg.solve_triangular(low, base.T @ np.column_stack([gram, rhs]), lower=True)
     own = gram - half[:, :-1].T @ half[:, :-1]
-    gradient = moment - half[:, :-1].T @ half[:, -1]
+    gradient = rhs - half[:, :-1].T @ half[:, -1]
     return [_one(a, own, gradient) for a in asked]
 
 
-def log_evidence(gram: F2, moment: F1, base: F2) -> float:
+def log_evidence(gram: F2, rhs: F1, base: F2) -> float:
     """Log marginal likelihood with everything along ``base`` unknown, less constants common to all bases."""
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
     low = scipy.linalg.cholesky(inside, lower=True)
-    z = scipy.linalg.solve_triangular(low, base.T @ moment, lower=True)
+    z = scipy.linalg.solve_triangular(low, base.T @ rhs, lower=True)
     return 0.5 * float(z @ z) - float(np.log(low.diagonal()).sum())
 
 
-def _one(asked: AskedChange, gram: F2, moment: F1) -> ChangeEvidence:
+def _one(asked: AskedChange, gram: F2, rhs: F1) -> ChangeEvidence:
     d = asked.directions
     values, vectors = scipy.linalg.eigh(d.T @ gram @ d)
-    values, along = np.maximum(values, 0.0), vectors.T @ (d.T @ moment)
+    values, along = np.maximum(values, 0.0), vectors.T @ (d.T @ rhs)
     found = []
     for size in asked.sizes:
         inside = 1.0 + size**2 * values
@@ -127,7 +127,7 @@ class Chosen:
 
     taken: tuple[TakenChange, ...]
     gram: F2
-    moment: F1
+    rhs: F1
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +179,14 @@ class ChangeContext:
         wins, the empty one included.
         """
         weight = np.exp(-self.fit.components.eta)
-        gram, moment = np.tensordot(weight, sums.gram, 1), weight @ sums.moment
-        start = np.zeros(len(moment))
+        gram, rhs = np.tensordot(weight, sums.gram, 1), weight @ sums.rhs
+        start = np.zeros(len(rhs))
         start[: self._n] = self.known.coefficients / self.problem.sizes.typical[: self._n]
-        none = Chosen((), gram, moment - gram @ start)
+        none = Chosen((), gram, rhs - gram @ start)
         linear = tuple(a for a in self.candidates if not a.several)
         every = self._needed(replace(none, taken=tuple(TakenChange(a, max(LINEAR_SIZES), 0.0, ()) for a in linear)))
         grown = [self._grown(start, self.candidates) for start in (none, self._grown(none, linear), every)]
-        best = max([none, *grown], key=lambda c: log_evidence(gram, c.moment, self._beside(c.taken)) - self._price * len(c.taken))
+        best = max([none, *grown], key=lambda c: log_evidence(gram, c.rhs, self._beside(c.taken)) - self._price * len(c.taken))
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
     def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
@@ -194,7 +194,7 @@ class ChangeContext:
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
         others = self._beside([t for t in chosen.taken if t is not taken])
-        own, *found = evidence_of(chosen.gram, chosen.moment, others, [taken.asked, *left])
+        own, *found = evidence_of(chosen.gram, chosen.rhs, others, [taken.asked, *left])
         near = [(e.name, own.gain - e.gain) for e in found if own.gain - e.gain < NEAR]
         return tuple(sorted(near, key=lambda item: item[1]))
 
@@ -211,7 +211,7 @@ class ChangeContext:
         left = [a for a in candidates if a.name not in names]
         if not left:
             return None
-        found = evidence_of(chosen.gram, chosen.moment, self._beside(chosen.taken), left)
+        found = evidence_of(chosen.gram, chosen.rhs, self._beside(chosen.taken), left)
         k = int(np.argmax([e.gain for e in found]))
         gain = found[k].gain - self._price
         if gain < ENOUGH:
@@ -223,7 +223,7 @@ class ChangeContext:
         taken = list(chosen.taken)
         while taken:
             for k, one in enumerate(taken):
-                found = evidence_of(chosen.gram, chosen.moment, self._beside([o for o in taken if o is not one]), [one.asked])[0]
+                found = evidence_of(chosen.gram, chosen.rhs, self._beside([o for o in taken if o is not one]), [one.asked])[0]
                 taken[k] = replace(one, gain=found.gain - self._price, size=found.size)
             least = min(taken, key=lambda t: t.gain)
             if least.gain >= ENOUGH:
@@ -267,7 +267,7 @@ class ChangeContext:
         inside[np.diag_indices_from(inside)] += 1.0
         low = scipy.linalg.cho_factor(inside)
         mine = slice(0, factor.shape[1])
-        x = scipy.linalg.cho_solve(low, whole.T @ chosen.moment)[mine]
+        x = scipy.linalg.cho_solve(low, whole.T @ chosen.rhs)[mine]
         covariance = scipy.linalg.cho_solve(low, np.eye(len(inside))[:, mine])[mine]
         typical = self.problem.sizes.typical[: self._n, None]
         turned = factor[: self._n] * typical
@@ -329,9 +329,9 @@ class ChangeContext:
     def _likelier(self, mine: Chosen, change: F1) -> float:
         """Log likelihood ratio of some runs for a change of coefficients that other runs chose."""
         moved = self._scaled(change)[:, 0]
-        shifted = mine.moment - mine.gram @ moved
-        plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.moment, shifted))
-        return with_it - plain + float(moved @ mine.moment) - 0.5 * float(moved @ mine.gram @ moved)
+        shifted = mine.rhs - mine.gram @ moved
+        plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.rhs, shifted))
+        return with_it - plain + float(moved @ mine.rhs) - 0.5 * float(moved @ mine.gram @ moved)
 
     def _left(self, rows: NDArray[np.bool_], coefficients: F1) -> float:
         """Sum of squares of readings less what coefficients predict, mm²; lost motion and set-ups refitted within their priors."""

@@ -92,13 +92,13 @@ def strength_of(problem: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[f
     effect = pick.effect
     plain = as_plain(problem, pick)
     c_plain, cov_plain = plain @ c, plain @ cov @ plain.T
-    seen = float(effect.strength(c_plain, pick.values))
+    fitted_strength = float(effect.strength(c_plain, pick.values))
     slope = _slope(effect, c_plain, cov_plain, pick)
     own = float(np.sqrt(max(float(slope @ cov_plain @ slope), 0.0)))
     ratio, u_ratio = effect.unseen
-    strength = ratio * seen
-    otherwise = seen - float(effect.strength(as_plain(problem, pick, offset=False) @ c, pick.values))
-    u = float(np.linalg.norm([ratio * own, true_to_form(effect.name, effect.family) * strength, u_ratio * seen, otherwise]))
+    strength = ratio * fitted_strength
+    otherwise = fitted_strength - float(effect.strength(as_plain(problem, pick, offset=False) @ c, pick.values))
+    u = float(np.linalg.norm([ratio * own, true_to_form(effect.name, effect.family) * strength, u_ratio * fitted_strength, otherwise]))
     return strength / effect.per_unit, u / effect.per_unit
 
 
@@ -224,20 +224,20 @@ def finding(
     """
     case, judgement = problem.case, _judge(problem, found, loud, solved, rivals)
     is_named, unnamed = judgement.verdict == "named", judgement.unnamed
-    seen = {r.path.setup for r in problem.runs}
+    fitted_setups = {r.path.setup for r in problem.runs}
     judged = [r for r in case.runs if r.deviation_mm is not None]
-    residuals = [{r.path.label: left_over(r, p[r.path.label], seen) for r in judged} for p in predicted]
+    residuals = [{r.path.label: left_over(r, p[r.path.label], fitted_setups) for r in judged} for p in predicted]
     agreement, unjudged = agreements(problem, solved, predicted[0]) if judgement.verdict == "none" else ((), ())
-    where, verdict, floor = locate(plain.paths, tuple(plain.by_run(plain.projection.residual))), judgement.verdict, floors(problem)
+    location, verdict, floor = locate(plain.paths, tuple(plain.by_run(plain.projection.residual))), judgement.verdict, floors(problem)
     lack = lack_of_fit(problem, residuals[0], floor, agreement) if verdict == "none" else None
     if lack is not None:
-        verdict, unnamed, where = "unknown", (lacking(lack),), lack
+        verdict, unnamed, location = "unknown", (lacking(lack),), lack
     elif verdict == "unknown":
-        where = replace(unnamed[0].where, table=where.table)
+        location = replace(unnamed[0].location, table=location.table)
     return Discovery(
         verdict=verdict,
         effects=judgement.effects if is_named else (),
-        where=where,
+        location=location,
         next_test=_next_test(problem, judgement.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
         gaps=gaps_of(problem, residuals[0], residuals[1], floor),
         residual_before_mm=residuals[0],
@@ -286,14 +286,14 @@ def _judge(
 
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
     """Rms of the holdout runs without each effect over that with all of them, by its number (`NamedEffect.needed`)."""
-    seen = {r.path.setup for r in problem.runs}
+    fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
         return dict.fromkeys(which)
 
     def rms(solution: SolvedModel) -> float:
         read = predictions(problem, solution)
-        return float(np.sqrt(np.nanmean(np.concatenate([left_over(r, read[r.path.label], seen) for r in judges]) ** 2)))
+        return float(np.sqrt(np.nanmean(np.concatenate([left_over(r, read[r.path.label], fitted_setups) for r in judges]) ** 2)))
 
     def deficit(i: int) -> SolvedModel:
         return replace(solved, coefficients=tuple(np.zeros_like(c) if k == i else c for k, c in enumerate(solved.coefficients)))
@@ -344,17 +344,17 @@ def _named(problem: WhitenedProblem, found: Selection, solved: SolvedModel, i: i
     pick, c, cov = solved.picks[i], solved.coefficients[i], solved.covariance[i]
     strength, u = strength_of(problem, pick, c, cov)
     shape = shape_of(pick, solved.shape_u[i])
-    where = localize_signal(problem.paths, tuple(problem.by_run(pick.raw(problem) @ c)))
+    location = localize_signal(problem.paths, tuple(problem.by_run(pick.raw(problem) @ c)))
     return NamedEffect(
         pick.effect.name, pick.key, strength, u, shape, c, cov, 0.5 * found.score,
-        tuple((r.pick.label, 0.5 * r.deficit) for r in rivals), where, tuple(f.name for f in pick.forms),
+        tuple((r.pick.label, 0.5 * r.deficit) for r in rivals), location, tuple(f.name for f in pick.forms),
     )  # fmt: skip
 
 
 def _of_scatter(f: VarianceFinding) -> NamedEffect:
     shape = {name: (value, math.nan) for name, value in f.parameters.items()}  # from a grid: no uncertainty is known
     c, u = np.array([f.strength]), float(np.hypot(f.u_strength, true_to_form(f.name, "drive") * f.strength))
-    return NamedEffect(f.name, f.key, f.strength, u, shape, c, np.array([[u * u]]), f.evidence, where=f.where)
+    return NamedEffect(f.name, f.key, f.strength, u, shape, c, np.array([[u * u]]), f.evidence, location=f.location)
 
 
 def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:

@@ -70,7 +70,7 @@ def level(
     """
     out: dict[str, Colour] = {}
     for kind in dict.fromkeys(kinds):
-        alone, pairs = [], []
+        singles, pairs = [], []
         start = 0
         for n, k in zip(lengths, kinds, strict=True):
             part = slice(start, start + n)
@@ -78,9 +78,9 @@ def level(
             if k == kind:
                 keep = use[part] > 0
                 scaled = residual[part] / np.sqrt(np.maximum(1.0 - leverage[part], 0.1))
-                alone.append(scaled[keep])
+                singles.append(scaled[keep])
                 pairs.append(np.diff(scaled)[keep[1:] & keep[:-1]] / np.sqrt(2.0))
-        sd, smooth = robust_sd(np.concatenate(alone)), robust_sd(np.concatenate(pairs))
+        sd, smooth = robust_sd(np.concatenate(singles)), robust_sd(np.concatenate(pairs))
         sd = smooth if smooth < CLEARLY * sd else sd
         out[kind] = Colour(max(sd, resolution_mm[kind] / np.sqrt(12.0)))
     return out

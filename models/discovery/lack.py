@@ -29,7 +29,7 @@ FEWEST, REPEATS = 8, 20
 """Least readings for judging a single run; least repeats for estimating noise."""
 NEAR_MM = 0.05
 """Positions closer than this are the same one, approached again."""
-ALONE = 0.999
+ALONG_ONE_AXIS = 0.999
 """A laser measures along one axis if that component of its beam is larger."""
 KNOWN_FREEDOM = 1e6
 COMMON, PERIODIC = 0.8, 0.6
@@ -93,14 +93,14 @@ def lack_of_fit(
     off = tuple(a.run for a in agreement if a.p < CHANCE and a.times > TIMES)
     if not (_times(np.concatenate(rest)) > TIMES or loud or off or (table and table[0].p < CHANCE)):
         return None
-    where = locate(problem.paths, tuple(rest))
+    location = locate(problem.paths, tuple(rest))
     if off and not loud:
-        where = replace(where, runs=off)
+        location = replace(location, runs=off)
     shaped = _shape_of([r for r in runs if not loud or r.path.label in loud], left_mm, floor)
     if shaped is None:
-        return where
-    depends = tuple(dict.fromkeys(("position", *(("direction",) if shaped.directions else ()), *where.depends_on)))
-    return replace(shaped, tests=where.tests, runs=where.runs, depends_on=depends, table=where.table)
+        return location
+    depends = tuple(dict.fromkeys(("position", *(("direction",) if shaped.directions else ()), *location.depends_on)))
+    return replace(shaped, tests=location.tests, runs=location.runs, depends_on=depends, table=location.table)
 
 
 def _times(rest: F1) -> float:
@@ -117,7 +117,7 @@ def _louder(rest: F1, floor: Floor, tried: int) -> bool:
 
 def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping[str, Floor]) -> Localization | None:
     """Shape of the residuals along the one axis that all runs measure: span, direction, period; None without such an axis."""
-    lines = [r for r in runs if r.path.test == "laser_linear" and np.abs(r.path.look[0]).max() > ALONE]
+    lines = [r for r in runs if r.path.test == "laser_linear" and np.abs(r.path.look[0]).max() > ALONG_ONE_AXIS]
     axes = {int(np.argmax(np.abs(r.path.look[0]))) for r in lines}
     if not lines or len(axes) != 1 or len(lines) < len(runs):
         return None

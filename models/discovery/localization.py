@@ -114,8 +114,8 @@ def _strong(sizes: dict[K, float]) -> tuple[K, ...]:
 def _time(rows: _SignalRows) -> tuple[float, float] | None:
     """Shortest interval that holds the share, if it is a small part of the campaign."""
     order = np.argsort(rows.t_s, kind="stable")
-    t, held = rows.t_s[order], np.cumsum(rows.energy[order])
-    low, high = np.interp([(1 - SHARE) / 2 * held[-1], (1 + SHARE) / 2 * held[-1]], held, t)
+    t, cumulative = rows.t_s[order], np.cumsum(rows.energy[order])
+    low, high = np.interp([(1 - SHARE) / 2 * cumulative[-1], (1 + SHARE) / 2 * cumulative[-1]], cumulative, t)
     return (float(low), float(high)) if high - low <= LOCAL * np.ptp(t) else None
 
 
@@ -175,9 +175,9 @@ def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Localization:
         (replace(g, p=float(-np.expm1(tried * np.log1p(-min(g.p, 1.0 - 1e-12))))) for g in found), key=lambda g: (g.p, g.kind, g.value)
     )
     significant = [g for g in table if g.p < SIGNIFICANT]
-    table_out = tuple(Significance(g.kind, g.value, g.statistic, g.p) for g in table)
+    significance = tuple(Significance(g.kind, g.value, g.statistic, g.p) for g in table)
     if not significant:
-        return Localization(table=table_out)
+        return Localization(table=significance)
 
     def values(kind: str) -> tuple[str, ...]:
         return tuple(dict.fromkeys(g.value.removesuffix(NEIGHBOURS).removesuffix(DIFFER) for g in significant if g.kind == kind))
@@ -186,7 +186,7 @@ def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Localization:
     return Localization(
         tests=values("test") or values("instrument"), axes=values("axis"), directions=tuple(int(v) for v in values("direction")),
         runs=values("run"), time_s=spread.time_s, position_mm=spread.position_mm, radius_mm=spread.radius_mm,
-        depends_on=tuple(dict.fromkeys(DEPENDS[g.kind] for g in significant if g.kind in DEPENDS)), table=table_out,
+        depends_on=tuple(dict.fromkeys(DEPENDS[g.kind] for g in significant if g.kind in DEPENDS)), table=significance,
     )  # fmt: skip
 
 

@@ -142,14 +142,14 @@ def _memory(residual: F1, taken: F2) -> float:
     n, ss = residual.size, float(residual @ residual)
     if ss <= 0.0:
         return 0.0
-    seen = float(residual[1:] @ residual[:-1]) / ss
+    observed = float(residual[1:] @ residual[:-1]) / ss
     q = scipy.linalg.orth(taken)
     project = np.eye(n) - q @ q.T
     expected = []
     for memory in MEMORIES:
         cov = project @ _correlation(n, float(memory)) @ project
         expected.append(float(np.trace(cov, offset=1) / np.trace(cov)))
-    found = float(np.interp(seen, expected, MEMORIES))
+    found = float(np.interp(observed, expected, MEMORIES))
     return min(found + 2.0 * float(np.sqrt((1.0 - found**2) / n)), float(MEMORIES[-1]))
 
 

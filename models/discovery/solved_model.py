@@ -138,43 +138,43 @@ def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
     """Coefficients for columns over all runs; zero for columns that no identify run sees."""
     if columns[0].shape[1] == c.size:
         return c
-    seen = np.any([np.abs(col).max(axis=0) > 0.0 for col, known in zip(columns, identified, strict=True) if known], axis=0)
+    observed = np.any([np.abs(col).max(axis=0) > 0.0 for col, known in zip(columns, identified, strict=True) if known], axis=0)
     out = np.zeros(columns[0].shape[1])
-    out[np.flatnonzero(seen)] = c
+    out[np.flatnonzero(observed)] = c
     return out
 
 
-def free_columns(run: CaseRun, seen: set[str]) -> F2:
+def free_columns(run: CaseRun, fitted_setups: set[str]) -> F2:
     """Columns of a judged run's own unknowns: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
     p = run.path
     if p.kind == "laser":
         return np.ones((p.n, 1))
-    if p.setup in seen:
+    if p.setup in fitted_setups:
         return np.zeros((p.n, 0))
     return np.column_stack([p.look, np.ones(p.n)])
 
 
-def left_over(run: CaseRun, predicted_mm: F1, seen: set[str]) -> F1:
+def left_over(run: CaseRun, predicted_mm: F1, fitted_setups: set[str]) -> F1:
     """Reading minus prediction after fitting the run's own unknowns, mm; NaN for flagged readings."""
     assert run.deviation_mm is not None
     gap = np.where(run.valid, run.deviation_mm, 0.0) - np.where(run.valid, predicted_mm, 0.0)
-    free = free_columns(run, seen) * run.valid[:, None]
+    free = free_columns(run, fitted_setups) * run.valid[:, None]
     if free.shape[1]:
         gap = gap - free @ np.linalg.lstsq(free, gap, rcond=None)[0]
     return np.asarray(np.where(run.valid, gap, np.nan))
 
 
-def left_together(runs: Sequence[CaseRun], predicted_mm: Mapping[str, F1], seen: set[str]) -> dict[str, F1]:
+def left_together(runs: Sequence[CaseRun], predicted_mm: Mapping[str, F1], fitted_setups: set[str]) -> dict[str, F1]:
     """As `left_over` for several runs, by label; ball-bar runs that share a set-up of their own have one cup and one length of each bar."""
     groups: dict[str, list[CaseRun]] = {}
     for run in runs:
-        own_cup = run.path.kind == "bar" and run.path.setup not in seen
+        own_cup = run.path.kind == "bar" and run.path.setup not in fitted_setups
         groups.setdefault(f"set-up {run.path.setup}" if own_cup else f"run {run.path.label}", []).append(run)
     out: dict[str, F1] = {}
     for group in groups.values():
         if len(group) == 1:
             label = group[0].path.label
-            out[label] = left_over(group[0], predicted_mm[label], seen)
+            out[label] = left_over(group[0], predicted_mm[label], fitted_setups)
         else:
             out |= _left_of_cup(group, predicted_mm)
     return out

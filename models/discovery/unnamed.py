@@ -10,7 +10,7 @@ import numpy as np
 from abbe.models.discovery.answer import Localization, NextTest
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.experiment.additions import BAR_MIN, LASER_MIN, RUN_MIN, WAIT_MIN, offers
-from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed, where_of
+from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed, location_of
 from abbe.models.discovery.selection import Selection
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.effects.path import Path
@@ -30,47 +30,47 @@ class Structure:
     label: str
     title: str
     evidence: float
-    where: Localization
+    location: Localization
 
 
 def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
     """Structures among the effects of the mean (``found``) and of the variance (``loud``), by evidence."""
     out = [
-        Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, where_of(f.pick.effect, f.pick.key, f.pick.values, case))
+        Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, location_of(f.pick.effect, f.pick.key, f.pick.values, case))
         for f in found
         if f.pick.unnamed
     ]
-    out += [Structure(f.label, TITLES[f.name], f.evidence, f.where) for f in loud if is_unnamed(f.name)]
+    out += [Structure(f.label, TITLES[f.name], f.evidence, f.location) for f in loud if is_unnamed(f.name)]
     return tuple(sorted(out, key=lambda s: (-s.evidence, s.label)))
 
 
-def lacking(where: Localization) -> Structure:
+def lacking(location: Localization) -> Structure:
     """A lack of fit as a structure."""
-    axis = f":{where.axes[0]}" if len(where.axes) == 1 else ""
-    if where.shape:
-        return Structure(f"{PREFIX}smooth{axis}", where.shape, 0.0, where)
-    return Structure(f"{PREFIX}place{axis}", "more is left than noise", 0.0, where)
+    axis = f":{location.axes[0]}" if len(location.axes) == 1 else ""
+    if location.shape:
+        return Structure(f"{PREFIX}smooth{axis}", location.shape, 0.0, location)
+    return Structure(f"{PREFIX}place{axis}", "more is left than noise", 0.0, location)
 
 
 def describe_structure(structure: Structure, *, beside: bool) -> str:
     """``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: names were found too."""
-    parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.where)]
+    parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.location)]
     return ", ".join(parts) + ("; what it closes of the gap is not the names'" if beside else "")
 
 
-def _place(where: Localization) -> list[str]:
+def _place(location: Localization) -> list[str]:
     out = []
-    if where.time_s is not None:
-        out.append(f"at {where.time_s[0]:.0f} to {where.time_s[1]:.0f} s")
-    if where.position_mm is not None:
-        x, y, z = where.position_mm
+    if location.time_s is not None:
+        out.append(f"at {location.time_s[0]:.0f} to {location.time_s[1]:.0f} s")
+    if location.position_mm is not None:
+        x, y, z = location.position_mm
         out.append(f"around X {x:.0f} Y {y:.0f} Z {z:.0f} mm")
-    if where.period_s is not None:
-        out.append(f"period {where.period_s:.1f} s")
-    if where.period_mm is not None:
-        out.append(f"pitch {where.period_mm:.1f} mm")
-    if where.angular_lobes is not None:
-        out.append(f"{where.angular_lobes} lobes")
+    if location.period_s is not None:
+        out.append(f"period {location.period_s:.1f} s")
+    if location.period_mm is not None:
+        out.append(f"pitch {location.period_mm:.1f} mm")
+    if location.angular_lobes is not None:
+        out.append(f"{location.angular_lobes} lobes")
     return out
 
 
@@ -146,7 +146,7 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
     open_ = {o.adds: o.minutes for o in offers(case)}
     plan, adds = _chosen(kind, like, set(open_))
     minutes = _repeat_minutes(like) if adds == "longer_session" else open_.get(adds, _once_minutes(like))
-    period = structures[0].where.period_s
+    period = structures[0].location.period_s
     standstill = "" if period is None else f" for {PERIODS * period:.0f} s"
     why = plan.why.format(run=f"run {like.label}", standstill=standstill)
     return NextTest((adds,), plan.between, None, float(minutes), why, like.label)
@@ -169,10 +169,10 @@ def _chosen(kind: str, like: Path, open_: set[str]) -> tuple[_Plan, str]:
 def _like(case: Case, structure: Structure) -> Path:
     """The run that is measured again: of those that show it a helix, if there is one, for a machine does that alone; near its moment."""
     paths = [r.path for r in case.of("identify", "holdout")]
-    where = structure.where
-    shown = [p for p in paths if p.label in where.runs] or paths
-    if where.time_s is not None:
-        middle = 0.5 * sum(where.time_s)
+    location = structure.location
+    shown = [p for p in paths if p.label in location.runs] or paths
+    if location.time_s is not None:
+        middle = 0.5 * sum(location.time_s)
         shown = sorted(shown, key=lambda p: max(float(p.at.t_s[0]) - middle, middle - float(p.at.t_s[-1]), 0.0))
     return next((p for kind in ("ballbar_helix", "ballbar_circle") for p in shown if p.test == kind), shown[0])
 

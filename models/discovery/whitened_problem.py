@@ -51,7 +51,7 @@ class SignalProjection:
         Whitened columns of the unknowns are ``columns`` times ``weight``, reading by reading.
     root : array, shape (p, p), lower triangle.
     more : array, shape (k, n): rows of T for further columns.
-    moment : array, shape (p + k,) = T @ y.
+    y_coordinates : array, shape (p + k,) = T @ y.
     """
 
     y: F1
@@ -59,7 +59,7 @@ class SignalProjection:
     weight: F1
     root: F2
     more: F2
-    moment: F1
+    y_coordinates: F1
 
     @classmethod
     def nothing(cls, n: int) -> SignalProjection:
@@ -73,9 +73,9 @@ class SignalProjection:
         scaled.flat[:: len(gram) + 1] += 1.0
         root = scipy.linalg.solve_triangular(np.linalg.cholesky(scaled), np.diag(prior_sd), lower=True)
         projection = cls(y, columns, np.ones(y.size) if weight is None else weight, root, np.zeros((0, y.size)), np.zeros(0))
-        return replace(projection, moment=projection.seen(y[:, None])[:, 0])
+        return replace(projection, y_coordinates=projection.coordinates(y[:, None])[:, 0])
 
-    def seen(self, columns: F2) -> F2:
+    def coordinates(self, columns: F2) -> F2:
         """T @ columns, shape (p + k, columns)."""
         return np.concatenate([self.root @ (self.columns.T @ (columns * self.weight[:, None])), self.more @ columns])
 
@@ -86,12 +86,12 @@ class SignalProjection:
 
     def left(self, columns: F2) -> F2:
         """M @ columns, shape (n, k)."""
-        return columns - self.spread(self.seen(columns))
+        return columns - self.spread(self.coordinates(columns))
 
     @cached_property
     def residual(self) -> F1:
         """M @ y, the whitened residual."""
-        return np.asarray(self.y - self.spread(self.moment[:, None])[:, 0])
+        return np.asarray(self.y - self.spread(self.y_coordinates[:, None])[:, 0])
 
     @cached_property
     def leverage(self) -> F1:
@@ -106,7 +106,7 @@ class SignalProjection:
     @property
     def chi2(self) -> float:
         """y^T M y."""
-        return float(self.y @ self.y - self.moment @ self.moment)
+        return float(self.y @ self.y - self.y_coordinates @ self.y_coordinates)
 
     def rows(self, columns: F2, prior_sd: F1) -> F2:
         """Rows of T that project out more columns (n, k), shape (k, n)."""
@@ -115,7 +115,7 @@ class SignalProjection:
     def without(self, columns: F2, prior_sd: F1) -> SignalProjection:
         """The projection with more columns projected out."""
         rows = self.rows(columns, prior_sd)
-        return replace(self, more=np.concatenate([self.more, rows]), moment=np.concatenate([self.moment, rows @ self.y]))
+        return replace(self, more=np.concatenate([self.more, rows]), y_coordinates=np.concatenate([self.y_coordinates, rows @ self.y]))
 
 
 def rows_of(left: F2, columns: F2, prior_sd: F1) -> F2:

@@ -241,8 +241,8 @@ def setup_length(parts: int) -> Callable[[F1, Values], float]:
 
     def strength(coefficients: F1, values: Values) -> float:
         lengths = np.linalg.norm(np.reshape(coefficients, (-1, parts)), axis=1)
-        seen = lengths[lengths > 0.0]
-        return float(np.sqrt(np.mean(seen**2))) if seen.size else 0.0
+        nonzero = lengths[lengths > 0.0]
+        return float(np.sqrt(np.mean(nonzero**2))) if nonzero.size else 0.0
 
     return strength
 

@@ -173,7 +173,7 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
     return out
 
 
-def standing(q_mm: F1, t_s: float, temp_c: Mapping[str, F1]) -> Places:
+def at_rest(q_mm: F1, t_s: float, temp_c: Mapping[str, F1]) -> Places:
     """Places with one row: the machine stands, its approach is unknown."""
     rest = np.zeros((1, 3))
     return Places(q_mm[None], rest, np.full((1, 3), FAR_MM), rest, rest, np.array([t_s]), temp_c)

@@ -14,7 +14,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.effects.effect import Effect, Family, Remedy, Signal, Values
-from abbe.models.effects.path import Kind, Path, driven, standing
+from abbe.models.effects.path import Kind, Path, at_rest, driven
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import diagonal_ends, step_diagonal
@@ -158,7 +158,7 @@ def _bar(owner: tuple[Machine, int], names: tuple[str, str], q_mm: F2, radius_mm
     set_s = 1800.0 * (start_s // 1800.0) - 120.0
     feeds = np.full(len(q_mm), feed)
     at = driven(q_mm, t_s, feeds, dwelling=False, temp_c=_warm(t_s))
-    reference = standing(CENTRE_MM, set_s, _warm(np.array([set_s])))
+    reference = at_rest(CENTRE_MM, set_s, _warm(np.array([set_s])))
     return Path(
         label, f"bar{radius_mm:.0f}-{start_s // 1800.0:.0f}", test, "bar", machine, vertical, at, reference, (q_mm - CENTRE_MM) / radius_mm,
         feeds, np.full(len(q_mm), float(direction)), np.zeros(len(q_mm)), set_s, 0.0, radius_mm, CENTRE_MM,

@@ -178,8 +178,8 @@ def _side(values: F2) -> _Side:
 
 def _of_mean(side: _Side, reversal: F1) -> F1:
     """Standard uncertainty of the means. What was read once has the scatter of the reversals about their mean, as two readings' noise."""
-    alone = float(np.std(reversal, ddof=1)) / np.sqrt(2.0)
-    return np.where(side.n > 1.0, side.s / np.sqrt(side.n), alone)
+    from_reversal = float(np.std(reversal, ddof=1)) / np.sqrt(2.0)
+    return np.where(side.n > 1.0, side.s / np.sqrt(side.n), from_reversal)
 
 
 def _of_s(side: _Side) -> F1:

@@ -96,7 +96,7 @@ def error_arrays(terms: tuple[Monomial, ...], theta: F1, u: F2, angle_scale: flo
     return ErrorArrays(d, e, s)
 
 
-def each_alone(terms: tuple[Monomial, ...], u: F2, angle_scale: float = 1.0) -> list[tuple[slice, ErrorArrays]]:
+def individual_terms(terms: tuple[Monomial, ...], u: F2, angle_scale: float = 1.0) -> list[tuple[slice, ErrorArrays]]:
     """Functions with one coefficient 1 and the others 0, for every coefficient in as few batches as possible: a design needs them all.
 
     Returns
@@ -112,5 +112,5 @@ def each_alone(terms: tuple[Monomial, ...], u: F2, angle_scale: float = 1.0) -> 
         for k, t in enumerate(terms[:functions]):
             (d if t.kind == "d" else e)[k, :, t.i, t.j] = u[:, t.j] ** t.power * (1.0 if t.kind == "d" else angle_scale)
         out.append((slice(0, functions), ErrorArrays(d.reshape(-1, 3, 3), e.reshape(-1, 3, 3), np.zeros(3))))
-    alone = [(slice(k, k + 1), error_arrays((terms[k],), np.ones(1), u, angle_scale)) for k in range(functions, len(terms))]
-    return out + alone
+    singles = [(slice(k, k + 1), error_arrays((terms[k],), np.ones(1), u, angle_scale)) for k in range(functions, len(terms))]
+    return out + singles

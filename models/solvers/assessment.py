@@ -56,7 +56,7 @@ class Observability:
     machine, terms, model
         Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution carries higher
         orders along, for honest uncertainties).
-    seen : ObservedInformation
+    observed : ObservedInformation
         Rank, effective rank, condition, null space (unit columns).
     reachable : int
         Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
@@ -76,7 +76,7 @@ class Observability:
     machine: Machine
     terms: tuple[Term, ...]
     model: tuple[Term, ...]
-    seen: ObservedInformation
+    observed: ObservedInformation
     reachable: int
     known: tuple[str, ...]
     hidden: tuple[HiddenGroup, ...]
@@ -91,7 +91,7 @@ class Observability:
     @property
     def rank(self) -> int:
         """Number of combinations of coefficients that the readings determine."""
-        return self.seen.rank
+        return self.observed.rank
 
     def at(self, axes_mm: F2) -> Volume:
         """Prior size, uncertainty and noise gain at commanded positions (n, 3), mm."""
@@ -105,7 +105,7 @@ class Observability:
         """The report in short sentences, most important first."""
         n, v, k = len(self.terms), self.volume, self.volume.worst_point
         out = [self.number.text]
-        out.append(f"The readings show {self.seen.rank} of {n} coefficients, {self.seen.effective_rank} of them well; ")
+        out.append(f"The readings show {self.observed.rank} of {n} coefficients, {self.observed.effective_rank} of them well; ")
         out[-1] += f"with the tools used no run could show more than {self.reachable}."
         place = ", ".join(f"{x:.0f}" for x in v.axes_mm[k])
         out.append(
@@ -216,22 +216,22 @@ def _report(
     terms = tuple(model.terms[i] for i in counted)
     few = compressed(replace(columns, machine=columns.machine[:, counted]))
     known = stated_knowledge(terms, runs, columns.setup_names) if known is None else known
-    seen, prior_sd = observed_information(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
-    found = picture(CampaignLayout(machine, terms, runs, few, known), seen, prior_sd[counted])
+    observed, prior_sd = observed_information(few, known), np.linalg.norm(beliefs.prior_root, axis=1)
+    found = picture(CampaignLayout(machine, terms, runs, few, known), observed, prior_sd[counted])
     names = (*(t.name for t in model.terms), *(f"backlash_{a}" for a in DIRECTIONS), *columns.setup_names)
-    secret = hidden_terms(terms, seen.null_space)
+    secret = hidden_terms(terms, observed.null_space)
     knowing = _knowing(beliefs, p)
     volume = whole_volume(machine, model.terms, knowing)
     return Observability(
         machine=machine,
         terms=terms,
         model=model.terms,
-        seen=seen,
+        observed=observed,
         reachable=found.reachable,
-        known=tuple(known.held),
+        known=tuple(known.fixed),
         hidden=found.groups,
         advice=found.advice,
-        parameters=parameters(names, beliefs.theta, beliefs.covariance, prior_sd, secret | hidden_free(few, known, seen)),
+        parameters=parameters(names, beliefs.theta, beliefs.covariance, prior_sd, secret | hidden_free(few, known, observed)),
         correlations=correlations(names, beliefs.covariance),
         motions=motions(machine, model.terms, knowing.posterior, knowing.prior, secret),
         knowing=knowing,

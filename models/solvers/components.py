@@ -68,13 +68,13 @@ class InformationSums:
     """Normal equations per kind of instrument: A^T W A (k, p, p), A^T W y (k, p), y^T W y (k,), sum of weights (k,)."""
 
     gram: F3
-    moment: F2
+    rhs: F2
     square: F1
     count: F1
 
     def minus(self, other: InformationSums) -> InformationSums:
         """The sums without a part of the readings."""
-        return InformationSums(self.gram - other.gram, self.moment - other.moment, self.square - other.square, self.count - other.count)
+        return InformationSums(self.gram - other.gram, self.rhs - other.rhs, self.square - other.square, self.count - other.count)
 
     def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> InformationSums:
         """The sums for other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
@@ -83,12 +83,12 @@ class InformationSums:
             gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
         for at in blocks:
             gram[:, at, :] = root[np.ix_(at, at)].T @ gram[:, at, :]
-        return InformationSums(gram, self.moment @ root, self.square, self.count)
+        return InformationSums(gram, self.rhs @ root, self.square, self.count)
 
     def decimated(self, factor: F1) -> InformationSums:
         """The sums with fewer effective readings by ``factor``, shape (k,), because neighbours are correlated."""
         f: F1 = 1.0 / factor
-        return InformationSums(self.gram * f[:, None, None], self.moment * f[:, None], self.square * f, self.count * f)
+        return InformationSums(self.gram * f[:, None, None], self.rhs * f[:, None], self.square * f, self.count * f)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...
     """Normal equations of every fold for given weights of the readings (1: as it is, 0: not used), shape (n,)."""
     found = []
     for f in range(g.parts.shape[0]):
-        gram, moment, square, count = g.parts[f].copy(), [], [], []
+        gram, rhs, square, count = g.parts[f].copy(), [], [], []
         for k in range(len(KINDS)):
             at = (r.fold == f) & (r.kind == k)
             w, y = weight[at], r.y[at]
@@ -124,10 +124,10 @@ def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...
             if downweighted.size:
                 out = r.a[downweighted]
                 gram[k] -= (out * (1.0 - weight[downweighted])[:, None]).T @ out
-            moment.append((w * y) @ r.a[at])
+            rhs.append((w * y) @ r.a[at])
             square.append(float(w @ y**2))
             count.append(float(w.sum()))
-        found.append(InformationSums(gram, np.array(moment), np.array(square), np.array(count)))
+        found.append(InformationSums(gram, np.array(rhs), np.array(square), np.array(count)))
     return tuple(found)
 
 
@@ -135,7 +135,7 @@ def total(parts: tuple[InformationSums, ...]) -> InformationSums:
     """All folds together."""
     return InformationSums(
         np.sum([s.gram for s in parts], axis=0),
-        np.sum([s.moment for s in parts], axis=0),
+        np.sum([s.rhs for s in parts], axis=0),
         np.sum([s.square for s in parts], axis=0),
         np.sum([s.count for s in parts], axis=0),
     )
@@ -169,15 +169,15 @@ def blend(sums: InformationSums, c: Components, half: F1) -> tuple[F2, F1, float
     """Information, moment and sum of squares over all instruments in units of the prior: (p, p), (p,), scalar."""
     w = np.exp(-c.eta)
     gram = np.tensordot(w, sums.gram, 1) * (half[:, None] * half)
-    return gram, (w @ sums.moment) * half, float(w @ sums.square)
+    return gram, (w @ sums.rhs) * half, float(w @ sums.square)
 
 
 def posterior(sums: InformationSums, c: Components, model: SizeModel) -> ComponentPosterior:
     """Most probable unknowns, their covariance and the evidence."""
-    gram, moment, square = blend(sums, c, c.half(model))
+    gram, rhs, square = blend(sums, c, c.half(model))
     np.fill_diagonal(gram, gram.diagonal() + 1.0)
     low = scipy.linalg.cholesky(gram, lower=True, overwrite_a=True, check_finite=False)
-    z = scipy.linalg.solve_triangular(low, moment, lower=True, check_finite=False)
+    z = scipy.linalg.solve_triangular(low, rhs, lower=True, check_finite=False)
     x = scipy.linalg.solve_triangular(low, z, lower=True, trans=1, check_finite=False)
     inverse, _ = scipy.linalg.lapack.dpotri(low, lower=1)  # its lower half only; the rest is the zeros of the factor
     cov = inverse + inverse.T
@@ -197,20 +197,20 @@ def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPo
     gradient[:h] = 0.5 * (p.x**2 + p.cov.diagonal() - 1.0) @ model.design
     info = np.zeros((gradient.size, gradient.size))
     info[:h, :h] = 0.5 * model.design.T @ (hat * hat) @ model.design
-    seen = _seen(sums, w, half, p.cov, hat)
+    shares = _information_shares(sums, w, half, p.cov, hat)
     for k in kinds:
         own = p.x * half
-        left = w[k] * (sums.square[k] - 2.0 * float(sums.moment[k] @ own) + float(own @ sums.gram[k] @ own))
-        trace = float(seen[k].trace())
+        left = w[k] * (sums.square[k] - 2.0 * float(sums.rhs[k] @ own) + float(own @ sums.gram[k] @ own))
+        trace = float(shares[k].trace())
         gradient[h + k] = 0.5 * (left + trace - float(sums.count[k]))
-        info[h + k, :h] = info[:h, h + k] = 0.5 * np.einsum("ij,ji->i", p.cov, seen[k]) @ model.design
+        info[h + k, :h] = info[:h, h + k] = 0.5 * np.einsum("ij,ji->i", p.cov, shares[k]) @ model.design
         for m in kinds:
-            info[h + k, h + m] = 0.5 * float(np.einsum("ij,ji->", seen[k], seen[m]))
+            info[h + k, h + m] = 0.5 * float(np.einsum("ij,ji->", shares[k], shares[m]))
         info[h + k, h + k] += 0.5 * (float(sums.count[k]) - 2.0 * trace)
     return gradient, info
 
 
-def _seen(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
+def _information_shares(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
     """Information of each instrument times the covariance; all together they are I - S, so the last one costs nothing."""
     used = np.flatnonzero(sums.count > 0)
     out = [np.zeros_like(cov) for _ in w]
@@ -314,8 +314,8 @@ def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Comp
     factor = np.ones(model.typical.size)
     for at in model.blocks:
         scale = np.exp(0.25 * unsure[at])
-        held = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
-        factor[at] = scale * np.hypot(held, SMALLEST_BEND) / held
+        prior_size = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
+        factor[at] = scale * np.hypot(prior_size, SMALLEST_BEND) / prior_size
     return replace(model, root=model.root * factor), c
 
 
@@ -360,7 +360,7 @@ def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, l
     levels = tuple(int(v) for v in np.unique(level[level >= 0]))
     w = np.exp(-c.eta)
     root = model.root * c.half(model)
-    gram, moment, fixed = _without_setup(np.tensordot(w, sums.gram, 1), w @ sums.moment, root, level)
+    gram, rhs, fixed = _without_setup(np.tensordot(w, sums.gram, 1), w @ sums.rhs, root, level)
     at = np.flatnonzero(level >= 0)
     covariance = root[at] @ root[at].T
     out = []
@@ -370,23 +370,23 @@ def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, l
         inside = low.T @ gram[np.ix_(keep, keep)] @ low
         np.fill_diagonal(inside, inside.diagonal() + 1.0)
         factor = scipy.linalg.cholesky(inside, lower=True, check_finite=False)
-        z = scipy.linalg.solve_triangular(factor, low.T @ moment[keep], lower=True, check_finite=False)
+        z = scipy.linalg.solve_triangular(factor, low.T @ rhs[keep], lower=True, check_finite=False)
         out.append(fixed + 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum()))
     return levels, np.array(out)
 
 
-def _without_setup(gram: F2, moment: F1, root: F2, level: I1) -> tuple[F2, F1, float]:
+def _without_setup(gram: F2, rhs: F1, root: F2, level: I1) -> tuple[F2, F1, float]:
     """Normal equations of the smooth terms with lost motion and set-up integrated out, and the log evidence of that part."""
     terms, rest = np.flatnonzero(level >= 0), np.flatnonzero(level < 0)
     sd = root.diagonal()[rest]  # independent of each other
     own = gram[np.ix_(rest, rest)] * sd[:, None] * sd
     np.fill_diagonal(own, own.diagonal() + 1.0)
     factor = scipy.linalg.cholesky(own, lower=True, check_finite=False)
-    both = np.column_stack([gram[np.ix_(rest, terms)], moment[rest]]) * sd[:, None]
+    both = np.column_stack([gram[np.ix_(rest, terms)], rhs[rest]]) * sd[:, None]
     half = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
     z = half[:, -1]
     fixed = 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum())
-    return gram[np.ix_(terms, terms)] - half[:, :-1].T @ half[:, :-1], moment[terms] - half[:, :-1].T @ z, fixed
+    return gram[np.ix_(terms, terms)] - half[:, :-1].T @ half[:, :-1], rhs[terms] - half[:, :-1].T @ z, fixed
 
 
 def choose(parts: tuple[InformationSums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:

@@ -38,8 +38,8 @@ def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> DesignRows:
     """
     d = points_mm - centre_mm
     n = d / np.linalg.norm(d, axis=1, keepdims=True)
-    seen = np.einsum("ni,nik->nk", n, field(points_mm) - field(centre_mm[None]))
-    return DesignRows(seen, np.concatenate([-n, np.ones((len(n), 1))], axis=1))
+    along_normal = np.einsum("ni,nik->nk", n, field(points_mm) - field(centre_mm[None]))
+    return DesignRows(along_normal, np.concatenate([-n, np.ones((len(n), 1))], axis=1))
 
 
 def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> DesignRows:
@@ -138,8 +138,8 @@ def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
     """
     unit, factor = unit_columns(a)
     _, s, vt = svd(project_out(unit, setup), full_matrices=False)
-    seen = s > RANK_TOLERANCE * s[0]
-    gain = (predict * factor) @ (vt[seen].T / s[seen])
+    kept = s > RANK_TOLERANCE * s[0]
+    gain = (predict * factor) @ (vt[kept].T / s[kept])
     return np.asarray(np.sqrt((gain**2).sum(axis=2)))
 
 

@@ -233,10 +233,10 @@ def _rank(problem: CampaignProblem, order: int) -> Identifiability:
     terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)
     columns = compressed(campaign_columns(problem.machine, terms, problem.runs, problem.setup))
     known = stated_knowledge(terms, problem.runs, problem.setup.names)
-    seen = observed_information(columns, known)
-    hidden = combinations_of(names, seen.null_space * (seen.factor / problem.sizes.typical[inside])[:, None])
-    involved = taking_part(names, seen.null_space) | hidden_free(columns, known, seen)
-    return Identifiability(len(names), seen.rank, seen.effective_rank, seen.condition, hidden, involved)
+    observed = observed_information(columns, known)
+    hidden = combinations_of(names, observed.null_space * (observed.factor / problem.sizes.typical[inside])[:, None])
+    involved = taking_part(names, observed.null_space) | hidden_free(columns, known, observed)
+    return Identifiability(len(names), observed.rank, observed.effective_rank, observed.condition, hidden, involved)
 
 
 def _fits(problem: CampaignProblem, fit: CampaignFit) -> tuple[RunFit, ...]:

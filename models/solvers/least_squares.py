@@ -217,8 +217,8 @@ def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, toleran
         Typical size of each parameter; default: unit-norm columns (the convention of math.md 4.4 to 4.6).
     """
     norm = np.linalg.norm(a, axis=0)
-    seen = norm > tolerance * (norm.max() if norm.size else 1.0)
-    scale = np.where(seen, 1.0 / np.where(seen, norm, 1.0), 1.0) if typical is None else typical
+    nonzero = norm > tolerance * (norm.max() if norm.size else 1.0)
+    scale = np.where(nonzero, 1.0 / np.where(nonzero, norm, 1.0), 1.0) if typical is None else typical
     _, s, vt = svd(a * scale, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(names) - s.size)])
     top = s[0] if s.size and s[0] > 0 else 1.0

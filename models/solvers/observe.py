@@ -244,9 +244,9 @@ class AxisPlaces:
 
     def rows(self, direction: F2, slope: F4) -> F2:
         """Derivative of a reading in the given directions (n, 3) with respect to every term and lost motion, shape (n, terms + 3)."""
-        seen = (direction[:, None, :] @ slope.reshape(-1, 3, 18))[:, 0, :]
-        lost = -0.5 * self.sign * seen[:, [0, 7, 14]]
-        return np.concatenate([self.values * seen[:, self.column], lost], axis=1)
+        along = (direction[:, None, :] @ slope.reshape(-1, 3, 18))[:, 0, :]
+        lost = -0.5 * self.sign * along[:, [0, 7, 14]]
+        return np.concatenate([self.values * along[:, self.column], lost], axis=1)
 
 
 __all__ = [
@@ -417,8 +417,8 @@ class _Laser:
         _, _, zero, drift = self._names()
         values = self.known.get(zero, drift)
         factor = factors.prod()
-        seen = nominal @ lean + added @ (self.run.beam + lean)  # apart, so that no digits of the metre are lost
-        return np.asarray((factor - 1.0) * (nominal @ self.run.beam) + factor * seen + values[0] + values[1] * self._since_s())
+        apparent_mm = nominal @ lean + added @ (self.run.beam + lean)  # apart, so that no digits of the metre are lost
+        return np.asarray((factor - 1.0) * (nominal @ self.run.beam) + factor * apparent_mm + values[0] + values[1] * self._since_s())
 
     def jacobian(self) -> F2:
         assert self.run.beam is not None

@@ -128,10 +128,10 @@ class CampaignTrials:
         """Errors of all readings in units of their standard deviation, shape (trials, n)."""
         out = np.empty((trials, self.response.weight.size), dtype=np.float32)
         for name in READINGS:
-            seen = self.response.kind == name.removesuffix("_noise")
-            drawn = np.empty((trials, int(seen.sum())), dtype=np.float32)
+            mask = self.response.kind == name.removesuffix("_noise")
+            drawn = np.empty((trials, int(mask.sum())), dtype=np.float32)
             self.distributions.get(name, NORMAL).fill(rng, drawn)
-            out[:, seen] = drawn
+            out[:, mask] = drawn
         return out
 
     def _drawn(self, name: str, rng: np.random.Generator, shape: tuple[int, int]) -> F2:

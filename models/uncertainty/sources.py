@@ -106,13 +106,13 @@ class Response:
         """Change of every unknown when each reading is wrong by ``error_mm`` (n,): C A^T W e, shape (p,)."""
         return np.asarray(self.covariance @ (self.design.T @ (error_mm * self.weight)))
 
-    def noise_factor(self, variance_mm2: F1 | None, seen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> F2:
+    def noise_factor(self, variance_mm2: F1 | None, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> F2:
         """Factor of the covariance that independent errors of some readings give the unknowns, shape (p, p).
 
-        ``variance_mm2``: of each reading (n,); None: what its weight stands for. ``seen``: which readings have them.
+        ``variance_mm2``: of each reading (n,); None: what its weight stands for. ``mask``: which readings have them.
         """
         size = np.sqrt(self.weight) if variance_mm2 is None else np.sqrt(variance_mm2) * self.weight
-        r = scipy.linalg.qr(self.design[seen] * size[seen, None], mode="r")[0][: self.design.shape[1]]
+        r = scipy.linalg.qr(self.design[mask] * size[mask, None], mode="r")[0][: self.design.shape[1]]
         return np.asarray(self.covariance @ r.T)
 
     def dof_of(self, kind: str) -> float:
@@ -173,9 +173,9 @@ def order_source(solution: JointSolution, r: Response, orders_above: int) -> tup
     omitted = _design(solution, above)
     weighted = omitted * r.weight[:, None]
     carried = r.covariance @ (r.design.T @ weighted)  # K B
-    seen = omitted.T @ weighted - (weighted.T @ r.design) @ carried
+    curvature = omitted.T @ weighted - (weighted.T @ r.design) @ carried
     sd = omitted_prior_sd(solution, above)
-    normal = np.eye(len(above)) + 0.5 * np.outer(sd, sd) * (seen + seen.T)
+    normal = np.eye(len(above)) + 0.5 * np.outer(sd, sd) * (curvature + curvature.T)
     lower = scipy.linalg.cholesky(normal, lower=True)
     root = sd[:, None] * scipy.linalg.solve_triangular(lower, np.eye(len(above)), lower=True).T
     residual = np.concatenate([fit.residual_mm for fit in solution.runs])
@@ -356,10 +356,10 @@ def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
     share = np.minimum(inputs.repeatability_mm**2, variance)  # never more than the readings scatter: that would count it twice
     for kind in ("bar", "laser"):
-        seen = r.kind == kind
-        if seen.any():
+        mask = r.kind == kind
+        if mask.any():
             left = None if inputs.repeatability_mm == 0 else variance - share
-            out.append(Source(f"{kind}_noise", r.noise_factor(left, seen), r.dof_of(kind)))
+            out.append(Source(f"{kind}_noise", r.noise_factor(left, mask), r.dof_of(kind)))
     if inputs.repeatability_mm > 0:
         out.append(Source("repeatability", r.noise_factor(share, everywhere), inputs.repeatability_dof))
     return out

@@ -197,7 +197,7 @@ class _PushQuestions:
         await self.bar.clear_away()
         each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.precheck.base.tables, self.precheck.proposed.tables)
         found = probe(each, self.read_before.deviation_mm, after.deviation_mm)
-        return Verdict(found.agrees, found.text + ("" if all(found.seen) else "; that rests on the commissioning"))
+        return Verdict(found.agrees, found.text + ("" if all(found.observed) else "; that rests on the commissioning"))
 
     async def verify(self) -> Verdict:
         context = self.context

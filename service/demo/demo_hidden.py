@@ -23,7 +23,7 @@ from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
-from abbe.service.discovery.discovery_answer import where_doc
+from abbe.service.discovery.discovery_answer import location_doc
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import book_lines, effect_lines, next_of, verdict_of
@@ -238,7 +238,7 @@ def hidden_json(result: HiddenDemo) -> dict[str, Any]:
         "format": FORMAT,
         "verdict": finding.verdict,
         "effects": [{k: getattr(e, k) for k in fields} for e in finding.effects],
-        "where": where_doc(finding.where),
+        "where": location_doc(finding.location),
         "gaps": {role: asdict(gap) for role, gap in finding.gaps.items()},
         "model_version": None if result.journal is None else result.journal.version,
         "anew": None if result.anew is None else asdict(result.anew),

@@ -46,9 +46,9 @@ def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress |
         return replace(found, fitted=fitted)
     if found.verdict == "none" or not _exceeds_scatter(quiet, found, scatter):
         return replace(drift, fitted=fitted)
-    table = (*drift.where.table, *found.where.table)
+    table = (*drift.location.table, *found.location.table)
     if drift.verdict == "none":
-        return replace(found, where=replace(found.where, table=table), fitted=fitted)
+        return replace(found, location=replace(found.location, table=table), fitted=fitted)
     return replace(_combined(case, drift, found, drifts, table), fitted=fitted)
 
 
@@ -71,7 +71,7 @@ def _combined(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, 
         found,
         verdict="named" if found.verdict == "named" else "unknown",
         effects=(*drift.effects, *found.effects),
-        where=replace(found.where, table=table),
+        location=replace(found.location, table=table),
         next_test=drift.next_test or found.next_test,
         gaps=gaps_of(problem, left, found.residual_after_mm, floor),
         residual_before_mm=left,

@@ -13,14 +13,14 @@ FORMAT = "abbe-discovery/1"
 
 def answer_doc(finding: Finding) -> dict[str, Any]:
     """JSON of a finding: gaps in µm, predictions of every sealed run in mm."""
-    held, fitted, test = finding.gaps.get("holdout"), finding.gaps.get("identify"), finding.next_test
+    holdout, fitted, test = finding.gaps.get("holdout"), finding.gaps.get("identify"), finding.next_test
     doc: dict[str, Any] = {
         "format": FORMAT,
         "case": finding.case,
         "verdict": finding.verdict,
         "effects": [_effect(e) for e in finding.effects],
         "confounded_with": list(finding.confounded_with),
-        "where": where_doc(finding.where),
+        "where": location_doc(finding.location),
         "p_value": finding.p_value,
         "predictions": {label: list(values) for label, values in finding.predictions.items()},
         "proved": finding.proved,
@@ -34,7 +34,7 @@ def answer_doc(finding: Finding) -> dict[str, Any]:
     doc |= {"next_test": _next_test(test)} if test is not None else {}
     if fitted is not None:
         doc |= {"rms_before_um": fitted.before_um, "rms_after_um": fitted.after_um, "noise_floor_um": fitted.floor_um}
-    return doc if held is None else doc | {"holdout_rms_um": held.after_um}
+    return doc if holdout is None else doc | {"holdout_rms_um": holdout.after_um}
 
 
 def _effect(e: EffectFound) -> dict[str, Any]:
@@ -61,6 +61,6 @@ def _next_test(test: NextTest) -> dict[str, Any]:
     return doc | ({"like": test.like} if test.like else {})
 
 
-def where_doc(where: Localization) -> dict[str, Any]:
+def location_doc(location: Localization) -> dict[str, Any]:
     """The known fields of a location, without the table of significance tests."""
-    return {k: v for k, v in asdict(where).items() if k != "table" and v not in (None, (), [], "")}
+    return {k: v for k, v in asdict(location).items() if k != "table" and v not in (None, (), [], "")}

@@ -68,7 +68,7 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
     names = " and ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
     if finding.verdict == "unknown":
         beside = f" Beside it: {names}." if names else _suspect_text(finding)
-        there = "; ".join(where_lines(finding.where)) or "it could not be located"
+        there = "; ".join(location_lines(finding.location)) or "it could not be located"
         return "bad", "Something is missing that the catalogue does not explain", f"{_capital(gap)}. {there}.{beside}"
     judged = judge(finding)
     proof = _proof_text(judged) if judged.proved else judged.rule
@@ -79,8 +79,8 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
 
 
 def _nothing_missing_verdict(finding: Finding, gap: str) -> tuple[str, str, str]:
-    where = finding.where
-    if where.tests and where.table and where == Localization(tests=where.tests, table=where.table):
+    location = finding.location
+    if location.tests and location.table and location == Localization(tests=location.tests, table=location.table):
         return "ok", "No common drift", _repeatability_text(finding)
     if disagreeing(finding):
         sign, word = "open", "Nothing is missing in the fitted runs, but the others do not agree"
@@ -115,7 +115,7 @@ def _suspect_text(finding: Finding) -> str:
 
 def _repeatability_text(finding: Finding) -> str:
     """A positioning test whose repeats share no drift: their scatter is the repeatability of axis and sensor."""
-    test, gap = finding.where.table[0], finding.gaps["identify"]
+    test, gap = finding.location.table[0], finding.gaps["identify"]
     p = f"noise with the same memory gives as much in {test.p:.1%} of tests"
     scatter = f"They scatter by {plain(gap.before_um)} µm: that is repeatability, which no model takes out"
     return f"In these repeats a {test.value}; {p}. {scatter}."
@@ -160,7 +160,7 @@ def effect_lines(effect: EffectFound) -> list[str]:
     lines = [f"{effect.words}: {size_text(effect)}"]
     lines += [f"  {name}: {parameter_text(p)}" for name, p in effect.parameters.items()]
     lines.append(f"  what to do: {effect.remedy_text} ({REMEDIES[effect.remedy]})")
-    there = where_lines(effect.where)
+    there = location_lines(effect.location)
     if there:
         lines.append("  where: " + "; ".join(there))
     lines.append("  what else it could be: " + "; ".join(rival_lines(effect)))
@@ -200,7 +200,7 @@ def next_of(finding: Finding) -> list[str]:
     if finding.next_test is not None:
         return _next_lines(finding.next_test)
     if finding.verdict == "unknown":
-        there = "; ".join(where_lines(finding.where))
+        there = "; ".join(location_lines(finding.location))
         what = f"repeat it where it lives ({there})" if there else "repeat the whole campaign: it could not be located"
         return [f"measure next: {what}, and once more later: what comes back belongs to the machine, what does not to that session"]
     if finding.verdict == "none":
@@ -223,22 +223,22 @@ def unseen_lines(finding: Finding) -> list[str]:
     return [f"could not be seen: {u.what}, because {u.because}; what would show it: {ADDS.get(u.adds, u.adds)}" for u in finding.unseen]
 
 
-def where_lines(where: Localization) -> list[str]:
+def location_lines(location: Localization) -> list[str]:
     """The location of an effect, one line per known property."""
-    axes = () if len(where.axes) == len(AXES) else where.axes  # all three axes are no information
+    axes = () if len(location.axes) == len(AXES) else location.axes  # all three axes are no information
     out = [
         f"{label} {', '.join(found[:MANY])}" + (f" and {len(found) - MANY} more" if len(found) > MANY else "")
-        for label, some in (("seen in", where.tests), ("axis", axes), ("run", where.runs), ("depends on", where.depends_on))
+        for label, some in (("seen in", location.tests), ("axis", axes), ("run", location.runs), ("depends on", location.depends_on))
         if (found := [str(v).replace("_", " ") for v in some])
     ]
-    if len(where.directions) == 1:
-        out.append("only " + ("forward" if where.directions[0] > 0 else "backward"))
-    if where.time_s is not None:
-        out.append("from {:.0f} to {:.0f} s of the session".format(*where.time_s))
-    if where.position_mm is not None:
-        near = "" if where.radius_mm is None else f", within {plain(where.radius_mm)} mm"
-        out.append("about X {:.0f}, Y {:.0f}, Z {:.0f} mm".format(*where.position_mm) + near)
-    if where.shape:
-        out.append(where.shape)
-    every = ((where.period_s, "every {} s"), (where.period_mm, "every {} mm"), (where.angular_lobes, "{} lobes a turn"))
+    if len(location.directions) == 1:
+        out.append("only " + ("forward" if location.directions[0] > 0 else "backward"))
+    if location.time_s is not None:
+        out.append("from {:.0f} to {:.0f} s of the session".format(*location.time_s))
+    if location.position_mm is not None:
+        near = "" if location.radius_mm is None else f", within {plain(location.radius_mm)} mm"
+        out.append("about X {:.0f}, Y {:.0f}, Z {:.0f} mm".format(*location.position_mm) + near)
+    if location.shape:
+        out.append(location.shape)
+    every = ((location.period_s, "every {} s"), (location.period_mm, "every {} mm"), (location.angular_lobes, "{} lobes a turn"))
     return out + [text.format(plain(value)) for value, text in every if value is not None]

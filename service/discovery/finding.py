@@ -46,7 +46,7 @@ def finding_of(
         gaps={role: _gap(g) for role, g in found.gaps.items() if math.isfinite(g.before_mm + g.after_mm + g.floor_mm)},
         runs={r.path.label: _run(found, r) for r in case.runs},
         effects=tuple(effect_found(e, by_name[e.name], by_name) for e in found.effects),
-        where=found.where,
+        location=found.location,
         next_test=found.next_test,
         rejected=found.rejected,
         confounded_with=found.confounded_with,
@@ -93,7 +93,7 @@ def effect_found(named: NamedEffect, effect: Effect, by_name: Mapping[str, Effec
         remedy_text=effect.remedy_text,
         signature=effect.signature,
         source=effect.source,
-        where=named.where,
+        location=named.location,
     )
 
 

@@ -44,7 +44,7 @@ class FoundBeside(FileObject):
     evidence: float
 
 
-class FoundWhere(FileObject):
+class FoundLocation(FileObject):
     """Location of what is missing; what was not located is left out."""
 
     tests: list[str] = Field(default_factory=list)
@@ -125,7 +125,7 @@ class DiscoveryFile(FileObject):
     proof: str = ""
     confounded_with: list[str] = Field(default_factory=list)
     beside: list[FoundBeside] = Field(default_factory=list)
-    where: FoundWhere
+    location: FoundLocation = Field(alias="where")
     next_test: FoundTest | None = None
     agreement: list[FoundAgreement] = Field(default_factory=list)
     unseen: list[FoundUnseen] = Field(default_factory=list)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from abbe.models.discovery.answer import Agreement, BlindSpot, Fitted, Localization, NextTest, Unjudged, Verdict
 from abbe.service.domain.discovery_file import FoundThinning
@@ -12,6 +14,8 @@ from abbe.service.domain.packed_arrays import PackedCovariance, PackedReadings
 
 Kind = Literal["mean", "variance"]
 """Whether an effect moves the readings or makes them noisier."""
+Location = Annotated[Localization, Field(alias="where")]
+"""Location of a gap or an effect; its key in documents is ``where`` (run-format.md 5)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +92,7 @@ class EffectSize:
     remedy: str
     remedy_text: str = ""
     source: str = ""
-    where: Localization = field(default_factory=Localization)
+    location: Location = field(default_factory=Localization)
 
     @property
     def words(self) -> str:
@@ -187,7 +191,7 @@ class Finding:
     effects : confirmed or unjudged. suspects : names that fit the fitted runs but are not confirmed by the judging runs; then the verdict
         is "unknown".
     proved, proof : whether runs that were never fitted confirm the names, and by which rule.
-    where : location of the gap of the present model.
+    location : location of the gap of the present model.
     rejected : labels that were tried, and the reason against each.
     confounded_with : rivals of the names that the price rule does not exclude. beside : structures without a name beside them.
     agreement, unjudged, unseen : of runs that were never fitted, if nothing is missing.
@@ -208,7 +212,7 @@ class Finding:
     suspects: tuple[EffectFound, ...] = ()
     proved: bool = False
     proof: str = ""
-    where: Localization = field(default_factory=Localization)
+    location: Location = field(default_factory=Localization)
     next_test: NextTest | None = None
     rejected: tuple[tuple[str, str], ...] = ()
     confounded_with: tuple[str, ...] = ()

@@ -68,15 +68,15 @@ def axis_drift(case: Case) -> Discovery | None:
     before = {r.path.label: _residual_mm(r, place, reading, None) for r in judged}
     after = {r.path.label: _residual_mm(r, place, reading - drift.drift_mm, span) for r in judged} if drift.named else before
     axis = AXES[int(np.argmax(np.abs(case.runs[0].path.look[0])))]
-    where = Localization(tests=("laser_linear",), axes=(axis,), depends_on=("time",))
+    location = Localization(tests=("laser_linear",), axes=(axis,), depends_on=("time",))
     table = (Significance("time", f"drift alike at all positions explains {drift.share:.0%} of the repeat variance", drift.share, drift.p),)
     predicted = {
         r.path.label: _predicted(r, place, reading - drift.drift_mm * drift.named, span if drift.named else None) for r in case.runs
     }
     return Discovery(
         verdict="named" if drift.named else "none",
-        effects=(_named(drift, axis, where),) if drift.named else (),
-        where=Localization(tests=("laser_linear",), axes=(axis,) if drift.named else (), table=table),
+        effects=(_named(drift, axis, location),) if drift.named else (),
+        location=Localization(tests=("laser_linear",), axes=(axis,) if drift.named else (), table=table),
         next_test=_next(axis) if drift.named else None,
         gaps={role: _gap(role, judged, before, after, drift) for role in sorted({r.role for r in judged})},
         residual_before_mm=before,
@@ -106,12 +106,12 @@ def _identify_readings(case: Case) -> tuple[F1, F1, F1]:
     return place, t, reading
 
 
-def _named(drift: RepeatDrift, axis: str, where: Localization) -> NamedEffect:
+def _named(drift: RepeatDrift, axis: str, location: Localization) -> NamedEffect:
     tau = {} if drift.tau_s is None else {"tau_s": (drift.tau_s, drift.tau_s)}  # from a coarse grid: uncertain by a factor
     evidence = -0.5 * np.log(max(1.0 - drift.share, 1e-12)) * drift.drift_mm.size
     rivals = tuple((label, 0.0) for label in (f"spindle_thermal_drift:{axis}", "dead_path", f"axis_thermal_growth:{axis}"))
     size, u = drift.change_mm * 1e3, drift.u_change_mm * 1e3
-    return NamedEffect("slow_drift", axis, size, u, tau, np.zeros(0), np.zeros((0, 0)), float(evidence), rivals, where)
+    return NamedEffect("slow_drift", axis, size, u, tau, np.zeros(0), np.zeros((0, 0)), float(evidence), rivals, location)
 
 
 def _next(axis: str) -> NextTest:

@@ -192,7 +192,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
         mean_over_volume={p.name: MeanValue(value=p.value, u=p.u) for p in found.mean},
         mean_over_volume_note=f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
         motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
-        rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.seen.effective_rank),
+        rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.observed.effective_rank),
         not_observable=not_observable(found),
         advice=[a.text for a in o.advice],
         observability=ObservabilityNumber(

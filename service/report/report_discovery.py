@@ -17,6 +17,7 @@ from abbe.service.discovery.discovery_store import stored_steps
 from abbe.service.discovery.discovery_text import (
     ROLES,
     book_lines,
+    location_lines,
     next_of,
     parameter_text,
     rival_lines,
@@ -24,7 +25,6 @@ from abbe.service.discovery.discovery_text import (
     unit,
     unseen_lines,
     verdict_of,
-    where_lines,
 )
 from abbe.service.domain.finding import EffectFound, Finding
 from abbe.service.domain.run import Run
@@ -166,7 +166,7 @@ def _sections(found: _Found) -> list[Section]:
     out = [Section(f"{e.words}: {size_text(e)}", [Facts(_card(e))]) for e in finding.effects]
     if changed := changed_lines(finding.changed):
         out.append(Section("What has changed", [Lines([line.strip() for line in changed])]))
-    if located := where_lines(finding.where):
+    if located := location_lines(finding.location):
         out.append(Section("Where the gap lives", [Lines(located)]))
     out.append(Section("The gap before and after", [gap_table(finding), *_pictures(found)]))
     following = next_of(finding)
@@ -178,7 +178,7 @@ def _sections(found: _Found) -> list[Section]:
 
 def _card(effect: EffectFound) -> dict[str, str]:
     """Remedy, signature, rivals and parameters of a named effect."""
-    there = "; ".join(where_lines(effect.where))
+    there = "; ".join(location_lines(effect.location))
     out = {"What to do": effect.remedy_text, "Who takes it out": REMEDIES[effect.remedy]}
     out |= ({"Where": there} if there else {}) | {"How it looks": effect.signature, "What else it could be": "; ".join(rival_lines(effect))}
     out |= {name.replace("_", " ").capitalize(): parameter_text(p) for name, p in effect.parameters.items()}
@@ -254,8 +254,8 @@ def _appendix(found: _Found) -> list[Section]:
         for label, r in finding.runs.items()
     ]
     out = [Section("Runs", [TextTable(("Run", "Test", "Role", "Readings", "Before, µm", "After, µm", "Noise, µm"), runs)])]
-    if finding.where.table:
-        tests = [(t.kind, t.value, plain(t.statistic), f"{t.p:.2g}") for t in finding.where.table]
+    if finding.location.table:
+        tests = [(t.kind, t.value, plain(t.statistic), f"{t.p:.2g}") for t in finding.location.table]
         table = TextTable(("Against", "Which", "Statistic", "p (all tests together)"), tests)
         out.append(Section(f"Tests of where the gap lives: {len(tests)}", [table], folded=True))
     if rejected := finding.rejected[:REJECTED]:
@@ -284,7 +284,7 @@ def _traces(found: _Found) -> list[Trace]:
     before, after = series.before.values_mm * 1e3, series.after.values_mm * 1e3
     noise, why = finding.runs[label].floor_um, "the gap shows most here"
     out = [Trace(label, "time of the session in s", columns.t_s, before, after, noise, why)]
-    key = finding.effects[0].key if finding.effects else "".join(finding.where.axes[:1])
+    key = finding.effects[0].key if finding.effects else "".join(finding.location.axes[:1])
     if key[-1:] in AXES and key:
         x = columns.q_mm[:, AXES.index(key[-1])]
         if float(np.ptp(x)) > 0.0:
@@ -306,9 +306,9 @@ def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
     keep = count >= FEWEST
     times = np.sqrt(np.bincount(which.ravel(), weights=ratio**2) / count)[keep]
     centre = (cells[keep] + 0.5) * side
-    spot, where = None, found.finding.where
-    if where.position_mm is not None:
-        spot = (where.position_mm[a], where.position_mm[b], where.radius_mm or 0.0)
+    spot, location = None, found.finding.location
+    if location.position_mm is not None:
+        spot = (location.position_mm[a], location.position_mm[b], location.radius_mm or 0.0)
     return PlaceMap(AXES[a], AXES[b], centre[:, 0], centre[:, 1], times, spot)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.effects.path import Path, Places, driven, since_reversal, standing
+from abbe.models.effects.path import Path, Places, at_rest, driven, since_reversal
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
 from abbe.service.domain.run import LaserSetup, Run
@@ -97,7 +97,7 @@ def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> P
         along: dict[str, Any] = {"reference": _first(at), "look": look, "travel_mm": (q - q[0]) @ run.beam, "dead_path_mm": dead_path_mm}
         return Path(**common, **along, at=at, kind="laser", radius_mm=0.0, centre_mm=np.zeros(3))
     centre = setup.centre_mm
-    cup: dict[str, Any] = {"reference": standing(centre, t_set, first), "look": _away(q, centre, run.run_id)}
+    cup: dict[str, Any] = {"reference": at_rest(centre, t_set, first), "look": _away(q, centre, run.run_id)}
     return Path(
         **common, **cup, at=at, kind="bar", travel_mm=np.zeros(len(q)), dead_path_mm=0.0, radius_mm=setup.radius_mm, centre_mm=centre
     )

@@ -71,8 +71,8 @@ def test_what_no_catalogue_names_is_called_unknown_and_located(tmp_path):
     found = played("unlisted", tmp_path / "kept")
     said = "\n".join(summary_lines(found))
     assert (found.finding.verdict, labels(found)) == ("unknown", []), said
-    assert found.finding.where.period_s == pytest.approx(40.0, rel=0.01), said
-    assert found.finding.where.axes == ("Z",), said
+    assert found.finding.location.period_s == pytest.approx(40.0, rel=0.01), said
+    assert found.finding.location.axes == ("Z",), said
     assert judged(found)[0]
     assert book(tmp_path / "kept") == []
     assert found.anew.gap.after_um == found.anew.gap.before_um  # nothing is claimed, nothing is closed

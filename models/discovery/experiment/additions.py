@@ -10,7 +10,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import BlindSpot
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.effects.path import Path, Places, driven, standing
+from abbe.models.effects.path import Path, Places, at_rest, driven
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 
@@ -167,7 +167,7 @@ def _bar(like: Path, q_mm: F2, feed_mm_min: float, t_set_s: float, label: str, c
     away = q - centre
     length = np.linalg.norm(away, axis=1, keepdims=True)
     path = Path(
-        label, f"~{label}", "ballbar_helix", "bar", like.machine, like.vertical, at, standing(centre, t_set_s, {}), away / length, feed,
+        label, f"~{label}", "ballbar_helix", "bar", like.machine, like.vertical, at, at_rest(centre, t_set_s, {}), away / length, feed,
         np.ones(len(q)), np.zeros(len(q)), t_set_s, 0.0, float(np.median(length)), centre,
     )  # fmt: skip
     return _run(path)

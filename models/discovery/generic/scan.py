@@ -54,42 +54,42 @@ def best(score: F1, count: int, apart: int) -> list[int]:
     return out
 
 
-def step_moments(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
+def step_instants(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
     """Times of a step per axis and, ``""``, in all directions at once: by set-up of a bar, by run of a laser, whose zero is new."""
     groups: dict[str, list[int]] = {}
-    for k, p in enumerate(seen.paths):
+    for k, p in enumerate(scanned.paths):
         groups.setdefault(f"bar {p.setup}" if p.kind == "bar" else f"laser {p.label}", []).append(k)
-    moments, gains = [], []
+    instants, gains = [], []
     for group in groups.values():
-        order = sorted(group, key=lambda k: seen.paths[k].at.t_s[0])
-        t, look, rest = seen.only(order).stacked()
+        order = sorted(group, key=lambda k: scanned.paths[k].at.t_s[0])
+        t, look, rest = scanned.only(order).stacked()
         moved = np.cumsum((look * rest[:, None])[::-1], axis=0)[::-1][1:]
         size = np.cumsum((look * look)[::-1], axis=0)[::-1]
         whole, size = size[0] + 1e-12, size[1:]
         length = size * (1.0 - size / whole)
         gain = np.where(length > 1e-3 * whole, moved**2 / np.maximum(length, 1e-12), 0.0)
-        moments.append(0.5 * (t[1:] + t[:-1]))
+        instants.append(0.5 * (t[1:] + t[:-1]))
         gains.append(gain)
-    t0, gain = np.concatenate(moments), np.concatenate(gains)
+    t0, gain = np.concatenate(instants), np.concatenate(gains)
     columns = {"X": gain[:, 0], "Y": gain[:, 1], "Z": gain[:, 2], "": gain.sum(axis=1)}
     return {key: tuple(float(t0[i]) for i in best(score, count, 15)) for key, score in columns.items()}
 
 
-def periods(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
+def periods(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
     """Periods on the clock, by axis and by instrument ("bar", "laser")."""
-    t, look, rest = seen.stacked()
-    per_mm = np.concatenate([np.full(p.n, 1.0 / s) for p, s in zip(seen.paths, seen.sigma_mm, strict=True)])
-    bar = np.concatenate([np.full(p.n, p.kind == "bar") for p in seen.paths])
+    t, look, rest = scanned.stacked()
+    per_mm = np.concatenate([np.full(p.n, 1.0 / s) for p, s in zip(scanned.paths, scanned.sigma_mm, strict=True)])
+    bar = np.concatenate([np.full(p.n, p.kind == "bar") for p in scanned.paths])
     columns = np.column_stack([look, np.where(bar, per_mm, 0.0), np.where(bar, 0.0, per_mm)])
     step_hz = 0.4 / max(float(np.ptp(t)), PERIODS_S[1])
     f, power = _wave_gain(1.0 / PERIODS_S[1], 1.0 / PERIODS_S[0], step_hz, t, columns, rest, 1.0)
     return {k: tuple(float(1.0 / f[i]) for i in best(power[j], count, 2)) for j, k in enumerate(("X", "Y", "Z", "bar", "laser"))}
 
 
-def pitches(seen: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
+def pitches(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
     """Pitches of a wave along one axis in the direction of another, by component."""
-    q = np.concatenate([p.at.q_mm for p in seen.paths])
-    _, look, rest = seen.stacked()
+    q = np.concatenate([p.at.q_mm for p in scanned.paths])
+    _, look, rest = scanned.stacked()
     out = {}
     for a, axis in enumerate("XYZ"):
         across = [d for d in range(3) if d != a]
@@ -115,10 +115,10 @@ def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F
     return f[inside], power
 
 
-def bursts(seen: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+def bursts(scanned: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Times, widths and frequencies of short oscillations in single bar runs: the values of the best few combinations."""
     found: list[tuple[float, float, float, float]] = []
-    for p, rest in zip(seen.paths, seen.rest, strict=True):
+    for p, rest in zip(scanned.paths, scanned.rest, strict=True):
         if p.kind != "bar" or p.n < 20:
             continue
         dt = float(np.median(np.diff(p.at.t_s)))
@@ -139,10 +139,10 @@ def bursts(seen: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float
     return tuple(tuple(dict.fromkeys(round(v[j], 6) for v in top)) for j in (1, 2, 3))  # type: ignore[return-value]
 
 
-def bumps(seen: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
+def bumps(scanned: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
     """Times at which the path passes the places where a bump would explain most."""
-    q = np.concatenate([p.at.q_mm for p in seen.paths])
-    t, look, rest = seen.stacked()
+    q = np.concatenate([p.at.q_mm for p in scanned.paths])
+    t, look, rest = scanned.stacked()
     _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
     tree = scipy.spatial.cKDTree(q)
     total = np.concatenate([_bump_gains(q[cells[i : i + PLACES]], tree, look, rest, widths_mm) for i in range(0, len(cells), PLACES)])

@@ -13,7 +13,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.case import Case
-from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, ScanResult, bumps, bursts, periods, pitches, step_moments
+from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, ScanResult, bumps, bursts, periods, pitches, step_instants
 from abbe.models.discovery.localization import localize_signal
 from abbe.models.effects.effect import Effect, Form, Parameter, Signal, Values
 from abbe.models.effects.path import Path, Places
@@ -204,7 +204,7 @@ def generic_rivals(
     return tuple(e for e in _all(starts, paths) if bar or e.name not in ("unnamed_lobes", "unnamed_burst"))
 
 
-def where_of(effect: Effect, key: str, values: Values, case: Case) -> Localization:
+def location_of(effect: Effect, key: str, values: Values, case: Case) -> Localization:
     """Localization of an unnamed structure, from its parameters (time, place, period, lobes) and its columns (tests, axes).
 
     Parameters
@@ -235,12 +235,12 @@ def where_of(effect: Effect, key: str, values: Values, case: Case) -> Localizati
     return Localization(**located, depends_on=DEPENDS[kind])  # type: ignore[arg-type]
 
 
-def _scanned(seen: ScanResult) -> Starts:
-    moments = step_moments(seen, TOP)
-    t0, width, hertz = bursts(seen, TOP)
+def _scanned(scanned: ScanResult) -> Starts:
+    instants = step_instants(scanned, TOP)
+    t0, width, hertz = bursts(scanned, TOP)
     return {
-        "step": moments, "slip": {"": moments[""]}, "settling": {k: moments[k][:3] for k in AXES}, "surge": periods(seen, TOP),
-        "wave": pitches(seen, TOP), "bump": {"": bumps(seen, WIDTHS_MM, 2 * TOP)},
+        "step": instants, "slip": {"": instants[""]}, "settling": {k: instants[k][:3] for k in AXES}, "surge": periods(scanned, TOP),
+        "wave": pitches(scanned, TOP), "bump": {"": bumps(scanned, WIDTHS_MM, 2 * TOP)},
         "burst": {"t0_s": t0[:4], "width_s": width[:3], "frequency_hz": hertz[:4]},
     }  # fmt: skip
 
@@ -248,7 +248,7 @@ def _scanned(seen: ScanResult) -> Starts:
 def _coarse(paths: tuple[Path, ...]) -> Starts:
     """Starts without any residual: borders and inside of runs, periods and pitches by resolution, places along the path."""
     t = np.concatenate([np.linspace(p.at.t_s[0], p.at.t_s[-1], 6) for p in paths])
-    moments = tuple(float(v) for v in t + 0.5)
+    instants = tuple(float(v) for v in t + 0.5)
     places = tuple(float(v) for p in _apart(paths) for v in np.linspace(p.at.t_s[0], p.at.t_s[-1], 24))
     bars = [p for p in paths if p.kind == "bar"]
     middles = tuple(float(v) for p in bars for v in np.linspace(p.at.t_s[0], p.at.t_s[-1], 8))
@@ -257,7 +257,7 @@ def _coarse(paths: tuple[Path, ...]) -> Starts:
     period = tuple(float(1.0 / f) for f in np.linspace(1.0 / 80.0, 1.0 / 25.0, lines))
     pitch = tuple(float(1.0 / f) for f in np.linspace(1.0 / PITCHES_MM[1], 1.0 / 10.0, 20))
     return {
-        "step": dict.fromkeys(AXES, moments), "slip": {"": moments[::2]}, "settling": dict.fromkeys(AXES, moments[::6]),
+        "step": dict.fromkeys(AXES, instants), "slip": {"": instants[::2]}, "settling": dict.fromkeys(AXES, instants[::6]),
         "surge": dict.fromkeys(("X", "Y", "Z", "bar", "laser"), period), "wave": dict.fromkeys(CROSS, pitch), "bump": {"": places},
         "burst": {"t0_s": middles or (0.0,), "width_s": (1.5,), "frequency_hz": (1.0,)},
     }  # fmt: skip
@@ -265,10 +265,10 @@ def _coarse(paths: tuple[Path, ...]) -> Starts:
 
 def _apart(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     """One run of every different path; the way back and other feeds pass the same places."""
-    seen: dict[tuple[float, ...], Path] = {}
+    distinct: dict[tuple[float, ...], Path] = {}
     for p in paths:
-        seen.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)
-    return tuple(seen.values())
+        distinct.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)
+    return tuple(distinct.values())
 
 
 def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
@@ -288,8 +288,10 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     out.append(_effect("slip", "work holding gave way", ("",), (_par("t0_s", clock, starts["slip"][""]),)))
     for key in (*AXES, *sorted(kinds)):
         shortest = max(PERIODS_S[0], _resolved_s([p for p in paths if key in (*AXES, p.kind)]))
-        seen = tuple(v for v in starts["surge"][key] if v >= shortest)
-        out.append(_effect("surge", "wave on the clock", (key,), (_par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), seen),)))
+        resolved = tuple(v for v in starts["surge"][key] if v >= shortest)
+        out.append(
+            _effect("surge", "wave on the clock", (key,), (_par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), resolved),))
+        )
     for key in CROSS:
         out.append(_effect("wave", "wave along one axis across it", (key,), (_par("pitch_mm", PITCHES_MM, starts["wave"][key]),)))
     width = Parameter("width_mm", "mm", 8.0, 45.0, 20.0, SOURCE, WIDTHS_MM)

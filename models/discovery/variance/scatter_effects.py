@@ -64,10 +64,10 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
         Which of them are outliers.
     """
     total = count = most = 0.0
-    held, middle = np.clip(rest, -LOUD, LOUD), np.zeros(3)
+    clipped, middle = np.clip(rest, -LOUD, LOUD), np.zeros(3)
     for i in np.flatnonzero(off):
         near = (np.linalg.norm(q_mm - q_mm[i], axis=1) < NEAR_MM) & (rest != 0.0)
-        along = np.sign(rest[i]) * held * near
+        along = np.sign(rest[i]) * clipped * near
         total += float(along.sum() - along[i])
         count += float(near.sum()) - 1.0
         if float(along.sum()) > most:
@@ -134,7 +134,7 @@ class VarianceFinding:
     u_strength: float
     parameters: Mapping[str, float]
     evidence: float
-    where: Localization
+    location: Localization
 
     @property
     def label(self) -> str:
@@ -224,14 +224,16 @@ def _vibration(
     if line is None:
         return []
     evidence = float(line.gain - np.log(line.tried * 3.0) - NAME_PRICE)
-    where = localize_signal(paths, tuple(np.abs(p.look[:, axis]) for p in paths))
-    where = Localization(where.tests, (AXES[axis],), where.directions, where.runs, period_s=1.0 / line.frequency_hz, depends_on=("time",))
+    location = localize_signal(paths, tuple(np.abs(p.look[:, axis]) for p in paths))
+    location = Localization(
+        location.tests, (AXES[axis],), location.directions, location.runs, period_s=1.0 / line.frequency_hz, depends_on=("time",)
+    )
     size, u, v = line.amplitude_mm * UM, line.u_mm * UM, _creep(axis, paths)
     if v is not None and line.p_harmonics < SAW_P:
         # at a single creeping speed a saw-tooth in position is one in time, and its fading with speed is unknown
         size *= 0.5 * np.pi * np.e
-        return [VarianceFinding("stick_slip", AXES[axis], size, size, {"v_c": v}, evidence, where)]
-    return [VarianceFinding("vibration", AXES[axis], size, u, {"frequency_hz": line.frequency_hz}, evidence, where)]
+        return [VarianceFinding("stick_slip", AXES[axis], size, size, {"v_c": v}, evidence, location)]
+    return [VarianceFinding("vibration", AXES[axis], size, u, {"frequency_hz": line.frequency_hz}, evidence, location)]
 
 
 def _creep(axis: int, paths: tuple[Path, ...]) -> float | None:
@@ -247,10 +249,10 @@ def _stick_slip(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[f
     out = []
     for axis, rough in gated_roughness(paths, rest, sigma_mm).items():
         evidence = rough.gain - np.log(rough.tried * 3.0) - NAME_PRICE
-        where = localize_signal(paths, rough.weight)
-        where = Localization(where.tests, (AXES[axis],), where.directions, where.runs, depends_on=("speed", "reversal"))
+        location = localize_signal(paths, rough.weight)
+        location = Localization(location.tests, (AXES[axis],), location.directions, location.runs, depends_on=("speed", "reversal"))
         size, u = rough.size_mm * UM, rough.u_mm * UM
-        out.append(VarianceFinding("stick_slip", AXES[axis], size, u, {"v_c": rough.v_c}, float(evidence), where))
+        out.append(VarianceFinding("stick_slip", AXES[axis], size, u, {"v_c": rough.v_c}, float(evidence), location))
     return out
 
 
@@ -259,12 +261,12 @@ def _burst(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float,
     if loud is None:
         return []
     gain, tried, k, t0, width, excess = loud
-    where = Localization(
+    location = Localization(
         tests=(paths[k].test,), runs=(paths[k].label,), time_s=(t0 - width, t0 + width), depends_on=("time",)
     )  # fmt: skip
     size = float(np.sqrt(2.0 * max(excess, 0.0))) * sigma_mm[k] * UM
     parameters = {"t0_s": t0, "width_s": width}
-    return [VarianceFinding("unnamed_burst", "", size, 0.3 * size, parameters, float(gain - np.log(tried) - NAME_PRICE - 3.0), where)]
+    return [VarianceFinding("unnamed_burst", "", size, 0.3 * size, parameters, float(gain - np.log(tried) - NAME_PRICE - 3.0), location)]
 
 
 def _outliers(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
@@ -274,9 +276,9 @@ def _outliers(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[flo
     off = np.abs(stacked) > max(OFF, 0.5 * found.size)
     size, u = found.size * sigma * UM, found.u_size * sigma * UM
     weight = tuple(np.asarray(part, dtype=np.float64) for part in np.split(off, np.cumsum([p.n for p in paths])[:-1]))
-    where = Localization(tests=tuple(dict.fromkeys(p.test for p in paths)), runs=localize_signal(paths, weight).runs)
+    location = Localization(tests=tuple(dict.fromkeys(p.test for p in paths)), runs=localize_signal(paths, weight).runs)
     evidence, (bound, (x, y, z)) = float(found.gain - NAME_PRICE), bound_to_places(np.concatenate([p.at.q_mm for p in paths]), stacked, off)
     if bound > PLACE_Z:
-        place = replace(where, position_mm=(float(x), float(y), float(z)), radius_mm=NEAR_MM, depends_on=("position",))
+        place = replace(location, position_mm=(float(x), float(y), float(z)), radius_mm=NEAR_MM, depends_on=("position",))
         return [VarianceFinding("unnamed_place", "", size, u, {}, evidence, place)]
-    return [VarianceFinding("beam_outliers", "", size, u, {"rate": found.rate}, evidence, where)]
+    return [VarianceFinding("beam_outliers", "", size, u, {"rate": found.rate}, evidence, location)]

@@ -275,13 +275,13 @@ def loud_windows(paths: tuple[Path, ...], rest: tuple[F1, ...]) -> tuple[float, 
             continue
         dt = float(np.median(np.diff(p.at.t_s)))
         level = float(np.median(r**2)) / 0.4549
-        held = np.concatenate([[0.0], np.cumsum(r**2 / max(level, 1e-12))])
+        cumulative = np.concatenate([[0.0], np.cumsum(r**2 / max(level, 1e-12))])
         for window in WINDOWS_S:
             m = max(round(window / dt), 4)
             if m > p.n // 3:
                 continue
             tried += p.n / m * 2.0
-            mean = np.maximum((held[m:] - held[:-m]) / m, 1.0)
+            mean = np.maximum((cumulative[m:] - cumulative[:-m]) / m, 1.0)
             gain = 0.5 * m * (mean - 1.0 - np.log(mean))
             i = int(np.argmax(gain))
             if best is None or gain[i] > best[0]:

@@ -17,8 +17,8 @@ def scaled(path: Path) -> F2:
 
 def strength(coefficients: F1, values: Values) -> float:
     """Misalignment in mrad from the mean over the set-ups (the mirror's tilt enters with either sign); negative: the beam reads short."""
-    seen = coefficients[coefficients != 0.0]
-    mean = float(seen.mean()) if seen.size else 0.0
+    nonzero = coefficients[coefficients != 0.0]
+    mean = float(nonzero.mean()) if nonzero.size else 0.0
     return float(np.sign(mean) * np.sqrt(abs(mean)))
 
 

@@ -103,8 +103,8 @@ def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
     own, free = design[:, : prior_sd.size] * prior_sd, design[:, prior_sd.size :]
     target = project_out(observed[:, None], free)[:, 0]
     u, s, _ = np.linalg.svd(project_out(own, free), full_matrices=False)
-    seen = s > UNSEEN * s[0]
-    u, s = u[:, seen], s[seen]
+    determined = s > UNSEEN * s[0]
+    u, s = u[:, determined], s[determined]
     along = u.T @ target
     left = target - u @ along
     dof = observed.size - int(np.linalg.matrix_rank(free)) - s.size if free.size else observed.size - s.size
@@ -281,15 +281,15 @@ class KwonCalibration:
     @property
     def statement(self) -> str:
         """Basis of the figures, in one sentence."""
-        return "; ".join([*self._seen(), *self._warnings(), "every stated uncertainty is conditional on the prior"])
+        return "; ".join([*self._identified(), *self._warnings(), "every stated uncertainty is conditional on the prior"])
 
-    def _seen(self) -> list[str]:
-        n, seen = len(PARAMETERS), self.identifiability
+    def _identified(self) -> list[str]:
+        n, identified = len(PARAMETERS), self.identifiability
         parts = [
-            f"the points see {seen.rank} of {n} combinations of parameters and carry {self.carried} of them better than the prior",
+            f"the points see {identified.rank} of {n} combinations of parameters and carry {self.carried} of them better than the prior",
             f"single values that rest on the prior: {', '.join(self.on_prior) or 'none'}",
         ]
-        hidden = ", ".join(_combination(h) for h in seen.hidden)
+        hidden = ", ".join(_combination(h) for h in identified.hidden)
         return [*parts, f"combinations that leave no trace and rest on the prior alone: {hidden}"] if hidden else parts
 
     def _warnings(self) -> list[str]:
@@ -370,17 +370,17 @@ def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = 
     if prior.shape != (len(PARAMETERS),) or not (np.isfinite(prior).all() and (prior > 0.0).all()):
         raise ValueError(f"calibration: expected {len(PARAMETERS)} finite positive prior standard deviations, got shape {prior.shape}")
     nominal_p = forward(nominal, readings.lambda_mm)
-    where = best_fit_frame(nominal_p, readings.measured_mm) if frame is None else checked_frame("calibration: frame", frame)
+    current_frame = best_fit_frame(nominal_p, readings.measured_mm) if frame is None else checked_frame("calibration: frame", frame)
     pivot = nominal_p.mean(axis=0) if frame is None else None
     theta = np.zeros(prior.size)
     for _ in range(ITERATIONS):
-        estimate, weights = _step(_with(nominal, theta), readings, where, pivot, (theta, prior))
+        estimate, weights = _step(_with(nominal, theta), readings, current_frame, pivot, (theta, prior))
         move = estimate.theta[prior.size :]
         step = np.concatenate([estimate.theta[: prior.size] - theta, move])
         theta = estimate.theta[: prior.size]
-        where = where if pivot is None else moved_frame(where, move, pivot)
+        current_frame = current_frame if pivot is None else moved_frame(current_frame, move, pivot)
         if (np.abs(step) <= SETTLED * np.sqrt(np.diag(estimate.covariance))).all():
-            return _result(_with(nominal, theta), readings, where, pivot, (estimate, prior, weights))
+            return _result(_with(nominal, theta), readings, current_frame, pivot, (estimate, prior, weights))
     raise NotSettled(f"calibration: not settled after {ITERATIONS} steps; the points do not fit the nominal machine")
 
 
@@ -425,9 +425,9 @@ def _result(
     estimate, prior, weights = fit
     design, misfit = whitened(geometry, readings, frame, pivot)
     # The triangle of a QR decomposition has the same singular values and the same null space as all the rows.
-    seen = np.asarray(np.linalg.qr(project_out(design[:, : prior.size], design[:, prior.size :]), mode="r"))
+    observed = np.asarray(np.linalg.qr(project_out(design[:, : prior.size], design[:, prior.size :]), mode="r"))
     residual = readings.measured_mm - from_frame(frame, forward(geometry, readings.lambda_mm))
-    rank, stray = analyse(PARAMETERS, seen, typical=prior), outlying_points(misfit.reshape(-1, 3))
+    rank, stray = analyse(PARAMETERS, observed, typical=prior), outlying_points(misfit.reshape(-1, 3))
     found = (weights.carried, residual, weights.test, weights.prior_factor, stray)
     return KwonCalibration(geometry, frame, pivot, estimate, rank, *found)
 

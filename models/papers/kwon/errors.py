@@ -103,11 +103,11 @@ def refuse_first(*faults: Fault) -> None:
 
 
 def _error(kind: type[PoseError], bad: NDArray[np.bool_], text: str, others: int) -> PoseError:
-    where = np.argwhere(bad)
-    names = [f"pose row {w[0]}, leg {w[1] + 1}" if w.size == 2 else f"pose row {w[0]}" for w in where]
+    indices = np.argwhere(bad)
+    names = [f"pose row {w[0]}, leg {w[1] + 1}" if w.size == 2 else f"pose row {w[0]}" for w in indices]
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     also = f"; and {others} more pose{'s' if others > 1 else ''} for other reasons" if others else ""
     error = kind(f"{'; '.join(names[:SHOWN])}{more}: {text}{also}")
-    error.rows = tuple(int(w[0]) for w in where)
-    error.legs = tuple(int(w[1]) + 1 for w in where if w.size == 2)
+    error.rows = tuple(int(w[0]) for w in indices)
+    error.legs = tuple(int(w[1]) + 1 for w in indices if w.size == 2)
     return error

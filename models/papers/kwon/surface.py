@@ -273,24 +273,28 @@ def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) ->
     p, y = poses("points_mm", points_mm), np.asarray(values, dtype=np.float64)
     if y.shape != (p.shape[0],) or not np.isfinite(y).all():
         raise ValueError(f"surface: {p.shape[0]} points need as many finite values, got shape {y.shape}")
-    where = layout(p, tolerance_mm)
+    point_layout = layout(p, tolerance_mm)
     shift, scale = centring(p)
-    x = regressors((p - shift) / scale, where.terms)
+    x = regressors((p - shift) / scale, point_layout.terms)
     u, s, vt = np.linalg.svd(x, full_matrices=False)
-    if y.size <= len(where.terms) or int((s > RANK_TOLERANCE * s[0]).sum()) < len(where.terms):
-        raise SurfaceNotDetermined(_why(x, where))
+    if y.size <= len(point_layout.terms) or int((s > RANK_TOLERANCE * s[0]).sum()) < len(point_layout.terms):
+        raise SurfaceNotDetermined(_why(x, point_layout))
     scaled = vt.T @ ((u.T @ y) / s)
     fitted = x @ scaled
-    return SphereSurface(where, shift, scale, scaled, (vt.T / s**2) @ vt, y - fitted, anova(y, fitted, len(where.terms)))
+    return SphereSurface(point_layout, shift, scale, scaled, (vt.T / s**2) @ vt, y - fitted, anova(y, fitted, len(point_layout.terms)))
 
 
 def _more(bad: NDArray[np.intp]) -> str:
     return f" and {bad.size - 1} more" if bad.size > 1 else ""
 
 
-def _why(x: F2, where: Layout) -> str:
-    head = f"surface: {where.n} points for {len(where.terms)} terms"
-    if where.n <= len(where.terms):
+def _why(x: F2, point_layout: Layout) -> str:
+    head = f"surface: {point_layout.n} points for {len(point_layout.terms)} terms"
+    if point_layout.n <= len(point_layout.terms):
         return f"{head}, there must be more points than terms"
-    hidden = analyse(tuple(term_name(t) for t in where.terms), x, tolerance=RANK_TOLERANCE).hidden
-    return f"{head}, but {hidden[0].text} ({where.plane_text})" if hidden else f"{head} hardly determine them ({where.plane_text})"
+    hidden = analyse(tuple(term_name(t) for t in point_layout.terms), x, tolerance=RANK_TOLERANCE).hidden
+    return (
+        f"{head}, but {hidden[0].text} ({point_layout.plane_text})"
+        if hidden
+        else f"{head} hardly determine them ({point_layout.plane_text})"
+    )

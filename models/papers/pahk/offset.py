@@ -124,7 +124,7 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, sti
         ``d_mm`` and ``squareness_rad`` as measured, the rest unchanged.
     """
     signs = parameter_signs(kind)
-    seen: list[F2] = []
+    offsets: list[F2] = []
     slopes = np.zeros((3, 3))  # [line, direction]
     for j in range(3):
         x = tables.positions_mm[j]
@@ -134,10 +134,10 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, sti
             slope, start = straight_line(x, off[:, i])
             slopes[j, i] = slope
             off[:, i] = signs[j, i] * (off[:, i] - start - slope * x)
-        seen.append(off)
+        offsets.append(off)
     obtuse = np.array([-(slopes[a, b] + slopes[b, a]) for a, b in PAIRS])
     squareness: F1 = obtuse * np.array([kind.alpha_sign, 1.0, 1.0])
-    return replace(tables, d_mm=(seen[0], seen[1], seen[2]), squareness_rad=squareness)
+    return replace(tables, d_mm=(offsets[0], offsets[1], offsets[2]), squareness_rad=squareness)
 
 
 def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
@@ -163,8 +163,8 @@ def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, st
         An offset beyond the tables without ``still_rad``.
     """
     nothing = replace(tables, d_mm=_zeros(tables), squareness_rad=np.zeros(3))
-    seen = as_measured(kind, nothing, setup, still_rad)
-    return replace(seen, d_mm=(-seen.d_mm[0], -seen.d_mm[1], -seen.d_mm[2]), squareness_rad=-seen.squareness_rad)
+    measured = as_measured(kind, nothing, setup, still_rad)
+    return replace(measured, d_mm=(-measured.d_mm[0], -measured.d_mm[1], -measured.d_mm[2]), squareness_rad=-measured.squareness_rad)
 
 
 def refer_to_origin(kind: PahkType, measured: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:

@@ -93,10 +93,10 @@ def _check_complete(circle: F1, longitude: F1, row: Indices, column: Indices) ->
     np.add.at(count, (row, column), 1)
     if (count != 1).any():
         i, k = (int(n) for n in np.argwhere(count != 1)[0])
-        where = f"colatitude {np.rad2deg(circle[i]):.6g}, longitude {np.rad2deg(longitude[k]):.6g} degrees"
+        place = f"colatitude {np.rad2deg(circle[i]):.6g}, longitude {np.rad2deg(longitude[k]):.6g} degrees"
         raise ValueError(
             f"lobing map: it takes circles with the same longitudes; {circle.size} circles and {longitude.size} longitudes were found, "
-            f"with {count[i, k]} touches at {where}"
+            f"with {count[i, k]} touches at {place}"
         )
 
 

@@ -170,8 +170,8 @@ class LobingMap:
         outermost = float(self.colatitude_rad[-1])
         beyond = (ph < 0.0) | (ph > outermost + EDGE_RAD)
         if beyond.any():
-            where = f"colatitude {np.rad2deg(ph[beyond].max()):.3f} degrees"
-            raise ValueError(f"lobing map: {int(beyond.sum())} directions beyond the outermost circle ({where}): no data there")
+            place = f"colatitude {np.rad2deg(ph[beyond].max()):.3f} degrees"
+            raise ValueError(f"lobing map: {int(beyond.sum())} directions beyond the outermost circle ({place}): no data there")
         circles, table = self._closed()
         i, u = _cell(circles, np.minimum(ph, outermost))
         turn = np.append(self.longitude_rad, self.longitude_rad[0] + PERIOD)

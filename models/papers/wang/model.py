@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.functions.monomials import ErrorArrays, Monomial, each_alone, error_arrays
+from abbe.models.functions.monomials import ErrorArrays, Monomial, error_arrays, individual_terms
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import DIAGONALS
@@ -178,10 +178,12 @@ def monomial_field(terms: tuple[Monomial, ...], axes_mm: F2, travel_mm: F1) -> F
     """
     form = machine(_ANY)
     out = np.empty((len(axes_mm), 3, len(terms)))
-    for which, values in each_alone(terms, np.asarray(axes_mm) / travel_mm):
+    for which, values in individual_terms(terms, np.asarray(axes_mm) / travel_mm):
         times = which.stop - which.start
-        where = np.tile(axes_mm, (times, 1))
-        out[:, :, which] = deviation_mm(form, where, _motions(values, where)).reshape(times, len(axes_mm), 3).transpose(1, 2, 0)
+        positions_mm = np.tile(axes_mm, (times, 1))
+        out[:, :, which] = (
+            deviation_mm(form, positions_mm, _motions(values, positions_mm)).reshape(times, len(axes_mm), 3).transpose(1, 2, 0)
+        )
     return out
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.functions.monomials import ErrorArrays, Monomial, each_alone, error_arrays
+from abbe.models.functions.monomials import ErrorArrays, Monomial, error_arrays, individual_terms
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
 
@@ -39,9 +39,9 @@ def delta_eq1(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
     ValueError
         Errors and positions differ in number, or the tool is not three numbers.
     """
-    n, where, tool = errors.d.shape[0], np.shape(slide_mm), np.shape(tool_mm)
-    if where != (n, 3) or tool != (3,):
-        raise ValueError(f"eq (1): errors of {n} positions do not fit positions of shape {where}, or tool {tool} is not (3,)")
+    n, shape, tool = errors.d.shape[0], np.shape(slide_mm), np.shape(tool_mm)
+    if shape != (n, 3) or tool != (3,):
+        raise ValueError(f"eq (1): errors of {n} positions do not fit positions of shape {shape}, or tool {tool} is not (3,)")
     x, y, z = np.asarray(slide_mm, dtype=np.float64).T
     tx, ty, tz = (float(t) for t in tool_mm)
     d, e = errors.d.transpose(1, 2, 0), errors.e.transpose(1, 2, 0)
@@ -118,11 +118,11 @@ def monomial_field(terms: tuple[Monomial, ...], points_mm: F2, travel_mm: F1, to
     slide = workpiece_mm(points_mm)
     form = machine(np.array([[0.0, 1.0]] * 3), tool_mm)
     out = np.empty((len(slide), 3, len(terms)))
-    for which, values in each_alone(terms, slide / travel_mm, 1.0 / ANGLE_MM):
+    for which, values in individual_terms(terms, slide / travel_mm, 1.0 / ANGLE_MM):
         times = which.stop - which.start
-        where = np.tile(slide, (times, 1))
-        seen = deviation_mm(form, np.tile(points_mm, (times, 1)), iso_motions(_as_errors(values), where))
-        out[:, :, which] = seen.reshape(times, len(slide), 3).transpose(1, 2, 0)
+        positions_mm = np.tile(slide, (times, 1))
+        deviations_mm = deviation_mm(form, np.tile(points_mm, (times, 1)), iso_motions(_as_errors(values), positions_mm))
+        out[:, :, which] = deviations_mm.reshape(times, len(slide), 3).transpose(1, 2, 0)
     return out
 
 

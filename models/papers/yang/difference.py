@@ -105,8 +105,8 @@ def model_difference(
         raise ValueError(f"model difference: {points} points in {repeats} repeats are too few")
     rng = np.random.default_rng(seed)
     low, high = np.asarray(stroke_mm, dtype=np.float64).T
-    where = rng.uniform(low, high, size=(repeats * points, 3))
-    off = (complete(where) - simplified(where)).reshape(repeats, points, 3)
+    samples_mm = rng.uniform(low, high, size=(repeats * points, 3))
+    off = (complete(samples_mm) - simplified(samples_mm)).reshape(repeats, points, 3)
     mean: F1 = off.mean(axis=(0, 1))
     variance = off.var(axis=1, ddof=1)
     sd: F1 = np.sqrt(variance).mean(axis=0) if law == "normal" else np.sqrt(variance.mean(axis=0))

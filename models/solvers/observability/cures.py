@@ -174,12 +174,12 @@ def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, nam
 def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
     """Additions that need no measurement on the machine."""
     out = []
-    if lengths := tuple(n for n in names if n.startswith("bar_length_") and n not in known.held):
-        some = any(n.startswith("bar_length_") for n in known.held)
+    if lengths := tuple(n for n in names if n.startswith("bar_length_") and n not in known.fixed):
+        some = any(n.startswith("bar_length_") for n in known.fixed)
         radii = " and ".join(n.removeprefix("bar_length_") for n in lengths)
         cause = f"the length of the bar of {radii} mm is not calibrated" if some else "no bar length here is calibrated"
         out.append(Addition("bar", cause, "a calibrated bar", knows=lengths))
-    if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.held):
+    if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.fixed):
         out.append(Addition("tilt", "the tilt of the mirror is unknown and reads like it", "a mirror of measured tilt", knows=tilts))
     return out
 
@@ -193,9 +193,9 @@ def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
         if not places:
             cause, cure = f"nothing here measures {a} alone against a known length", f"a laser line along {a}"
         else:
-            where = "; ".join(place_text(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
+            examples = "; ".join(place_text(k, p) for p in places[:2]) + ("; ..." if len(places) > 2 else "")
             count = "one line" if len(places) == 1 else f"{len(places)} lines"
-            cause = f"{a} alone was measured along {count} only ({where})"
+            cause = f"{a} alone was measured along {count} only ({examples})"
             cure = f"another laser line along {a} at {place_text(k, corner)}"
         out.append(Addition(f"line {a}", cause, cure, (_line(machine, k, corner, order),)))
     return out
@@ -326,29 +326,29 @@ class CampaignLayout:
 
 @dataclass(frozen=True)
 class CureTrial:
-    """An addition and what it would show: ``seen``, shape (rows, k), per unit of each hidden combination, set-up unknowns out."""
+    """An addition and what it would show: ``observed``, shape (rows, k), per unit of each hidden combination, set-up unknowns out."""
 
     addition: Addition
-    seen: F2
+    observed: F2
 
     def shows(self, combinations: F2) -> int:
         """How many of some hidden combinations, columns (k, m) of orthonormal coordinates, it makes visible."""
-        return count_observed(self.seen @ combinations)
+        return count_observed(self.observed @ combinations)
 
 
-def count_observed(seen: F2) -> int:
+def count_observed(observed: F2) -> int:
     """Number of hidden combinations that a design, shape (rows, k), shows; hidden ones show less than 1e-9 (unit columns)."""
-    s = singular_values(seen) if seen.size else np.zeros(0)
+    s = singular_values(observed) if observed.size else np.zeros(0)
     return int((s > SHOWN).sum())
 
 
-def trials(campaign: CampaignLayout, seen: ObservedInformation) -> list[CureTrial]:
+def trials(campaign: CampaignLayout, observed: ObservedInformation) -> list[CureTrial]:
     """Try every usual addition on what is hidden; none if nothing is hidden."""
-    if not seen.null_space.shape[1]:
+    if not observed.null_space.shape[1]:
         return []
     order = max(t.order for t in campaign.terms)
     tried = additions(campaign.machine, campaign.runs, campaign.known, campaign.columns.setup_names, order)
-    hidden = play(campaign.columns, campaign.known, seen)
+    hidden = play(campaign.columns, campaign.known, observed)
     return [CureTrial(a, _shown(campaign, a, hidden)) for a in tried]
 
 
@@ -357,12 +357,12 @@ def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, i
     out: list[tuple[Addition, int]] = []
     stack, left, shown = np.zeros((0, hidden)), list(found), 0
     while left and shown < hidden:
-        counts = [count_observed(np.concatenate([stack, t.seen])) for t in left]
+        counts = [count_observed(np.concatenate([stack, t.observed])) for t in left]
         best = int(np.argmax(counts))
         if counts[best] <= shown:
             break
         shown = counts[best]
-        stack = np.concatenate([stack, left[best].seen])
+        stack = np.concatenate([stack, left[best].observed])
         out.append((left.pop(best).addition, shown))
     return out
 
@@ -391,9 +391,9 @@ def _shown(campaign: CampaignLayout, addition: Addition, hidden: Play) -> F2:
 def _known_with(campaign: CampaignLayout, runs: tuple[RunData, ...], setup: SetupUnknowns, new: CampaignColumns) -> Knowledge:
     """Knowledge with the addition's new unknowns, by the same rules as the old ones, which do not change."""
     known, before = campaign.known, set(campaign.columns.setup_names)
-    stated = stated_knowledge(campaign.terms, runs, setup.names).held
-    held = {n: v for n, v in stated.items() if n not in before} | {n: v for n, v in known.held.items() if n in new.setup_names}
-    return replace(known, held=held)
+    stated = stated_knowledge(campaign.terms, runs, setup.names).fixed
+    fixed = {n: v for n, v in stated.items() if n not in before} | {n: v for n, v in known.fixed.items() if n in new.setup_names}
+    return replace(known, fixed=fixed)
 
 
 def _upper(shown: F2) -> F2:

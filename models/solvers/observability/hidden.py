@@ -140,9 +140,9 @@ def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, reported: F2, 
     active = {m: at for m, at in rows.items() if np.trace(shadow[np.ix_(at, at)]) > INSIDE}
     out: list[tuple[tuple[str, ...], F2]] = []
     for size in range(1, largest + 1):
-        for chosen, held in _holding(shadow, active, size):
+        for chosen, count_inside in _holding(shadow, active, size):
             known = sum(v.shape[1] for motions, v in out if set(motions) <= set(chosen))
-            if reported.shape[1] == count or held <= known:
+            if reported.shape[1] == count or count_inside <= known:
                 continue
             new, reported = _independent(_inside(shadow, [i for m in chosen for i in active[m]]), reported)
             if new.shape[1]:
@@ -270,18 +270,18 @@ class HiddenDirection:
     reachable: int
 
 
-def picture(campaign: CampaignLayout, seen: ObservedInformation, prior_sd: F1) -> HiddenDirection:
+def picture(campaign: CampaignLayout, observed: ObservedInformation, prior_sd: F1) -> HiddenDirection:
     """Everything about the null space; ``prior_sd``: typical size of every coefficient, shape (p,)."""
     terms = campaign.terms
-    field = _fields(campaign, seen.factor)
-    silent = _silent(seen.null_space, field)
-    tried = trials(campaign, seen)
-    harmful = families(terms, seen.null_space, seen.factor, found=silent)
-    groups = [_group(terms, f, seen, tried, _effect(f, field, seen.factor, prior_sd), prior_sd) for f in harmful]
+    field = _fields(campaign, observed.factor)
+    silent = _silent(observed.null_space, field)
+    tried = trials(campaign, observed)
+    harmful = families(terms, observed.null_space, observed.factor, found=silent)
+    groups = [_group(terms, f, observed, tried, _effect(f, field, observed.factor, prior_sd), prior_sd) for f in harmful]
     other_tools = [t for t in tried if t.addition.key in TOOLS]  # combinations that move no tool in use depend on the tool alone
-    groups += [_group(terms, f, seen, other_tools, 0.0, prior_sd) for f in families(terms, silent, seen.factor)]
-    steps = best_sequence(tried, seen.null_space.shape[1])
-    advice = tuple(Advice(a.cure, seen.rank + shown, len(terms)) for a, shown in steps)
+    groups += [_group(terms, f, observed, other_tools, 0.0, prior_sd) for f in families(terms, silent, observed.factor)]
+    steps = best_sequence(tried, observed.null_space.shape[1])
+    advice = tuple(Advice(a.cure, observed.rank + shown, len(terms)) for a, shown in steps)
     return HiddenDirection(tuple(groups), advice, _reachable(field))
 
 
@@ -338,10 +338,12 @@ def _typical(family: Family, prior_sd: F1) -> F2:
 
 
 def _group(
-    terms: tuple[Term, ...], family: Family, seen: ObservedInformation, tried: list[CureTrial], effect_mm: float, prior_sd: F1
+    terms: tuple[Term, ...], family: Family, observed: ObservedInformation, tried: list[CureTrial], effect_mm: float, prior_sd: F1
 ) -> HiddenGroup:
     count = family.vectors.shape[1]
-    coordinates = scipy.linalg.qr(seen.null_space.T @ (family.vectors / seen.factor[:, None]), mode="economic", check_finite=False)[0]
+    coordinates = scipy.linalg.qr(observed.null_space.T @ (family.vectors / observed.factor[:, None]), mode="economic", check_finite=False)[
+        0
+    ]
     shown = [(t.addition, t.shows(coordinates)) for t in tried]
     full = [a for a, n in shown if n == count]
     one = family.vectors[:, 0] / np.linalg.norm(family.vectors[:, 0] / prior_sd)

@@ -43,7 +43,7 @@ no reading by more than 5 nm through it. Columns of motions that are seen are lo
 NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""
 Status = Literal["observed", "weak", "not observable"]
-OBSERVED, SEEN = 0.9, 0.1
+OBSERVED, WEAKLY_OBSERVED = 0.9, 0.1
 """Share of information from data: from 0.9 on (u at most 0.32 of the prior's) a parameter is observed, below 0.1 (u at least 0.95 of it)
 not observable; weak between."""
 CORRELATED = 0.9
@@ -91,7 +91,7 @@ class Knowledge:
 
     Attributes
     ----------
-    held : mapping of set-up unknown to array, shape (number of terms,)
+    fixed : mapping of set-up unknown to array, shape (number of terms,)
         Unknowns that are known: zero, or this combination of the machine's own errors (a mirror that was squared to the machine's Z line
         leans as that line does).
     shared : tuple of tuples of names
@@ -100,7 +100,7 @@ class Knowledge:
         Whether the machine may have lost motion. The papers' models have none.
     """
 
-    held: Mapping[str, F1] = field(default_factory=dict)
+    fixed: Mapping[str, F1] = field(default_factory=dict)
     shared: tuple[tuple[str, ...], ...] = ()
     lost_motion: bool = True
 
@@ -178,17 +178,17 @@ def _calibrated(run: RunData) -> bool:
 def perfect_setup(known: Knowledge, terms: tuple[Term, ...], setup: SetupUnknowns, kinds: tuple[str, ...] = HAND_SET) -> Knowledge:
     """Known besides: all set-up unknowns of these kinds (``"cup"``, ``"tilt"``, ``"bar_length"``), as the papers assume."""
     more = {n: np.zeros(len(terms)) for n in setup.names if n.startswith(tuple(f"{k}_" for k in kinds))}
-    return replace(known, held={**known.held, **more}, shared=tuple(g for g in known.shared if not set(g) & set(more)))
+    return replace(known, fixed={**known.fixed, **more}, shared=tuple(g for g in known.shared if not set(g) & set(more)))
 
 
 def with_knowledge(columns: CampaignColumns, known: Knowledge) -> tuple[F2, F2, tuple[tuple[str, ...], ...]]:
     """Machine columns, columns of what stays free (set-up unknowns and lost motion), and the names behind each of these."""
     machine, at = columns.machine, {n: i for i, n in enumerate(columns.setup_names)}
-    for name, combination in known.held.items():
+    for name, combination in known.fixed.items():
         if combination.any():
             machine = machine + np.outer(columns.setup[:, at[name]], combination)
     tied = {n for group in known.shared for n in group}
-    groups: list[tuple[str, ...]] = [(n,) for n in columns.setup_names if n not in known.held and n not in tied]
+    groups: list[tuple[str, ...]] = [(n,) for n in columns.setup_names if n not in known.fixed and n not in tied]
     groups += [tuple(n for n in group if n in at) for group in known.shared]
     free = [columns.setup[:, [at[n] for n in group]].sum(axis=1, keepdims=True) for group in groups]
     if known.lost_motion:
@@ -205,7 +205,7 @@ def observed_information(columns: CampaignColumns, known: Knowledge) -> Observed
     ValueError
         ``known`` names a set-up unknown that the campaign has not.
     """
-    strangers = set(known.held) | {n for group in known.shared for n in group}
+    strangers = set(known.fixed) | {n for group in known.shared for n in group}
     if strangers - set(columns.setup_names):
         raise ValueError(f"observability: {', '.join(sorted(strangers - set(columns.setup_names)))} is no set-up unknown of these runs")
     machine, free, _ = with_knowledge(columns, known)
@@ -248,24 +248,24 @@ class Play:
     size: F2
 
 
-def play(columns: CampaignColumns, known: Knowledge, seen: ObservedInformation) -> Play:
+def play(columns: CampaignColumns, known: Knowledge, observed: ObservedInformation) -> Play:
     """Null space of machine and free unknowns together, from that of the machine alone (`observed_information`)."""
     machine, free, groups = with_knowledge(columns, known)
     unit, factor = unit_columns(free)
     u, s, vt = svd(unit, full_matrices=True)
     rank = int((s > RANK_TOLERANCE * s[0]).sum()) if s.size else 0
-    hidden = seen.null_space * seen.factor[:, None]
+    hidden = observed.null_space * observed.factor[:, None]
     answer = vt[:rank].T @ ((u[:, :rank].T @ (machine @ hidden)) / s[:rank, None])
     loose = np.where(np.abs(vt[rank:].T) > NOTHING, vt[rank:].T, 0.0)  # rounding must not count as an unknown of its own
     return Play(groups, hidden, -answer * factor[:, None], loose * factor[:, None], factor[:, None])
 
 
-def hidden_free(columns: CampaignColumns, known: Knowledge, seen: ObservedInformation) -> frozenset[str]:
+def hidden_free(columns: CampaignColumns, known: Knowledge, observed: ObservedInformation) -> frozenset[str]:
     """Free unknowns that take part in what is hidden, by name.
 
-    Among them lost motion of axes that never reverse, like the pole axis of one helix. What is known (`Knowledge.held`) is not free.
+    Among them lost motion of axes that never reverse, like the pole axis of one helix. What is known (`Knowledge.fixed`) is not free.
     """
-    found = play(columns, known, seen)
+    found = play(columns, known, observed)
     share = np.linalg.norm(np.concatenate([found.free, found.loose], axis=1) / found.size, axis=1)
     return frozenset(n for group, s in zip(found.groups, share, strict=True) if s > HIDDEN for n in group)
 
@@ -274,8 +274,8 @@ def hidden_free(columns: CampaignColumns, known: Knowledge, seen: ObservedInform
 class ParameterStatus:
     """One unknown: estimate (None before solving), standard uncertainty, prior standard deviation, in mm, rad or mm/s.
 
-    ``share``: 1 - (u / prior)^2, how much of the information comes from the readings; ``status``: by `OBSERVED` and `SEEN`, and never
-    better than ``"not observable"`` for a parameter that takes part in a hidden combination.
+    ``share``: 1 - (u / prior)^2, how much of the information comes from the readings; ``status``: by `OBSERVED` and `WEAKLY_OBSERVED`, and
+    never better than ``"not observable"`` for a parameter that takes part in a hidden combination.
     """
 
     name: str
@@ -313,7 +313,7 @@ class MotionStatus:
 
 def status_of(share: float, *, hidden: bool) -> Status:
     """Status for a share of information from the readings."""
-    if hidden or share < SEEN:
+    if hidden or share < WEAKLY_OBSERVED:
         return "not observable"
     return "observed" if share >= OBSERVED else "weak"
 

@@ -90,15 +90,15 @@ class Number:
     """The observability number: how many times smaller the volumetric error of a typical machine can become by these runs.
 
     ``value``: at the worst place of the inner 80 %, before over after; ``median``: median place before over median place after;
-    ``before_mm``, ``after_mm``: the sizes behind ``value``; ``where_mm``: the worst place afterwards; ``verdict``: ``"good"``, ``"usable
-    with care"`` or ``"mostly assumption"``; ``text``: in words.
+    ``before_mm``, ``after_mm``: the sizes behind ``value``; ``worst_place_mm``: the worst place afterwards; ``verdict``: ``"good"``,
+    ``"usable with care"`` or ``"mostly assumption"``; ``text``: in words.
     """
 
     value: float
     median: float
     before_mm: float
     after_mm: float
-    where_mm: F1
+    worst_place_mm: F1
     verdict: str
     text: str
 
@@ -181,13 +181,13 @@ def observability_number(volume: Volume) -> Number:
     """
     prior, u = volume.prior_mm[volume.inner], np.maximum(volume.u_mm[volume.inner], 1e-12)
     k = int(np.argmax(u))
-    value, median, where = float(prior.max() / u[k]), float(np.median(prior) / np.median(u)), volume.axes_mm[volume.inner][k]
+    value, median, worst_place_mm = float(prior.max() / u[k]), float(np.median(prior) / np.median(u)), volume.axes_mm[volume.inner][k]
     verdict = "good" if value >= GOOD else "usable with care" if value >= USABLE else "mostly assumption"
-    place = ", ".join(f"{v:.0f}" for v in where)
+    place = ", ".join(f"{v:.0f}" for v in worst_place_mm)
     sizes = f"from {prior.max() * 1e3:.2g} µm to {u[k] * 1e3:.2g} µm at ({place}) mm"
     text = (
         f"Observability {value:.1f} ({verdict}): at the worst place of the inner 80 % of the volume, a correction from these runs makes "
         f"the error of a typical machine at best {value:.1f} times smaller ({sizes}), {median:.1f} times at the median. Below {USABLE:g} "
         f"the result is mostly assumption, from {GOOD:g} on it is good."
     )
-    return Number(value, median, float(prior.max()), float(u[k]), where, verdict, text)
+    return Number(value, median, float(prior.max()), float(u[k]), worst_place_mm, verdict, text)

@@ -130,7 +130,7 @@ def _run_live(
         number = addition_count(store, job.campaign.name) + 1
         name = (f"next{number} {SystemClock().utc():%Y-%m-%d %H:%M:%S}", f"n{number}")
         test = finding.next_test
-        about = replace(finding.where, runs=(test.like,)) if finding.verdict == "unknown" and test.like else None
+        about = replace(finding.location, runs=(test.like,)) if finding.verdict == "unknown" and test.like else None
         wanted = next_plan(test.adds, site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
         if wanted.plan is None:
             typer.echo(f"by hand: Abbe cannot run {', '.join(wanted.by_hand)} on this machine")

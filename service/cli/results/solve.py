@@ -206,7 +206,7 @@ def _print(summary: Assessment, solution: SolutionFile) -> None:
     if solution.verdict is not None:
         typer.echo(f"{solution.verdict.word.capitalize()}. {solution.verdict.text}")
         typer.echo(solution.verdict.layout)
-    typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.seen.effective_rank} of them well.")
+    typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well.")
     typer.echo(worst_line(summary))
     _tables(solution)
     if solution.table_taken_out is not None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidate_bank import SEEN, UNNAMED
+from abbe.models.discovery.candidate_bank import UNNAMED, VISIBLE_SHARE
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
 from abbe.models.discovery.selection import Contest
@@ -62,7 +62,7 @@ def candidates_of(case: Case, *, unnamed: bool = True) -> Candidates:
         bank = contest.banks.pop(0)
         left = np.concatenate([problem.projection.left(part.T.astype(np.float64)) for part in bank.parts], axis=1)
         length = np.linalg.norm(left, axis=0)
-        seen = length**2 > SEEN * bank.own
+        seen = length**2 > VISIBLE_SHARE * bank.own
         for pick, first, size in zip(bank.picks, bank.first, bank.size, strict=True):
             labels.append(pick.label)
             sizes.append(int(seen[first : first + size].sum()))

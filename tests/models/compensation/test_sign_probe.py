@@ -41,7 +41,7 @@ def read(tables: NineTables, rng: np.random.Generator) -> np.ndarray:
 def test_an_honest_control_is_believed_and_every_wrong_sign_of_a_seen_axis_is_found():
     rng = np.random.default_rng(11)
     zero = np.zeros(len(PLACES))
-    seen = passed = 0
+    observed = passed = 0
     for _ in range(300):
         tables = smooth(rng, rng.uniform(0.002, 0.02))
         each = expected_changes(PLACES, CENTRE, None, tables)
@@ -51,9 +51,9 @@ def test_an_honest_control_is_believed_and_every_wrong_sign_of_a_seen_axis_is_fo
             if len(turned) != 1:
                 continue
             found = probe(each, zero, read(with_signs(tables, signs), rng))
-            if found.seen[turned[0]]:
-                seen, passed = seen + 1, passed + found.agrees
-    assert seen > 500
+            if found.observed[turned[0]]:
+                observed, passed = observed + 1, passed + found.agrees
+    assert observed > 500
     assert passed == 0
 
 
@@ -63,7 +63,7 @@ def test_exchanged_axes_and_other_units_are_found():
     for _ in range(100):
         tables = smooth(rng, 0.01)
         each = expected_changes(PLACES, CENTRE, None, tables)
-        if not all(probe(each, zero, zero).seen):
+        if not all(probe(each, zero, zero).observed):
             continue
         for factor in (-1.0, 0.0, 0.5, 25.4, 1000.0):
             assert not probe(each, zero, factor * read(tables, rng)).agrees
@@ -78,7 +78,7 @@ def test_a_change_too_small_to_prove_is_still_refuted_by_another_one():
     zero = np.zeros(len(PLACES))
     calm = probe(each, zero, each.sum(axis=1))
     assert calm.agrees
-    assert calm.seen == (False, False, False)
+    assert calm.observed == (False, False, False)
     assert "too small to prove the sign of X, Y, Z" in calm.text
     assert not probe(each, zero, each.sum(axis=1) + 0.08).agrees
     assert not probe(each, zero, np.full(len(PLACES), np.nan)).agrees

@@ -10,8 +10,8 @@ from abbe.models.compensation.achievable import (
     achievable,
     cross_only,
     enough_for_the_field,
+    individually_observable,
     motion_tables,
-    observable_alone,
     positioning_only,
     squareness_tables,
 )
@@ -149,14 +149,14 @@ def test_all_motions_in_tables_are_the_deviation(solved):
 
 def test_only_motions_that_are_told_apart_are_written_under_their_names(solved):
     _, s = solved
-    seen = observable_alone(s)
+    seen = individually_observable(s)
     told = {m.name: m.status for m in observability_of(s).motions}
     hidden = {name.split(".")[0] for c in s.identifiability.hidden for name, _ in c.weights}
     tables = motion_tables(s, COUNTS, seen)
     assert hidden
     assert not hidden & (set(tables.motions) | set(tables.squareness_rad))
     assert set(tables.left_out) == {name for name, status in told.items() if status != "observed"}
-    assert observable_alone(s, weak=True) == {name for name, status in told.items() if status != "not observable"}
+    assert individually_observable(s, weak=True) == {name for name, status in told.items() if status != "not observable"}
     for name, values in tables.motions.items():
         mine = {n: s.estimate.value(n) for n in s.estimate.names if n.split(".")[0] == name}
         alone = only(s, **{n.replace(".", "_"): v for n, v in mine.items()})
@@ -180,7 +180,7 @@ def test_as_few_motions_as_carry_the_field_are_right_for_this_tool_and_only_for_
 
 def test_hidden_and_weak_motions_are_not_written_as_right_for_any_tool(solved):
     _, s = solved
-    seen = observable_alone(s)
+    seen = individually_observable(s)
     hidden = sorted({name.split(".")[0] for c in s.identifiability.hidden for name, _ in c.weights})
     assert hidden
     for name in hidden:

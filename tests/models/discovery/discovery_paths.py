@@ -8,7 +8,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.effects.path import Path, Places, driven, standing
+from abbe.models.effects.path import Path, Places, at_rest, driven
 from abbe.models.machine import Machine
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import diagonal_ends, step_diagonal
@@ -40,7 +40,7 @@ def bar(
     length = np.linalg.norm(away, axis=1, keepdims=True)
     ones = np.full(len(q), -1.0 if back else 1.0)
     return Path(
-        label, setup, test, "bar", MACHINE, 2, at, standing(centre, start, {}), away / length, f, ones, 0 * ones, start, 0.0,
+        label, setup, test, "bar", MACHINE, 2, at, at_rest(centre, start, {}), away / length, f, ones, 0 * ones, start, 0.0,
         float(np.median(length)), centre,
     )  # fmt: skip
 

@@ -133,7 +133,7 @@ def test_what_noise_was_assumed_does_not_matter(folder: Path) -> None:
     """Readings say how large it is, and the prediction's uncertainty goes with that once."""
     problem, solution, predicted = solved(folder, 0)
     colours = {kind: replace(c, sd_mm=2.0 * c.sd_mm) for kind, c in problem.colours.items()}
-    projection = replace(problem.projection, y=0.5 * problem.projection.y, moment=0.5 * problem.projection.moment)
+    projection = replace(problem.projection, y=0.5 * problem.projection.y, y_coordinates=0.5 * problem.projection.y_coordinates)
     first = agreements(problem, solution, predicted)[0]
     second = agreements(
         replace(problem, colours=colours, projection=projection),

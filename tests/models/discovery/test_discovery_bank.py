@@ -27,7 +27,7 @@ def problem() -> WhitenedProblem:
 def same(a: Bank, b: Bank) -> None:
     assert [p.start for p in a.picks] == [p.start for p in b.picks]
     assert dict(a.known) == dict(b.known)
-    for name in ("first", "size", "own", "moment", "prior_sd", "logs"):
+    for name in ("first", "size", "own", "rhs", "prior_sd", "logs"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     for x, y in zip((*a.gram, *a.parts), (*b.gram, *b.parts), strict=True):
         assert np.array_equal(x, y)
@@ -52,7 +52,7 @@ def test_what_another_bank_holds_is_not_made_again_and_is_the_same(problem: Whit
     monkeypatch.setattr(WhitenedProblem, "white", None)  # nothing is whitened a second time
     found = bank_of(problem, mixed)
     assert np.concatenate(found.parts) == pytest.approx(np.concatenate(fresh.parts), rel=1e-5, abs=1e-7)
-    assert found.moment == pytest.approx(fresh.moment, rel=1e-9, abs=1e-9)
+    assert found.rhs == pytest.approx(fresh.rhs, rel=1e-9, abs=1e-9)
     assert [p.start for p in found.picks] == [p.start for p in fresh.picks]
     assert found.known == fresh.known
     same(bank_of(problem, PICKS), held)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.generic.unnamed_structures import SIGNALS, generic_rivals, is_unnamed, place_at, where_of
+from abbe.models.discovery.generic.unnamed_structures import SIGNALS, generic_rivals, is_unnamed, location_of, place_at
 from abbe.models.effects.effect import Effect
 from abbe.models.effects.path import Path
 from tests.models.discovery.discovery_paths import campaign, case_of_paths, noise
@@ -56,7 +56,7 @@ def test_scan_finds_bump_by_place() -> None:
     rest = {p.label: e + c / SIGMA[p.kind] for p, e, c in zip(PATHS, noise(PATHS, 6), columns, strict=True)}
     effect = the(generic_rivals(CASE, rest, SIGMA), "unnamed_bump", "")
     assert np.linalg.norm(place_at(PATHS, effect.shape[0].starts[0]) - centre) < 20.0
-    where = where_of(effect, "", values, CASE)
+    where = location_of(effect, "", values, CASE)
     assert where.position_mm is not None
     assert np.linalg.norm(np.subtract(where.position_mm, centre)) < 1e-6
     assert where.radius_mm == 40.0
@@ -64,14 +64,14 @@ def test_scan_finds_bump_by_place() -> None:
 
 def test_where_says_time_period_lobes() -> None:
     rivals = generic_rivals(CASE)
-    step = where_of(the(rivals, "unnamed_step", "X"), "X", {"t0_s": 950.0}, CASE)
+    step = location_of(the(rivals, "unnamed_step", "X"), "X", {"t0_s": 950.0}, CASE)
     assert step.time_s is not None
     assert step.time_s[0] < 950.0 < step.time_s[1]
     assert step.axes == ("X",)
-    surge = where_of(the(rivals, "unnamed_surge", "Z"), "Z", {"period_s": 41.0}, CASE)
+    surge = location_of(the(rivals, "unnamed_surge", "Z"), "Z", {"period_s": 41.0}, CASE)
     assert surge.period_s == 41.0
     assert surge.depends_on == ("time",)
-    lobes = where_of(the(rivals, "unnamed_lobes", "Z4"), "Z4", {}, CASE)
+    lobes = location_of(the(rivals, "unnamed_lobes", "Z4"), "Z4", {}, CASE)
     assert lobes.angular_lobes == 4
     assert set(lobes.tests) == {"ballbar_circle", "ballbar_helix"}
 

@@ -74,7 +74,7 @@ def same(a: Discovery, b: Discovery, rel: float, *, key: Any = lambda text: text
         assert other.forms == one.forms
         assert {k: v[0] for k, v in other.parameters.items()} == pytest.approx({k: v[0] for k, v in one.parameters.items()}, rel=rel)
         assert {_label(n, key) for n, _ in one.alternatives} == {n for n, _ in other.alternatives}
-        assert other.where.axes == tuple(sorted(key(x) for x in one.where.axes))
+        assert other.location.axes == tuple(sorted(key(x) for x in one.location.axes))
     assert b.p_value == pytest.approx(a.p_value, rel=100.0 * rel)
     assert b.noise_mm == pytest.approx(a.noise_mm, rel=rel)
     for role, gap in a.gaps.items():

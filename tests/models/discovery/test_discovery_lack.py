@@ -38,13 +38,13 @@ def test_a_shape_that_no_effect_explains_is_unknown_with_place_and_shape() -> No
     gap = found.gaps["identify"]
     assert gap.before_mm > 1.5 * gap.floor_mm
     assert gap.floor_mm == pytest.approx(0.3e-3, rel=0.2)  # of the repeats; what the fit leaves is many times that
-    assert (found.where.axes, found.where.runs) == (("X",), ("r01",))
-    assert "position" in found.where.depends_on
-    assert "a shape along X, alike in both directions" in found.where.shape
-    assert answer_doc(finding)["where"]["shape"] == found.where.shape
+    assert (found.location.axes, found.location.runs) == (("X",), ("r01",))
+    assert "position" in found.location.depends_on
+    assert "a shape along X, alike in both directions" in found.location.shape
+    assert answer_doc(finding)["where"]["shape"] == found.location.shape
     sign, word, text = verdict_of(finding)
     assert (sign, word) == ("bad", "Something is missing that the catalogue does not explain")
-    assert found.where.shape in text
+    assert found.location.shape in text
     assert found.next_test is not None
 
 
@@ -102,7 +102,7 @@ def test_no_real_axis_is_called_complete_over_a_gap(shared: Path, name: str) -> 
     assert answer["verdict"] != "none" or answer["rms_before_um"] <= 1.5 * answer["noise_floor_um"]
     if name.endswith("-ild"):  # tens of um, the same in both directions, in a sensor that repeats to less than 1 um
         assert (answer["verdict"], answer["effects"]) == ("unknown", [])
-        assert "alike in both directions" in found.where.shape
+        assert "alike in both directions" in found.location.shape
         assert answer["noise_floor_um"] < 1.0
     else:
         assert (answer["verdict"], answer["proved"]) == ("named", True)

@@ -19,7 +19,7 @@ from abbe.models.discovery.instrument_noise import Colour, unscaled
 from abbe.models.discovery.selection import Contest, joined, weighed
 from abbe.models.discovery.whitened_problem import SignalProjection, whiten
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.models.effects.path import Path, driven, standing
+from abbe.models.effects.path import Path, at_rest, driven
 from abbe.models.machine import Machine
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.finding import finding_of
@@ -96,7 +96,7 @@ def run(label: str, setup: str, cup: F1, q: F2, t: F1, feed: float, direction: i
     speed, number = np.full(N, feed), int(label[1:])
     role: Role = "sealed" if number % 11 == 5 else "holdout" if number % 7 == 3 else "identify"
     path = Path(
-        label, setup, "ballbar_circle", "bar", MACHINE, 2, driven(q, t, speed, dwelling=False, temp_c={}), standing(cup, t_set, {}), u,
+        label, setup, "ballbar_circle", "bar", MACHINE, 2, driven(q, t, speed, dwelling=False, temp_c={}), at_rest(cup, t_set, {}), u,
         speed, np.full(N, float(direction)), np.zeros(N), t_set, 0.0, R, cup,
     )  # fmt: skip
     return CaseRun(path, role, None if role == "sealed" else reading, np.ones(N, dtype=bool))
@@ -190,8 +190,8 @@ def test_a_step_in_time_is_unknown_and_located() -> None:
     found = discover(campaign(step_um=6.0), CATALOGUE)
     assert found.verdict == "unknown"
     assert found.effects == ()
-    assert found.where.time_s is not None
-    low, high = found.where.time_s
+    assert found.location.time_s is not None
+    low, high = found.location.time_s
     assert low <= 900.0 + 60.0
     assert high >= 900.0 - 60.0
 

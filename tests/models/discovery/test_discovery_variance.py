@@ -45,7 +45,7 @@ def test_stick_slip_by_axis_and_size() -> None:
 
     first = found(only_bars(saw))[0]
     assert first.label == "stick_slip:X"
-    assert first.where.axes == ("X",)
+    assert first.location.axes == ("X",)
     assert abs(first.strength - 3.0) < 0.5
     assert 1.2 < first.parameters["v_c"] < 3.2
 
@@ -55,7 +55,7 @@ def test_few_laser_readings_that_are_off() -> None:
     add = [np.where(rng.uniform(size=p.n) < 0.03, 2e-3 * rng.choice([-1, 1], p.n), 0.0) * (p.kind == "laser") for p in PATHS]
     first = found(add)[0]
     assert first.label == "beam_outliers"
-    assert first.where.tests == ("laser_diagonal",)
+    assert first.location.tests == ("laser_diagonal",)
     assert abs(first.strength - 2.0) < 0.6
     assert 0.005 < first.parameters["rate"] < 0.08
 
@@ -67,9 +67,9 @@ def test_a_burst_of_one_run_is_located_and_has_no_name() -> None:
     add = [6e-3 * rng.standard_normal(p.n) * (np.abs(p.at.t_s - middle) < 1.5) * (p is run) for p in PATHS]
     bursts = [f for f in found(add) if f.name == "unnamed_burst"]
     assert bursts
-    assert bursts[0].where.runs == (run.label,)
-    assert bursts[0].where.time_s is not None
-    assert bursts[0].where.time_s[0] - 1 < middle < bursts[0].where.time_s[1] + 1
+    assert bursts[0].location.runs == (run.label,)
+    assert bursts[0].location.time_s is not None
+    assert bursts[0].location.time_s[0] - 1 < middle < bursts[0].location.time_s[1] + 1
 
 
 def test_noise_alone_names_nothing() -> None:
@@ -120,5 +120,5 @@ def test_a_place_where_the_machine_is_off_is_no_lost_beam() -> None:
 
     first = found([bump(p) for p in PATHS])[0]
     assert first.label == "unnamed_place"
-    assert first.where.position_mm is not None
-    assert np.linalg.norm(np.array(first.where.position_mm) - corner) < 30.0
+    assert first.location.position_mm is not None
+    assert np.linalg.norm(np.array(first.location.position_mm) - corner) < 30.0

@@ -58,7 +58,7 @@ class Experiment:
     def seen(self, degree: int, extra: dict[str, np.ndarray] | None = None) -> ObservedInformation:
         terms, setup = smooth_terms(degree), setup_unknowns(self.runs, Priors())
         known = self.knowledge(terms, setup)
-        known = replace(known, held={**known.held, **(extra or {})})
+        known = replace(known, fixed={**known.fixed, **(extra or {})})
         return observed_information(compressed(campaign_columns(self.machine, terms, self.runs, setup)), known)
 
 

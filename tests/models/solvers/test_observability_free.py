@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from abbe.models.compensation.achievable import observable_alone
+from abbe.models.compensation.achievable import individually_observable
 from abbe.models.machine import Machine
 from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.assessment import motions_of, observability, observability_of
@@ -70,7 +70,7 @@ def test_the_solver_s_rank_the_report_and_the_tables_say_the_same(certified):
     solution = solve_joint(YANG, tuple(moved(replace(r, **stated), rng) for r in TEN), order=1)
     report = observability_of(solution)
     rank = solution.identifiability
-    assert (rank.rank, rank.effective_rank, rank.n_parameters) == (report.rank, report.seen.effective_rank, len(report.terms))
+    assert (rank.rank, rank.effective_rank, rank.n_parameters) == (report.rank, report.observed.effective_rank, len(report.terms))
     assert rank.rank == (11 if certified else 10)
     involved = {n for m in report.motions for n in m.hidden}
     assert {n for c in rank.hidden for n, _ in c.weights} == involved == rank.involved & {t.name for t in report.terms}
@@ -79,7 +79,7 @@ def test_the_solver_s_rank_the_report_and_the_tables_say_the_same(certified):
     assert {p.status for p in report.parameters if p.name in rank.involved} == {"not observable"}
     assert ("bar_length_175" in rank.involved) == (not certified)
     assert motions_of(solution) == report.motions
-    assert observable_alone(solution) == {m.name for m in report.motions if m.status == "observed"}
+    assert individually_observable(solution) == {m.name for m in report.motions if m.status == "observed"}
 
 
 @pytest.mark.parametrize("digits", [9, 7, 6, 4, 3] if LONG else [6, 3])

@@ -158,7 +158,7 @@ def gain(experiment, degree, key):
     columns = compressed(campaign_columns(experiment.machine, terms, experiment.runs, setup))
     campaign = CampaignLayout(experiment.machine, terms, experiment.runs, columns, experiment.knowledge(terms, setup))
     found = trials(campaign, experiment.seen(degree))
-    return next(count_observed(t.seen) for t in found if t.addition.key == key)
+    return next(count_observed(t.observed) for t in found if t.addition.key == key)
 
 
 def test_a_bar_counts_as_calibrated_only_if_every_run_says_so():

@@ -26,8 +26,8 @@ def effect(label, family="structure"):
 
 
 def demo(hidden, verdict, *labels):
-    where = Localization(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
-    finding = Finding(verdict=verdict, effects=tuple(effect(n) for n in labels), where=where)
+    location = Localization(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
+    finding = Finding(verdict=verdict, effects=tuple(effect(n) for n in labels), location=location)
     gap = GapUm(before_um=2.0, after_um=0.5, floor_um=0.5)
     return HiddenDemo(
         [], None, Path(), "", finding, None, SimpleNamespace(version=1), NewMeasurement(gap, {"a": gap}),

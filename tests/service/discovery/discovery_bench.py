@@ -76,13 +76,13 @@ class Search:
         before = {r.path.label: reading(r) for r in judged}
         after = {r.path.label: reading(r, shift[r.path.label] * (self.holds or r.role == "identify")) for r in judged}
         rival = (("lateral_play:EYX", self.ahead),)
-        where = Localization(tests=("ballbar_circle",), axes=("X",), position_mm=(310.0, 240.0, 100.0), radius_mm=30.0)
+        location = Localization(tests=("ballbar_circle",), axes=("X",), position_mm=(310.0, 240.0, 100.0), radius_mm=30.0)
         table = Localization(axes=("X",), table=(Significance("axis", "X", 40.0, 1e-9),))
-        named = NamedEffect("backlash", "X", size, 0.1, {}, np.array([size]), np.array([[0.01]]), 300.0, rival, where)
+        named = NamedEffect("backlash", "X", size, 0.1, {}, np.array([size]), np.array([[0.01]]), 300.0, rival, location)
         return Discovery(
             verdict=self.verdict,
             effects=(named,) if self.verdict == "named" else (),
-            where=where if self.verdict == "unknown" else table,
+            location=location if self.verdict == "unknown" else table,
             next_test=NextTest(("second_feed",), ("backlash:X", "lateral_play:EYX"), 4.2, 12.0, "") if self.verdict == "named" else None,
             gaps={role: gap(role, case, before, after) for role in ("identify", "holdout") if case.of(role)},
             residual_before_mm=before,
