@@ -60,7 +60,7 @@ class ReplyTimeout(DriverError, TimeoutError):
 
 
 class BadFrame(DriverError):
-    """Bytes arrived that are no frame of the protocol, or a reply that does not match the request."""
+    """Bytes arrived that are not a frame of the protocol, or a reply that does not match the request."""
 
     code = "DRV-004"
 

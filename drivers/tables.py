@@ -147,5 +147,5 @@ def _counts(value_mm: float, what: str) -> int:
     if not -(1 << 31) - 0.5 < exact < (1 << 31) - 0.5:
         raise TableCodecError(f"grid {what} {value_mm} mm is not a number within +-21 m")
     if abs(exact - round(exact)) > _EXACT:
-        raise TableCodecError(f"grid {what} {value_mm} mm is no multiple of {GRID_NM} nm; quantise the grid before computing the table")
+        raise TableCodecError(f"grid {what} {value_mm} mm is not a multiple of {GRID_NM} nm; quantise the grid before computing the table")
     return round(exact)

@@ -26,20 +26,20 @@ EWMA_WEIGHT = 0.2
 EWMA_L = 2.962
 """Width of the EWMA's limits: one false alarm in 500 checks on average (Lucas and Saccucci 1990)."""
 MIN_CHECKS = 8
-"""Least checks for a statement about drift."""
+"""Number of checks needed for a statement about drift."""
 MIN_FIT = 6
-"""Least checks for a statement about the limit."""
+"""Number of checks needed for a statement about the limit."""
 SIGNIFICANCE = 0.01
 """Significance level of a slope that is extrapolated."""
 Z_MAX = 8.0
 MOST_CHECKS = 400
-"""Most recent checks used for a forecast; older ones do not bear on the days ahead."""
+"""How many of the latest checks a forecast uses; older ones say little about the days ahead."""
 MOST_KNOTS = 200
 FARTHEST = 20.0
 """Longest forecast, in lengths of the series."""
 JUMP_SIGMAS = 5.0
 JUMP_SHARE = 0.25
-"""Least jump in standard uncertainties, and as a share of the limit, because the spread of few checks is not known."""
+"""Smallest jump that counts, in standard uncertainties, and as a share of the limit, because the spread of few checks is not known."""
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class _Sums:
         return np.asarray(self.yy - self.level() * self.y - self.slope() * self.yr, dtype=np.float64)
 
     def squares_if(self, reached: F1) -> F1:
-        """Least sum of squares if the limit is reached on each of these days, over all knots."""
+        """Smallest sum of squares if the limit is reached on each of these days, over all knots."""
         s = 1.0 / (reached[:, None] - self.knots[None, :])
         level2 = (self.y - s * self.yr) ** 2 / (self.w - 2 * s * self.r + s**2 * self.rr)
         return np.asarray((self.yy - level2).min(axis=1), dtype=np.float64)

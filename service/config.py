@@ -183,6 +183,6 @@ def _siblings(location: tuple[int | str, ...]) -> list[str]:
 
 
 def _keys(section: Any) -> dict[str, Any]:
-    """Return the keys of a table with their types; nothing for a type that is no table."""
+    """Return the keys of a table with their types; nothing for a type that is not a table."""
     names = section.model_fields if hasattr(section, "model_fields") else getattr(section, "__dataclass_fields__", ())
     return {name: kind for name, kind in get_type_hints(section).items() if name in names} if names else {}

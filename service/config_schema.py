@@ -257,7 +257,7 @@ class Web(Section):
         if bool(self.certificate) != bool(self.key):
             raise ValueError("certificate and key belong together, expected both or none")
         if self.behind_tls and not self.names:
-            raise ValueError("behind_tls needs the proxy's name in names, under which browsers ask for the page")
+            raise ValueError("behind_tls: add to names the host name of the proxy that browsers use")
         return self
 
 
@@ -302,7 +302,7 @@ class OpcUa(Section):
 
 def _public_key(text: str) -> str:
     if len(text) != 64 or not set(text) <= set("0123456789abcdef"):
-        raise ValueError(f"{text!r} is no public key, expected 64 hex digits as `abbe key new` prints them")
+        raise ValueError(f"{text!r} is not a public key, expected 64 hex digits as `abbe key new` prints them")
     return text
 
 

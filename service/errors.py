@@ -213,7 +213,7 @@ class StretchDiffers(SetupDisturbed):
 
 
 class MachineInUse(UnsafeToMove):
-    """Another process uses the machine, or pushes a table into it. This is no fault: wait until that process has finished."""
+    """Another process uses the machine, or pushes a table into it. This is not a fault: wait until that process has finished."""
 
     code = "SEQ-010"
 

@@ -19,7 +19,7 @@ _KINDS = (
 
 
 class NotPlainError(OSError):
-    """The path is no plain file, or the file is larger than the limit: ``strerror`` says which."""
+    """The path is not a plain file, or the file is larger than the limit: ``strerror`` says which."""
 
 
 def read_plain(path: Path, most: int) -> bytes:

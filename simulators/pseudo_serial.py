@@ -42,7 +42,7 @@ class PseudoSerial:
         return len(self._out)
 
     def send(self, data: bytes) -> None:
-        """Send bytes; what the terminal does not take waits."""
+        """Send bytes; those that the terminal does not accept yet wait in a buffer."""
         self._out += data
         self.pump()
 

@@ -101,7 +101,7 @@ class World:
 
 
 def with_hidden_bar(draws: Draws, scenario: Scenario) -> Draws:
-    """Draws in which the bar is as wrong as a hidden effect wants it."""
+    """The draws, with the bar error that a hidden effect asks for."""
     if scenario.hidden.name != "bar_length_error":
         return draws
     return replace(draws, bar_length_error_mm=draws.bar_length_error_mm + scenario.hidden.parameters["strength"] * UM)

@@ -1,4 +1,4 @@
-"""Simulated hardware is no program of this computer: beside other tests it does not wait for a core."""
+"""Simulated hardware is not a program of this computer: beside other tests it does not wait for a core."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Box:
 
     @property
     def reads(self) -> Reads | None:
-        """Number of the settings, and stroke; None if the box does not report them."""
+        """Change counter and measuring range of the settings; None if the box does not report them."""
         return None if self.settings is None else Reads(self.settings.number, self.settings.range_nm)
 
     async def accept(self) -> frames.Info:

@@ -74,7 +74,7 @@ class BoxSettings:
 
 @dataclass(frozen=True, slots=True)
 class Bad:
-    """``n_bytes`` bytes that are no frame; ``reason`` is ``"check sum"`` if they contained a false frame, else ``"garbage"``."""
+    """``n_bytes`` bytes that are not a frame; ``reason`` is ``"check sum"`` if they contained a false frame, else ``"garbage"``."""
 
     reason: str
     n_bytes: int

@@ -86,7 +86,7 @@ class SequenceTracker:
 
     @property
     def too_lossy(self) -> bool:
-        """Whether the run has lost too much to end at 0.1 % or less, unless it lasts much longer than ``_LOSS_FLOOR`` samples."""
+        """Whether more than 0.1 % of the samples are lost; a shorter run counts as ``_LOSS_FLOOR`` samples long."""
         return self.lost > _MAX_LOSS * max(self.lost + self.accepted, _LOSS_FLOOR)
 
     @property

@@ -170,7 +170,7 @@ class ModbusLine:
         return Request(self._function(), request.address - skip, request.count + skip), skip
 
     async def ask(self, request: Request) -> ModbusReply:
-        """Send a request once; on RTU accept its reply only if the canary read after it is right. Raises as the wire."""
+        """Send a request once; on RTU accept its reply only if the canary read after it is right. Raises the errors of the wire."""
         answer = await self._asked(request)
         if self._canary is not None:
             await self._wire.gap()

@@ -22,16 +22,16 @@ MANY = 100
 """Number of least delays from which the power of their distribution near the least possible delay is estimated; fewer for few points."""
 LEAST_PAIRS = 2 * LOWEST + 2
 EARLY = 3.0
-"""A single arrival that lies below the line of all others by more than this many times the 24th least delay is no arrival: a stamp is
+"""A single arrival that lies below the line of all others by more than this many times the 24th least delay is not an arrival: a stamp is
 wrong."""
 MOST_EARLY = 3
 STEP_BLOCKS = 40
 LEAST_IN_BLOCK = 10
 SURE = 10.0
-"""Least step, as a multiple of the scatter of the blocks' least delays."""
+"""Smallest step that is recognised, as a multiple of the scatter of the blocks' shortest delays."""
 LEAST_STEP_S = 1e-3
 SIDE = 4
-"""Least blocks on either side of a step: fewer late ones at an end are a spike."""
+"""Minimum number of blocks on either side of a step: fewer late ones at an end are a spike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ def _edge(x: F1, y: F1) -> tuple[int, int]:
     """Indices of the two ends of that edge of the lower convex hull which spans the mean of x."""
     some = np.unique([a + int(np.argmin(y[a:b])) for a, b in pairwise(np.linspace(0, x.size, min(BLOCKS, x.size) + 1).astype(int))])
     rough = _hull(x, y, np.unique(np.concatenate([[0], some, [x.size - 1]])))
-    # what lies above the hull of some of the points is no corner of the hull of all
+    # what lies above the hull of some of the points is not a corner of the hull of all
     hull = _hull(x, y, np.flatnonzero(y <= np.interp(x, x[rough], y[rough]) + 1e-15))
     at = int(np.searchsorted(x[hull], x.mean())) - 1
     at = min(max(at, 0), len(hull) - 2)
@@ -178,7 +178,7 @@ class ClockFit:
         return np.asarray(self.host_s0 + self.rate * (np.asarray(device_s, dtype=np.float64) - self.device_s0))
 
     def u_host_s(self, device_s: F1) -> F1:
-        """Standard uncertainty of that."""
+        """Standard uncertainty of `host_s` at ``device_s``."""
         away = self.u_rate * (np.asarray(device_s, dtype=np.float64) - self.device_s0)
         return np.sqrt(self.u_offset_s**2 + self.u_delay_s**2 + away**2)
 
@@ -198,7 +198,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
     ----------
     device_s, arrived_s : array, shape (n,)
         Device time of a sample (the newest of those that arrived together), and monotonic host time of its arrival.
-        50 pairs or more, of one segment: no reboot, no step in between .
+        50 pairs or more, of one segment: no reboot, no step in between.
     least_delay_s, u_delay_s : float
         Shortest delay of the link itself, and its standard uncertainty; the arrivals do not show it.
     grid_s : float
@@ -209,7 +209,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
     Raises
     ------
     ValueError
-        Too few pairs, device time not rising, or numbers that are none.
+        Too few pairs, device time that does not rise, or values that are not finite.
     """
     x, y = np.asarray(device_s, dtype=np.float64), np.asarray(arrived_s, dtype=np.float64)
     if x.size < LEAST_PAIRS:

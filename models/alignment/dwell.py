@@ -232,7 +232,7 @@ LONG, SHORT = 1.8, 0.4
 """A standstill longer or shorter than planned by these factors is reported."""
 JUMP_SAMPLES = 2
 MATCHED = 0.5
-"""Least share of the targets to be found: with fewer, the stream belongs to another program."""
+"""Minimum share of the targets to be found: with fewer, the stream belongs to another program."""
 
 
 @dataclass(frozen=True, slots=True)

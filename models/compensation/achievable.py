@@ -116,7 +116,7 @@ def motion_tables(
     Raises
     ------
     ValueError
-        A name that is no motion of the solution, no name at all, or (``any_tool``) a motion that the data do not separate from others.
+        A name that is not a motion of the solution, no name at all, or (``any_tool``) a motion that the data do not separate from others.
     """
     known = {t.motion for t in solution.terms}
     motions = _writable(solution, known, motions, any_tool)

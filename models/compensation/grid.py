@@ -266,7 +266,7 @@ def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:
     Raises
     ------
     ValueError
-        The unit is no positive number.
+        The unit is not a positive number.
     """
     check_unit(lsb_mm)
     return replace(table, correction_mm=np.round(table.correction_mm / lsb_mm) * lsb_mm)
@@ -278,7 +278,7 @@ def check_steps(table: GridTable, limit_mm: float) -> None:
     Raises
     ------
     ValueError
-        Names the axis of the step, its node and its size; or the limit is no number of 0 or more.
+        Names the axis of the step, its node and its size; or the limit is not a number of 0 or more.
     """
     if not limit_mm >= 0:
         raise ValueError(f"grid table: the largest allowed step is {limit_mm} mm, must be a number of 0 or more")

@@ -150,7 +150,7 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
 
 SHOWN = 3
 OBSERVED_MM = 0.003
-"""Least change at the strongest place; with less, drift within the tolerance could hide a reversed sign."""
+"""Smallest change at the strongest place; with less, drift within the tolerance could hide a reversed sign."""
 
 
 @dataclass(frozen=True)

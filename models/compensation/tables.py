@@ -113,7 +113,7 @@ def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
     Raises
     ------
     ValueError
-        The unit is no positive number.
+        The unit is not a positive number.
     """
     check_unit(lsb_mm)
     rounded = tuple(np.round(c / lsb_mm) * lsb_mm for c in tables.correction_mm)
@@ -121,7 +121,7 @@ def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
 
 
 def check_unit(lsb_mm: float) -> None:
-    """Refuse a controller's unit that is no positive number: rounding to it would make tables of nothing.
+    """Refuse a controller's unit that is not a positive number: rounding to it would make tables of nothing.
 
     Raises
     ------

@@ -4,7 +4,7 @@ A known machine that drifts lacks no physical effect: its model is complete, its
 is compared with new runs, and error motions compete for the residuals: six linear ones (scales, squareness) and the shape of each of the
 21. Selection is stepwise by the marginal likelihood of a linear normal model (as `abbe.models.solvers.components`) less the price, the
 logarithm of the number of candidates. For validation, one half of the set-ups chooses and the other judges, both ways round. Set-ups and
-lost motion are refitted throughout: a new cup is no change of the machine.
+lost motion are refitted throughout: a new cup is not a change of the machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NEAR = 3.0
 MOST = 6
 POINTS = 41
 FEWEST_SETUPS = 2
-"""Least set-ups of each half for cross-validation."""
+"""Minimum number of set-ups in each half for cross-validation."""
 
 
 @dataclass(frozen=True)
@@ -283,9 +283,9 @@ class ChangeContext:
         return np.asarray(term_values(self.known.terms, points, stroke) * mine)
 
     def hidden(self, chosen: Chosen) -> dict[str, float]:
-        """Bound on the change of each scale and squareness that was not chosen, rad: |estimate| + U (k = 2), all linear ones free.
+        """Largest change, rad, that each scale or squareness not chosen may have: |estimate| + U (k = 2), with all of them fitted.
 
-        Changes that these runs do not see, up to the largest size that is tried, are left out.
+        Left out: those whose change these runs could not see, even at the largest size that is tried.
         """
         names = {t.asked.name for t in chosen.taken}
         out = {}

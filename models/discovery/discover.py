@@ -24,15 +24,15 @@ from abbe.models.effects.effect import Effect
 
 
 GATE = 1.3
-"""Readings below this multiple of the stick-slip speed are excluded from the mean ..."""
+"""Readings below this multiple of the stick-slip speed are excluded from the mean, up to the share `MOST_GATED`."""
 MOST_GATED = 0.35
-"""... unless they exceed this share of all readings."""
+"""If more than this share of all readings is below `GATE`, none is excluded."""
 Progress = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
 """A rival replaces a name when it explains more by this chi-square, the margin that a new name also needs."""
 ROUNDS = 3
-"""Most repetitions of the search, each with noise and simulation refitted beside the findings."""
+"""Maximum number of repetitions of the search, each with noise and simulation refitted beside the findings."""
 
 
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:

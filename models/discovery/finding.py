@@ -37,7 +37,7 @@ TRUE_TO_FORM_OF = {
     "vibration": 0.04,
     "stick_slip": 0.1,  # its teeth are not all of one height
     "beam_outliers": 0.05,
-    "ram_sag": 0.05,  # the bending line is no parabola
+    "ram_sag": 0.05,  # the bending line is not a parabola
     "mirror_tilt": 0.1,  # a mirror is not mounted equally badly every time
     "air_refraction": 0.1,  # a hall does not swing as a sine
     "dead_path": 0.1,  # nor does its air warm up at one rate
@@ -46,7 +46,7 @@ TRUE_TO_FORM_OF = {
 CARRYING = ("modulated", "sensor")
 """Forms (by prefix) that carry part of an effect's size, thermal effects aside."""
 OFFSET = "offset"
-"""Prefix of forms whose first column is a constant: the start value of a sensor is no part of the swing."""
+"""Prefix of forms whose first column is a constant: the start value of a sensor is not part of the swing."""
 TIME_TRUE_TO_FORM = 0.3
 """Relative standard uncertainty of a time constant: of several time constants, a short campaign shows the quick ones."""
 RESIDUE_SHARE = 0.001
@@ -116,7 +116,7 @@ def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2
     """Coefficients of the plain effect nearest to the effect with its forms, per coefficient, shape (plain, all).
 
     Only forms that carry part of the size count: an amplitude that changes along the axis, other thermal courses, a followed sensor.
-    Additions such as a second harmonic or wind-up are no part of the strength.
+    Additions such as a second harmonic or wind-up are not part of the strength.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]

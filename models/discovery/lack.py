@@ -26,14 +26,14 @@ TIMES = 1.5
 CHANCE = 1e-3
 """Significance level of statements about one run, place or direction, per campaign."""
 FEWEST, REPEATS = 8, 20
-"""Least readings for judging a single run; least repeats for estimating noise."""
+"""Minimum number of readings for judging a single run, and of repeats for estimating noise."""
 NEAR_MM = 0.05
 """Positions closer than this are the same one, approached again."""
 ALONG_ONE_AXIS = 0.999
 """A laser measures along one axis if that component of its beam is larger."""
 KNOWN_FREEDOM = 1e6
 COMMON, PERIODIC = 0.8, 0.6
-"""Least share of a gap's energy that both directions have in common, and of that which one period explains, to be reported."""
+"""Smallest share of a gap's energy to be reported: the part common to both directions, and the part that one period explains."""
 
 
 @dataclass(frozen=True)

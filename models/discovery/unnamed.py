@@ -88,7 +88,7 @@ class _Plan:
 _AGAIN = _Plan(
     ("longer_session",),
     ("something of the machine", "something of that session"),
-    f"{{run}} again, later, {REPEATS} times in one undisturbed set-up: what comes back belongs to the machine, what does not "
+    f"{{run}} again, later, {REPEATS} times in one undisturbed set-up: what recurs belongs to the machine, what does not "
     "belonged to that session",
 )
 _PERIOD = _Plan(

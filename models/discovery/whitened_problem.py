@@ -63,7 +63,7 @@ class SignalProjection:
 
     @classmethod
     def nothing(cls, n: int) -> SignalProjection:
-        """The identity on n readings, all zero."""
+        """Projection without unknowns (the identity), with n readings of zero."""
         return cls(np.zeros(n), np.zeros((n, 0)), np.ones(n), np.zeros((0, 0)), np.zeros((0, n)), np.zeros(0))
 
     @classmethod
@@ -136,7 +136,7 @@ class WhitenedProblem:
     theta : array, shape (p,): unknowns of the fitted simulation.
     tangent : columns of the simulation's unknowns, whitened but for the size of the noise.
     projection : of the whitened gap onto the complement of the simulation's unknowns.
-    also : array, shape (n, k): further columns to project out that are no part of the simulation (waves of a vibration), mm per mm.
+    also : array, shape (n, k): further columns to project out that are not part of the simulation (waves of a vibration), mm per mm.
     column_cache : whitened columns of picks and their projection. banks : live banks of candidates of this problem. widths : columns of an
         effect along one run, by label. All three are caches.
     """

@@ -33,7 +33,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A freedom of form that belongs to an effect once it is there (a machine's backlash is no textbook's): more columns, lower price.
+    """A freedom of form that belongs to an effect once it is there (a machine's backlash is not a textbook's): more columns, lower price.
 
     ``signal`` as of the effect, for its key and its non-linear parameters. Never a name of its own.
     """
@@ -75,7 +75,7 @@ class Effect:
         Whether it moves the readings or makes them noisier (stick-slip, vibration with an unknown phase, outliers); a "variance" effect's
         ``signal`` says where: its columns are non-negative weights of the extra variance per reading.
     absorbed_by : tuple of str
-        Entries of ``current_model.includes`` that make it part of the present model (then it is no candidate).
+        Entries of ``current_model.includes`` that make it part of the present model (then it is not a candidate).
     needs : what a campaign must contain to show it, for people. blind : tests that cannot show it.
     signature, remedy_text : for people: how it looks, what to do at the machine.
     remedy : part of the machine or control that can remove it.

@@ -68,7 +68,7 @@ class BSpline:
 
     @property
     def parameters(self) -> F1:
-        """The coefficients."""
+        """Linear parameters: the coefficients."""
         return self.coefficients
 
     @property

@@ -54,12 +54,12 @@ class Legendre:
 
     @property
     def domain_mm(self) -> tuple[float, float]:
-        """The stroke."""
+        """Range of definition: the stroke."""
         return self.stroke_mm
 
     @property
     def parameters(self) -> F1:
-        """The coefficients."""
+        """Linear parameters: the coefficients."""
         return self.coefficients
 
     @property

@@ -29,7 +29,7 @@ class Monomial:
 
     @property
     def name(self) -> str:
-        """As the vectors write it: ``dxx^1``, ``ezy^2``, ``Sxy^1``."""
+        """Name as the vector files write it: ``dxx^1``, ``ezy^2``, ``Sxy^1``."""
         return f"{self.kind}{'xyz'[self.i]}{'xyz'[self.j]}^{self.power}"
 
 

@@ -17,7 +17,7 @@ from abbe.models.functions.table import Table
 from abbe.models.machine import AXES
 
 PASSES = 2
-"""The first takes the line away, the second what rounding left of it."""
+"""Number of passes: the first removes the line, the second what rounding left of it."""
 ROTATIONS = ("A", "B", "C")
 REVERSE = "@reverse"
 SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
@@ -282,7 +282,7 @@ class ErrorMotions:
         Raises
         ------
         ValueError
-            A name is no parameter of these motions, or as in `motions`.
+            A name is not a parameter of these motions, or as in `motions`.
         """
         axes, signs = _checked(axes_mm, direction)
         wanted, known = tuple(names), set(self.parameter_names())
@@ -291,7 +291,7 @@ class ErrorMotions:
         bases: dict[str, F2] = {}
         for column, name in enumerate(wanted):
             if name not in known:
-                raise ValueError(f"{name!r} is no parameter of these error motions")
+                raise ValueError(f"{name!r} is not a parameter of these error motions")
             if name in SQUARENESS:
                 axis, component, sign = SQUARENESS[name]
                 weights[:, column] = sign * axes[:, axis]

@@ -49,7 +49,7 @@ class Polynomial:
 
     @property
     def parameters(self) -> F1:
-        """The coefficients."""
+        """Linear parameters: the coefficients."""
         return self.coefficients
 
     @property

@@ -75,10 +75,10 @@ def _check_correlations(c: F2, spread: F2, what: str) -> None:
 
 
 CHUNK = 8192
-"""Most points at a time."""
+"""Maximum number of points at a time."""
 
 WEIGHTS = 2**20
-"""Most weights (points times parameters) at a time, 8 MB: those of many points or of long tables do not fit into memory at once."""
+"""Maximum number of weights (points times parameters) at a time, 8 MB: for many points or long tables all would not fit into memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def sensitivity(machine: Machine, errors: ErrorMotions, names: Sequence[str], at
     Raises
     ------
     ValueError
-        A name is no parameter, or a shape is wrong.
+        A name is not a parameter, or a shape is wrong.
     """
     places, weights = errors.sensitivities(names, at.axes_mm, at.direction)
     slopes = _slopes(machine, errors, at, exact=exact)
@@ -152,7 +152,7 @@ def deviation_covariance(
     Raises
     ------
     ValueError
-        The matrix does not fit the names or is no covariance (`checked_covariance`), or as in `sensitivity`.
+        The matrix does not fit the names or is not a covariance (`checked_covariance`), or as in `sensitivity`.
     """
     names, matrix = covariance
     matrix = checked_covariance(matrix, len(names))

@@ -1,6 +1,6 @@
 """The deviation over a volume: grid, best-fit rigid motion, rms and maximum, and the deviation per unit of each coefficient.
 
-The pose of the workpiece is no property of the machine: two error maps are compared only after the best-fit rigid motion over one volume
+The pose of the workpiece is not a property of the machine: two error maps are compared only after the best-fit rigid motion over one volume
 is removed from both (math.md 3). It must be removed from their uncertainty too, which otherwise includes the frame."""
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ class HelixTest:
 
     @property
     def mounting(self) -> str:
-        """Tests with equal mounting share what was mounted: this cup."""
+        """Key of the mounted cup: tests with the same key share one mounting."""
         return "cup " + ",".join(f"{v:g}" for v in self.centre_mm)
 
     @property

@@ -83,7 +83,7 @@ def _search_runs(what: PlanningProblem, tests: tuple[Measurement, ...]) -> tuple
 
 
 def _sigma(what: PlanningProblem, run: RunData) -> F1:
-    """Standard uncertainty of each value; fewer points than block means count for more, so that the run tells as much as it will."""
+    """Standard uncertainty of each value; scaled so that few planned points carry as much information as the real block means."""
     tools = what.tools
     if run.kind == "laser":
         return np.hypot(tools.laser_noise_mm / np.sqrt(run.weight_n), tools.floor_mm)

@@ -88,7 +88,7 @@ class Search:
         return sum(self.cost_min(t, tests[:k]) for tests in chosen.values() for k, t in enumerate(tests))
 
     def information(self, chosen: Chosen) -> F2:
-        """Prior and all mountings, shape (size, size)."""
+        """Information of the prior and all mountings together, shape (size, size)."""
         total = np.eye(self.what.size)
         for tests in chosen.values():
             total += self.mounting(tests)

@@ -196,7 +196,7 @@ def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
 
 
 def _demanded_variance(estimate: ParameterEstimate) -> float:
-    """Factor on the stated variance that the misfit demands: errors that six linear parameters cannot follow are no white noise.
+    """Factor on the stated variance that the misfit demands: errors that six linear parameters cannot follow are not white noise.
 
     Neighbouring residuals of a real machine are alike, so n readings are worth n (1 - r) / (1 + r), r their correlation at lag one (the
     integrated autocorrelation was tried and covers less: the fit has taken the slow part out of the residual). A curvature that cup offset

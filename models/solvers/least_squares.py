@@ -31,7 +31,7 @@ def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
     Raises
     ------
     ValueError
-        Something in the matrix is no finite number.
+        Something in the matrix is not a finite number.
     """
     try:
         u, s, vt = scipy.linalg.svd(a, full_matrices=full_matrices, check_finite=False)

@@ -13,9 +13,9 @@ Kind = Literal["bar", "laser"]
 Test = Literal["", "helix", "circle", "diagonal", "linear"]
 
 REJECT_SIGMA = 5.0
-"""A reading farther from the middle of its block than this many robust standard deviations is no part of the block's mean."""
+"""A reading farther from the middle of its block than this many robust standard deviations is not part of the block's mean."""
 LEAST_SPREAD_MM = 1e-4
-"""Resolution of a usual ball-bar: readings that differ by rounding alone are no outliers of each other."""
+"""Resolution of a usual ball-bar: readings that differ by rounding alone are not outliers of each other."""
 
 LEAST_BAR_MM = 1.0
 """No ball-bar is shorter; nearer to the cup than this a position is a mistake, and the direction of the bar means nothing."""
@@ -84,7 +84,7 @@ class RunData:
 
 
 def _check_columns(run: RunData) -> None:
-    """Every column as long as the readings, and nothing in it that is no number."""
+    """Every column as long as the readings, and nothing in it that is not a number."""
     n = run.deviation_mm.size
     shapes = {"deviation_mm": (n,), "axes_mm": (n, 3), "sign": (n, 3), "t_s": (n,), "weight_n": (n,)}
     if n == 0:
@@ -95,7 +95,7 @@ def _check_columns(run: RunData) -> None:
             raise ValueError(f"run {run.label}: {name} has shape {column.shape}, expected {shape}")
         bad = np.flatnonzero(~np.isfinite(column).reshape(n, -1).all(axis=1))
         if bad.size:
-            raise ValueError(f"run {run.label}: {name} is no finite number in {bad.size} of {n} readings, first in reading {bad[0] + 1}")
+            raise ValueError(f"run {run.label}: {name} is not a finite number in {bad.size} of {n} readings, first in reading {bad[0] + 1}")
     if not (run.weight_n > 0).all():
         raise ValueError(f"run {run.label}: every weight_n must be above 0")
 

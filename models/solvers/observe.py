@@ -141,7 +141,7 @@ def _same_tool(a: F1 | None, b: F1 | None) -> bool:
 
 
 def _bent(run: RunData) -> bool:
-    """Whether a tilted mirror shows: the path is no straight one, or one that the beam is not meant to follow.
+    """Whether a tilted mirror shows: the path is not a straight one, or one that the beam is not meant to follow.
 
     Judged by the path and not by the beam: one with six digits leaves any diagonal by a micrometre, and a tilt that reads as a scale of
     the run would hide that scale.

@@ -122,7 +122,7 @@ WIDE = Priors(
 ORDER = 10
 BLOCKS = 120
 STRONG, NAMED = 25.0, 5.0
-"""Least gain of log evidence (natural) for which a run is suspected at all; by which a named cause has to be better than none."""
+"""Smallest gain of natural log evidence for a run to be suspected, and for a named cause to be preferred to none."""
 FACTORS = {"um": 1e-3, "inch": 25.4, "sign": -1.0, "mm_as_um": 1e3, "mm_as_inch": 1.0 / 25.4}
 """Factors that correct deviations written in another unit or with the other sign."""
 SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}

@@ -109,7 +109,7 @@ class CampaignTrials:
         return np.asarray(theta)
 
     def _others(self) -> list[tuple[str, F2]]:
-        """Sources that are no noise of readings, each as a factor (inputs, 3 m) of the results."""
+        """Sources that are not noise of readings, each as a factor (inputs, 3 m) of the results."""
         b, out = self.predict_per_unit, []
         for s in self.sources.sources:
             if s.name in (*READINGS, "repeatability"):

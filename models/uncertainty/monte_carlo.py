@@ -84,7 +84,7 @@ def adaptive(
     Raises
     ------
     ValueError
-        ``digits`` is neither 1 nor 2, the share is none, or fewer than one batch is allowed.
+        ``digits`` is neither 1 nor 2, the share is not between 0 and 1, or fewer than one batch is allowed.
     """
     batch = batch_size(probability)
     if digits not in (1, 2) or not 0.0 < share <= 1.0:

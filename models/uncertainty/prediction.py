@@ -304,7 +304,7 @@ def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest
     ----------
     prediction : Prediction
         In the frame that the correction is made in; rigid-free for a map (`abbe.models.geometry.volume`), or a displacement of the whole
-        workpiece, which is no error, decides.
+        workpiece, which is not an error, decides.
     k : float, optional
         Coverage factor; default: that of the prediction's own probability and degrees of freedom.
     smallest_mm : float

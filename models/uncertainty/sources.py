@@ -162,7 +162,7 @@ def prior_factor(root: F2) -> F2:
 def order_source(solution: JointSolution, r: Response, orders_above: int) -> tuple[tuple[Term, ...], F2]:
     """Terms of the solution and of the orders above it, and the factor of what the latter do to all of them, shape (P, q).
 
-    The prediction stays the one of the chosen order, so what the residuals ask of the higher orders is no correction: it counts as one more
+    The prediction stays that of the chosen order, so what the residuals ask of the higher orders is not a correction: it counts as one more
     column, in full.
     """
     above = omitted_terms(max((t.order for t in solution.terms), default=0), orders_above)

@@ -2,7 +2,7 @@
 
 A correction removes the estimate, not the truth: the uncertainty stays in the machine. With coefficients theta of the truth,
 estimate t and a correction c made from the estimate, theta - c is normal about t - c with the whole covariance of the solution. Every
-figure is taken from draws of it (GUM Supplement 1), because the largest error, the range of a diagonal and an rms are no linear functions,
+figure is taken from draws of it (GUM Supplement 1), because the largest error, the range of a diagonal and an rms are not linear functions,
 and near zero their linear uncertainty is wrong. Before and after come from the same draws, so their difference has its own uncertainty. A
 figure that is never negative is expected larger than that of the mean map alone: the unknown part adds to it.
 """

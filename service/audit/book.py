@@ -250,7 +250,7 @@ def read_key(file: Path, *, make: bool) -> bytes:
     except OSError as error:
         raise refusal(file, error) from None
     if len(key) != KEY_BYTES:
-        raise AuditBroken(f"{file} is no key of an audit", "bring it back from the backup")
+        raise AuditBroken(f"{file} is not a key of an audit", "bring it back from the backup")
     return key
 
 

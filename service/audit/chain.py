@@ -74,7 +74,7 @@ def _digest_or_none(record: AuditEvent) -> str | None:
 
 
 def _anchor_faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
-    """Faults against the kept heads: the database must hold each of them."""
+    """Faults found by comparing the records with the heads kept outside of the database."""
     found, stored = [], {record.id: record.digest for record in records}
     for anchor in anchors:
         if not hmac.compare_digest(anchor.mac, mac_of(key, f"{anchor.id} {anchor.digest}")):

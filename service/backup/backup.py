@@ -117,7 +117,7 @@ def read_backup(folder: Path) -> Backup:
     Raises
     ------
     BackupRefused
-        The folder is no backup, or one of a newer version; or names a file that is missing, additional or changed.
+        The folder is not a backup, or one of a newer version; or names a file that is missing, additional or changed.
     """
     try:
         doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
@@ -127,7 +127,7 @@ def read_backup(folder: Path) -> Backup:
         wanted, found = listed.files, file_list(folder)
         wrong = sorted(name for name in wanted.keys() | found.keys() if name not in wanted or wanted[name] != found.get(name))
     except FileNotFoundError:
-        raise BackupRefused(f"{folder} is no backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
+        raise BackupRefused(f"{folder} is not a backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
     except OSError as err:
         raise BackupRefused(f"{folder} cannot be read: {err.strerror}", "look at its rights and at the disk") from None
     except (ValueError, AttributeError, Unusable) as err:

@@ -42,7 +42,7 @@ class CampaignIssue:
 
 
 FASTEST = 0.2
-"""Least ratio of a run's duration to path length over feed: the programmed feed is the upper limit."""
+"""Smallest possible ratio of a run's duration to path length over feed: the programmed feed is the upper limit."""
 SLOWEST = {"ballbar": 10.0, "laser": 200.0}
 """Largest ratio of a run's duration to path length over feed: a ball-bar run moves steadily, a laser run stops at every point."""
 OVERLAP = 0.1
@@ -299,7 +299,7 @@ def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> 
         row = int(np.argmax(size)) + 1
         return [
             CampaignIssue(
-                label, f"{y[row - 1]:.3g} mm in row {row} is no reading", "mark it with valid 0, or write deviation_mm in mm", True
+                label, f"{y[row - 1]:.3g} mm in row {row} is not a reading", "mark it with valid 0, or write deviation_mm in mm", True
             )
         ]
     if count > HALF * of:

@@ -23,9 +23,9 @@ STILL_MM = 1e-6
 def lines_of(made: FoundThinning) -> tuple[str, ...]:
     """Lines about the decimation: what was done, what it hides, and the remedy."""
     each, means = made.readings_per_value, made.how == "means"
-    became = f"every {each} of them became one mean" if means else f"of every {each} one was looked at, as it was read"
-    done = f"{made.readings} ball-bar readings are more than are searched one by one: {became}, {made.kept} values in all"
-    hidden = f"what that hides could not be seen, which does not say that it is absent: {'; '.join(made.not_seen)}"
+    became = f"every {each} of them were averaged" if means else f"one of every {each} was used, unaveraged"
+    done = f"{made.readings} ball-bar readings are too many to search one by one: {became}, {made.kept} values in all"
+    hidden = f"effects that this hides may be present all the same: {'; '.join(made.not_seen)}"
     return (done, hidden, REMEDY) if means else (done, hidden)
 
 
@@ -38,11 +38,11 @@ def _not_seen(*, each: int, means: bool, interval_s: float, turning: int) -> lis
     if means:
         # A spike as long as one interval usually spans two values; one as long as two intervals fills a value wherever it begins.
         spikes = f"a spike at a reversal keeps its height from {2.0 * interval_s:.2g} s on, one of a single reading is 1/{each} as high"
-        sides = f"in {turning} means an axis turns round, and both sides of its lost motion are mixed there"
+        sides = f"in {turning} means an axis reverses, and both sides of its lost motion are mixed there"
         fast = f"vibration above {highest_hz:.2g} Hz is averaged down, or looks like a slower one"
     else:
         spikes = f"a spike at a reversal that lasts less than {interval_s:.2g} s may lie between two values"
-        sides = f"{turning} values stand for readings in which an axis turns round; how it loses motion there is not seen"
+        sides = f"{turning} values stand for readings in which an axis reverses; its lost motion there is not seen"
         fast = f"vibration above {highest_hz:.2g} Hz looks like a slower one, or like noise"
     return [spikes, sides, fast]
 

@@ -78,9 +78,9 @@ class BarBreaks:
 
 
 MOST_TRIES = 5
-"""Most consecutive suspensions or mountings of a test without a new point; then a person has to look."""
+"""Maximum number of consecutive suspensions or mountings of a test without a new point; after that a person has to look."""
 LEAST_GAIN_MM = 1.0
-"""Least extension of a path's read length that counts as a gain."""
+"""Smallest increase of the length read of a path that counts as progress."""
 Confirm = Callable[[str], Awaitable[bool]]
 
 

@@ -91,7 +91,7 @@ def read_instruments(path: Path | None) -> Instruments:
 def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[str, ...]]:
     """Return the instruments that a machine can use, and messages about those left out.
 
-    A machine file that names a ball-bar or a laser under ``[devices]`` has no other; one that names neither is planned with all.
+    A machine file with a ball-bar or a laser under ``[devices]`` can use only these; with neither, all instruments are planned.
 
     Raises
     ------

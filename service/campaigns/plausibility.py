@@ -97,14 +97,16 @@ def _strokes(config: MachineFile) -> list[str]:
     axis, longest = max(lengths.items(), key=lambda pair: pair[1])
     if longest < SMALL_MM and not config.short_strokes:
         return [f"the longest axis has {longest:g} mm: are the strokes inches? (stroke_mm; short_strokes = true if they are not)"]
-    return [f"stroke_mm.{axis} is {longest:g} mm long: is it meant?"] if longest > LARGE_MM else []
+    return [f"stroke_mm.{axis} is {longest:g} mm long: is that intended?"] if longest > LARGE_MM else []
 
 
 def _window(config: MachineFile) -> list[str]:
     low, high = config.limits.temperature_c
     if low >= ROOM_C[0] and high <= ROOM_C[1]:
         return []
-    return [f"limits.temperature_c is {low:g} to {high:g} degrees C: is it meant? a table holds at the temperature that it was measured at"]
+    return [
+        f"limits.temperature_c is {low:g} to {high:g} degrees C: is that intended? a table holds at the temperature that it was measured at"
+    ]
 
 
 def _far(site: Site, today: date) -> list[str]:

@@ -146,5 +146,5 @@ class Ingest:
         except OSError as error:
             raise CaptureFault(f"the segment cannot be read back: {error.strerror}", "look at the disk") from error
         if found is None:
-            raise CaptureFault("the segment reads back otherwise than it was written", "look at the disk")
+            raise CaptureFault("the segment does not read back as it was written", "look at the disk")
         return found[0]

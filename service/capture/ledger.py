@@ -209,7 +209,7 @@ class Drafter:
             self.ledger.add_gap(gap_of(record))
 
     def lost(self, cause: str, last: int | None, after_us: int | None, stream: int | None = None) -> Record:
-        """Return the record of a gap from the next expected number on, in the current stream or a later one without drafts."""
+        """Return the record of a gap that begins at the next expected number, in the current stream or in a later one."""
         at = self._stream if stream in (None, self._stream.number) else _OpenStream(int(stream or 0))
         if last is not None and last < at.next_seq:  # the numbers went back: the end is unknown
             last = None

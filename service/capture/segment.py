@@ -159,7 +159,7 @@ class Segment:
             Any other error, including no room at the sync. The segment accepts nothing more.
         """
         if self.dead:
-            raise CaptureFault(f"{self.path}: an earlier error of the disk ended this file")
+            raise CaptureFault(f"{self.path}: a disk error ended this file earlier")
         head, at, pieces, places = self.head, self.size, [], []
         for record in records:
             encoded = encode(replace(record, previous=head))
@@ -329,7 +329,7 @@ def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Bytes between good records that are no record: flipped bits, or a lost sector."""
+    """Bytes between good records that are not a record: flipped bits, or a lost sector."""
 
     offset: int
     length: int

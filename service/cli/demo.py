@@ -108,7 +108,7 @@ def _folder(keep: Path | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        why = "it is no folder" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+        why = "it is not a folder" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
         raise ConfigError(f"{folder} cannot hold the demonstration: {why}", "name another folder with --keep") from None
     return folder
 

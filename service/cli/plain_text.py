@@ -53,7 +53,7 @@ def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
         raise error
     out = []
     for one in error.object[error.start : error.end]:
-        if 0xDC80 <= ord(one) <= 0xDCFF:  # a byte of a file name that is no text: show its escape
+        if 0xDC80 <= ord(one) <= 0xDCFF:  # a byte of a file name that is not text: show its escape
             out.append(f"\\x{ord(one) - 0xDC00:02x}")
             continue
         text = PLAIN.get(one, "?")

@@ -64,7 +64,7 @@ def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None,
         if target is None:
             continue
         if target.is_dir() or not target.parent.is_dir():
-            wrong = "is a folder" if target.is_dir() else f"cannot be written: {target.parent} is no folder"
+            wrong = "is a folder" if target.is_dir() else f"cannot be written: {target.parent} is not a folder"
             raise ConfigError(f"{target}: {wrong}", "give the name of a file in a folder that exists")
         if target.resolve() in taken:
             raise ConfigError(f"{target}: would overwrite a file that this command reads or writes", "give another name")

@@ -336,7 +336,7 @@ async def _two_banks(t: Trial) -> bool:
     marked = image[:begin] + bytes(b ^ 0x5A for b in number) + image[end:]
     why = await t.refusal_of(c.write_bank(1 - now.active_bank, marked))
     if why:
-        t.fail("two_banks", f"the bank at rest takes no writes: {why}")
+        t.fail("two_banks", f"the inactive bank refuses writes: {why}")
         return False
     apart = await c.read_bank(1 - now.active_bank, len(image)) == marked and await c.read_bank(now.active_bank, len(image)) == image
     t.judge(

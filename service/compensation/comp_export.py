@@ -76,7 +76,7 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
     Raises
     ------
     FileFormatError
-        The file cannot be read or is no JSON object.
+        The file cannot be read or is not a JSON object.
     """
     if source.isdigit():
         return stored(int(source))
@@ -298,7 +298,7 @@ def read_files(path: Path) -> tuple[TextFile, ...]:
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read: {error.strerror}", "give a file or a folder") from None
     except UnicodeDecodeError:
-        raise FileFormatError(f"{path}: is no text", "give the table's file") from None
+        raise FileFormatError(f"{path}: is not text", "give the table's file") from None
     if not out:
         raise FileFormatError(f"{path}: the folder is empty", "give a file or a folder of files")
     return tuple(out)

@@ -93,7 +93,7 @@ async def correct(context: PushContext, campaign: str | int, before: list[Run], 
     gathered = await gather(context.session.controller, store, site, campaign)
     check_same_table(gathered.base, before)
     check_temperature(site, gathered.runs)
-    figures(before)  # before anything is written: runs that are no verification are refused now
+    figures(before)  # before anything is written: runs that are not a verification are refused now
     made = await make(store, site, gathered, progress=context.progress, agree=lambda promised: check_promise(promised, site.limits))
     return await _push(context, await admit(context, made.number, control), made, before)
 

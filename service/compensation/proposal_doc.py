@@ -154,7 +154,7 @@ def _plain(value: Any) -> Any:
 
 
 def proposed_from(doc: Doc) -> Proposed:
-    """Read a document that `doc_of` wrote; raises ValueError if it is none."""
+    """Read a document that `doc_of` wrote; raises ValueError for any other document."""
     return _PROPOSED.validate_python(doc)
 
 
@@ -176,6 +176,6 @@ def load(store: Store, number: int) -> Proposed:
     except (TypeError, ValueError):
         proposed = None
     if proposed is None or (record.machine, record.solution_id) != (proposed.candidate.machine, proposed.solution_id):
-        raise StoreError(f"proposal {number} in {store.url} was changed after it was stored: its content is not that of its digest",
+        raise StoreError(f"proposal {number} in {store.url} was changed after it was stored: its content does not match its digest",
                          "propose again; nothing was written to the controller")  # fmt: skip
     return proposed

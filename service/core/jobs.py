@@ -38,7 +38,7 @@ ASKING = "asking"
 
 
 def by_hand(recipe: str) -> Schedule:
-    """Return the schedule of a job that a person starts: at once."""
+    """Return the schedule of a job that a person starts; it runs immediately."""
     return Schedule(BY_HAND, "", "UTC", recipe)
 
 

@@ -93,7 +93,7 @@ def _shared(folder: Path) -> Path:
         folder.mkdir()
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode):
-        raise UnsafeToMove(f"{folder} is no folder, so it is unknown whether the machine is in use", "remove it")
+        raise UnsafeToMove(f"{folder} is not a folder, so it is unknown whether the machine is in use", "remove it")
     if found.st_mode & SHARED != SHARED:
         if found.st_uid != os.geteuid():
             raise UnsafeToMove(
@@ -151,7 +151,7 @@ def _plain(handle: int) -> int:
     if stat.S_ISREG(os.fstat(handle).st_mode):
         return handle
     os.close(handle)
-    raise OSError(errno.EINVAL, "it is no plain file")
+    raise OSError(errno.EINVAL, "it is not a plain file")
 
 
 def _remedy(folder: Path) -> str:

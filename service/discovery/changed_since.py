@@ -1,6 +1,6 @@
 """Changes of a machine since its last solution: the part of a discovery that names a drift.
 
-A table activated in between is no change of the machine. Its effect is subtracted from the newer readings and the effect of the older table
+A table activated in between does not change the machine. Its effect is subtracted from the newer readings and the effect of the older table
 added, so that both describe the same machine.
 """
 

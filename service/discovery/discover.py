@@ -148,7 +148,7 @@ def _checked(campaign: Campaign) -> list[str]:
     flags = check_files(campaign.site.doc, used)
     flags += copy_issues([*used, *(r for r in campaign.runs if r.role == "holdout")])
     refuse(flags)
-    # Wrong units, signs and axes are refused. A run that merely does not fit the others is no flag here: the search looks for the reason.
+    # Wrong units, signs and axes are refused. A run that only does not fit the others is not a flag here: the search looks for the reason.
     refuse(check_readings(campaign.site.machine, [run_data(r, blocks=ALL_READINGS) for r in used]))
     return [f.line for f in flags]
 

@@ -23,13 +23,13 @@ FOLLOWS: dict[State | None, frozenset[State]] = {
 }
 ENDS = frozenset({"EXPLAINED", "UNEXPLAINED"})
 VISIBLE = 1.05
-"""Least gap of the judging runs over their noise floor before the fit; below it the effect does not show and they cannot judge."""
+"""Smallest gap of the judging runs over their noise floor before the fit; below it the effect does not show and they cannot judge."""
 CLOSED = 0.5
 """Share of the gap (`GapUm.closed`) that must close on the judging runs. A wrong effect closes it on the fitted runs only."""
 LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise."""
 WORSE = 1.05
-"""Largest ratio of the gap after to the gap before in any role: a diverged solution is no finding."""
+"""Largest ratio of the gap after to the gap before in any role: a diverged solution is not a finding."""
 NEAR = 3.0
 """Lead in evidence (natural logarithm) over every rival that an effect needs for the model book: twenty times as likely."""
 NOT_CONFIRMED = "runs that judge do not agree better with the effect than without it"
@@ -64,7 +64,7 @@ def ending(finding: Finding, judged: Judgement) -> DiscoveryStep:
 
 
 def not_entered(finding: Finding, judged: Judgement) -> str | None:
-    """Why a finding stays out of the model book; None if it is proved and has no close rival, so that `entering` is added."""
+    """Reason to keep a finding out of the model book. None: it is proved and has no close rival, so its `entering` effects are added."""
     if judged.proved is not True:
         return f"it is not proved, {judged.rule}"
     if finding.beside:

@@ -99,7 +99,7 @@ def _continues(old: DiscoveryRecord, before: StoredJournal) -> bool:
 
 
 def _is_valid(store: Store, old: DiscoveryRecord, machine: str, now: int | None) -> bool:
-    """Whether the current model version ``now`` does not outdate a search."""
+    """Whether a search is still valid for the current model version ``now``."""
     origin = {m.version: m.discovery_id for m in store.models.all(machine)}
     if old.id in _chain(store, None if now is None else origin.get(now)):
         return True

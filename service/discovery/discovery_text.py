@@ -202,7 +202,7 @@ def next_of(finding: Finding) -> list[str]:
     if finding.verdict == "unknown":
         there = "; ".join(location_lines(finding.location))
         what = f"repeat it where it lives ({there})" if there else "repeat the whole campaign: it could not be located"
-        return [f"measure next: {what}, and once more later: what comes back belongs to the machine, what does not to that session"]
+        return [f"measure next: {what}, and repeat it later: what recurs belongs to the machine, what does not belonged to that session"]
     if finding.verdict == "none":
         again = "measure next: repeat the runs that were never fitted and do not agree, some of them with the role identify"
         return ([again] if disagreeing(finding) else []) + unseen_lines(finding)
@@ -225,7 +225,7 @@ def unseen_lines(finding: Finding) -> list[str]:
 
 def location_lines(location: Localization) -> list[str]:
     """The location of an effect, one line per known property."""
-    axes = () if len(location.axes) == len(AXES) else location.axes  # all three axes are no information
+    axes = () if len(location.axes) == len(AXES) else location.axes  # all three axes say nothing
     out = [
         f"{label} {', '.join(found[:MANY])}" + (f" and {len(found) - MANY} more" if len(found) > MANY else "")
         for label, some in (("seen in", location.tests), ("axis", axes), ("run", location.runs), ("depends on", location.depends_on))

@@ -43,7 +43,7 @@ def drift_text(store: Store, made: StoredProposal) -> str:
 
 
 def largest_sure(changes: dict[str, tuple[float, float]]) -> str | None:
-    """Name of the largest change of those that exceed their U (k = 2), given value and standard uncertainty; None: none does."""
+    """Name of the largest change that exceeds its U (k = 2), given (change, standard uncertainty) by name; None if none does."""
     sure = {name: abs(change) for name, (change, u) in changes.items() if abs(change) > COVERAGE * u}
     return max(sure, key=lambda name: sure[name], default=None)
 

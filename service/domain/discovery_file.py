@@ -97,7 +97,7 @@ class FoundFitted(FileObject):
 
 
 class FoundThinning(FileObject):
-    """Decimation: long ball-bar runs were searched with fewer values than they have readings; what that hides may be present."""
+    """Decimation: long ball-bar runs were searched with fewer values than readings; effects that this hides may be present."""
 
     readings: int
     kept: int

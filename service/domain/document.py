@@ -12,7 +12,7 @@ from abbe.service.errors import Unusable
 Doc = dict[str, Any]
 """A JSON object."""
 GENESIS = "0" * 64
-"""What the first entry of a hash chain follows, in place of a digest."""
+"""Stands for the digest of the previous entry in the first entry of a hash chain."""
 T = TypeVar("T")
 _adapters: dict[type[Any], TypeAdapter[Any]] = {}
 

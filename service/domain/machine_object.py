@@ -33,7 +33,7 @@ Point = tuple[float, float, float]
 
 
 class FileObject(BaseModel):
-    """Base of everything in an exchange file: unknown keys are kept, numbers are finite, text is no number."""
+    """Base of everything in an exchange file: unknown keys are kept, numbers are finite, text is not a number."""
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True, frozen=True)
 

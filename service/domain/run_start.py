@@ -127,12 +127,12 @@ class RunStart:
 
     @property
     def commanded(self) -> CommandedPath:
-        """The path of a run that has one.
+        """Commanded path of the run.
 
         Raises
         ------
         KeyError
-            The document states none.
+            The run has no path.
         """
         if self.path is None:
             raise KeyError("path")

@@ -74,7 +74,7 @@ class Schedule:
     recipe: Annotated[Name, Field(description="what to measure")] = "quick-check"
     grace_s: Annotated[
         float,
-        Field(ge=1.0, le=86_400.0, description="a slot may start so late; found later, or kept from starting for longer, it is missed"),
+        Field(ge=1.0, le=86_400.0, description="how late a slot may start; after that it counts as missed"),
     ] = 300.0
     every_h: Annotated[
         float, AfterValidator(_interval), Field(le=8784.0, description="instead of cron: interval in hours (1/60 or more)")

@@ -30,7 +30,7 @@ class TableInForce(FileObject):
 
 
 class Inputs(FileObject):
-    """SHA-256 of every run's data by its name, of the machine's geometry, and of all of them with the model; tables in force meanwhile."""
+    """SHA-256 digests of each run's data, of the machine's geometry, and of all inputs with the model; and the tables in force."""
 
     digest: Digest
     machine: Digest = ""

@@ -49,7 +49,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     Raises
     ------
     TableFileError
-        The first line is not two whole numbers, the number of values differs from the stated one, or a value is no number.
+        The first line is not two whole numbers, the number of values differs from the stated one, or a value is not a number.
     """
     return Compensation(tuple(_read_one(f, settings) for f in files))
 
@@ -61,7 +61,7 @@ def _read_one(file: TextFile, settings: FormatSettings) -> AxisTable:
         raise file.wrong(1, "the name does not end in its axis, or the file is empty", "name it cnc-x.tab, cnc-y.tab or cnc-z.tab")
     head = lines[0][1].split()
     if len(head) != 2 or not head[0].isdigit():
-        raise file.wrong(1, f"{lines[0][1]!r} is no heading of version 1 (number of values, travel in counts)")
+        raise file.wrong(1, f"{lines[0][1]!r} is not a heading of version 1 (number of values, travel in counts)")
     count, travel = int(head[0]), file.number(1, head[1], "the travel")
     values = np.array([file.number(line, text.strip(), "the correction") for line, text in lines[1:]])
     if values.size != count or count < 2 or travel == 0.0:

@@ -72,7 +72,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     nx, ny, nz = (a.size for a in axes)
     wanted = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
     if table.shape[0] != nx * ny * nz or table.shape[0] < 8 or not np.array_equal(wanted, table[:, 1:4]):
-        raise file.wrong(len(rows) + 1, "the nodes are no complete grid with X fastest")
+        raise file.wrong(len(rows) + 1, "the nodes are not a complete grid with X fastest")
     unit = settings.unit_mm * settings.magnification
     units = table[:, 4:].reshape(nz, ny, nx, 3).transpose(2, 1, 0, 3)
     value = from_file("fanuc-lattice", units * unit, np.zeros(units.shape))

@@ -46,7 +46,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        The table is of another kind, the reference is no point of it, a difference exceeds ``largest_step``, or the points are used up.
+        The table is of another kind, the reference is not a point of it, a difference exceeds ``largest_step``, or the points are used up.
     """
     check_kinds(comp, LIMITS, WHAT)
     if settings.reference_mm is None:

@@ -139,5 +139,5 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
         if name == axis:
             continue
         if name not in PLACES or AXES[PLACES[name][0]] != axis:
-            raise file.wrong(line, f"{name} is no error motion of {axis}")
+            raise file.wrong(line, f"{name} is not an error motion of {axis}")
         curves[name] = AxisCurve(axis, position, -from_file("isg", table[:, k], position))

@@ -144,7 +144,7 @@ def _take(net: _Network, file: TextFile, line: int, text: str) -> None:
     elif cells[:1] == ["net"] and len(cells) > 3:
         net.wired |= {w.partition(".")[0] for w in cells[3:] if w.endswith((".in", ".in0", ".in1", ".out"))} | {cells[2].partition(".")[0]}
     elif cells[:1] != ["loadrt"]:
-        raise file.wrong(line, f"{text.strip()!r} is no line of such a network")
+        raise file.wrong(line, f"{text.strip()!r} is not a line of such a network")
 
 
 def _curve(net: _Network, file: TextFile, name: str) -> AxisCurve:

@@ -119,7 +119,7 @@ def check_size(position_mm: F1, values: F1, limits: FormatLimits, name: str) -> 
         The message names place and size.
     """
     if not np.isfinite(values).all():
-        raise FormatRefused(f"{name}: holds values that are no numbers", f"check the solution; {NOTHING}")
+        raise FormatRefused(f"{name}: holds values that are not numbers", f"check the solution; {NOTHING}")
     k = int(np.argmax(np.abs(values)))
     if abs(values[k]) > limits.size_mm:
         raise FormatRefused(

@@ -74,7 +74,7 @@ def parse(file: TextFile, name: str) -> Assignments:
             continue
         match = _LINE.fullmatch(text.strip())
         if match is None or ended:
-            raise file.wrong(line, f"{text.strip()!r} is no assignment" if not ended else "there is something behind M17")
+            raise file.wrong(line, f"{text.strip()!r} is not an assignment" if not ended else "there is something behind M17")
         key = (match.group(1), tuple(w.strip() for w in match.group(2).split(",")))
         if key in out.value:
             raise file.wrong(line, f"${key[0]}[{','.join(key[1])}] has a second value (first in line {out.line[key]})")
@@ -111,6 +111,6 @@ def step_of(position_mm: F1, name: str) -> float:
     step = round(float(np.ptp(position_mm)) / (position_mm.size - 1), POSITION_DECIMALS)
     if abs(position_mm[0] + step * (position_mm.size - 1) - position_mm[-1]) > 1e-6:
         raise FormatRefused(
-            f"{name}: the step {np.ptp(position_mm) / (position_mm.size - 1)!r} mm is no whole number of nanometres", NOTHING
+            f"{name}: the step {np.ptp(position_mm) / (position_mm.size - 1)!r} mm is not a whole number of nanometres", NOTHING
         )
     return step

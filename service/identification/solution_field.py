@@ -94,7 +94,7 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
     """
     solution = stored_solution(record.doc, record.id)
     if solution.prediction is None:
-        raise Unusable(f"solution {record.id} does not hold its covariance: a version before it was kept stored it", "solve again")
+        raise Unusable(f"solution {record.id} has no covariance: an older version of Abbe stored it", "solve again")
     terms, coefficients, covariance = stored_prediction(solution.prediction)
     machine = machine_from_doc(store.machines.get(store.campaigns.find(record.campaign_id).machine_id).doc)
     motions = solution.motions

@@ -66,7 +66,7 @@ class Verdict:
 
     @property
     def sign(self) -> str:
-        """``ok``, ``open`` or ``bad``."""
+        """Sign of the verdict: ``ok``, ``open`` or ``bad``."""
         return ("bad", "open", "ok")[WORDS.index(self.word)]
 
 

@@ -69,7 +69,7 @@ def judged(config: MachineFile, runs: list[Run], campaign: str, started: datetim
     Raises
     ------
     MeasurementFault
-        The runs are no complete check: a body diagonal is missing, or a run was not measured to its end.
+        The runs are not a complete check: a body diagonal is missing, or a run was not measured to its end.
     """
     rows = figure_rows(figures(runs))
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}

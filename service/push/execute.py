@@ -180,7 +180,7 @@ class ControllerPort:
             case OperationKind.ACTIVATE:
                 await self._c.activate(op.bank, expect_crc=op.crc, expect_gen=op.gen, owner=op.owner)
             case _:
-                raise AssertionError(f"{op.kind} is no operation on a controller")
+                raise AssertionError(f"{op.kind} is not an operation on a controller")
 
     async def _ask(self, kind: OperationKind, journal: Journal) -> Outcome:
         if kind is OperationKind.VALIDATE:

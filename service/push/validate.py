@@ -324,7 +324,7 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
     if abs(v[0]) > ZERO_MM:
         yield f"REFERENCE: {v[0] * 1e3:.2f} µm at the reference instead of 0"
     if max(abs(x / lsb_mm - round(x / lsb_mm)) for x in v) > WHOLE:
-        yield "ROUNDING: values are no whole units of the table; quantise it first"
+        yield "ROUNDING: values are not whole units of the table; quantise it first"
     if column.reverse_mm:
         yield from _reverse(column)
 

@@ -73,7 +73,7 @@ class Comparison:
     given: bool = False
 
     def __post_init__(self) -> None:
-        """Check that a number without computation has a reason, and a computed one an origin and is no input."""
+        """Check that a number without computation has a reason, and a computed one an origin and is not an input."""
         name = f"{self.location}: {self.quantity}"
         if self.computed is None and not self.why:
             raise ValueError(f"{name} is not computed and has no reason")

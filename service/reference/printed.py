@@ -54,7 +54,7 @@ class Printed:
         """Power of ten of the last printed digit."""
         exponent = Decimal(self.last or self.text).as_tuple().exponent
         if not isinstance(exponent, int):
-            raise ValueError(f"{self.text!r} is no finite number")
+            raise ValueError(f"{self.text!r} is not a finite number")
         return exponent
 
     @property

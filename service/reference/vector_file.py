@@ -71,7 +71,7 @@ class VectorCase:
         Raises
         ------
         FileFormatError
-            It is no object, or an empty one, which would skip the comparison silently.
+            It is not an object, or an empty one, which would skip the comparison silently.
         """
         if not isinstance(self.value, dict):
             raise FileFormatError(f"{self.label}: expected an object, got {type(self.value).__name__}", LAYOUT)
@@ -90,7 +90,7 @@ class VectorCase:
         Raises
         ------
         FileFormatError
-            It is no object, or one of the keys is missing or unknown.
+            It is not an object, or one of the keys is missing or unknown.
         """
         unknown = [key for key in self.keys() if key not in names]
         if unknown:
@@ -104,7 +104,7 @@ class VectorCase:
         Raises
         ------
         FileFormatError
-            It is no list, or (unless ``or_none``) an empty one, which would skip the comparison silently.
+            It is not a list, or (unless ``or_none``) an empty one, which would skip the comparison silently.
         """
         if not isinstance(self.value, list):
             raise FileFormatError(f"{self.label}: expected a list, got {type(self.value).__name__}", LAYOUT)
@@ -141,7 +141,7 @@ class VectorCase:
         Raises
         ------
         FileFormatError
-            The list is missing, empty, ragged, of another shape, or holds something that is no finite number.
+            The list is missing, empty, ragged, of another shape, or holds something that is not a finite number.
         """
         part = self.at(*keys) if keys else self
         for path, value in _leaves(part.value, part.path):

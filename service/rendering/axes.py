@@ -181,7 +181,7 @@ class PanelGrid:
         return (self.WIDTH - self.LEFT - 10.0 - (count - 1) * self.gap) / count
 
     def panel(self, row: str, column: str, x_range: tuple[float, float]) -> Panel:
-        """Panel of a cell."""
+        """The panel to draw in, for the cell in this row and column."""
         left = self.LEFT + self.columns.index(column) * (self._width + self.gap)
         top = self.top + self.rows.index(row) * (self.cell_height + self.gap)
         return Panel(left, top, self._width, self.cell_height, x_range, self.y_range)

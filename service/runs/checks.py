@@ -44,7 +44,7 @@ def strict_json(text: str, path: Path, *, finite: bool = True) -> Any:
     Raises
     ------
     FileFormatError
-        The text is no JSON, repeats a key in one object, is nested too deeply, has an integer of more than 308 digits, or (``finite``) a
+        The text is not JSON, repeats a key in one object, is nested too deeply, has an integer of more than 308 digits, or (``finite``) a
         number that is not finite.
     """
     strict: dict[str, Any] = {"parse_constant": _refuse, "parse_float": _finite} if finite else {}

@@ -18,12 +18,12 @@ from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.runs.helix_axis import about_axis, circle_axis, helix_axis
 
 LEAST = 0.9
-"""Least share of the commanded path for a judgement: the missing part may contain the largest deviation."""
+"""Smallest share of the commanded path that must be read for a judgement: the missing part may contain the largest deviation."""
 COMPLETE = "complete"
 GAP_MM, GAP_SAMPLES = 5.0, 10.0
 """Two valid readings farther apart than both limits leave the path between them unread."""
 LEAST_A_TURN = 8
-"""Least number of readings per turn; with fewer, this many count as one turn that was read."""
+"""Minimum number of readings per turn; with fewer, this many count as one turn that was read."""
 GAP_STEPS, GAP_SHARE = 3.0, 0.15
 """For a file, whose commanded path is unknown: two neighbours farther apart than this many median steps, and than this share of a laser run
 or of a turn, leave the path between them unread."""

@@ -12,7 +12,7 @@ from abbe.service.errors import MeasurementFault
 STRAIGHT = 0.8
 """Along its axis a helix advances: least ratio of net to total travel."""
 ROUND = 0.5
-"""Across its axis a helix goes round: largest ratio of net to total travel. Less than a turn is no helix."""
+"""Across its axis a helix goes round: largest ratio of net to total travel. Less than a turn is not a helix."""
 
 
 def helix_axis(stated: str, at_mm: F2) -> int | None:

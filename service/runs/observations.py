@@ -81,7 +81,7 @@ def _went_beyond(run: Run, q_mm: F2, way: F1, turned: np.ndarray[tuple[int], np.
 BLOCKS = 400
 """Largest number of values per ball-bar run in a solution: averaging reduces noise and keeps smooth errors."""
 LEAST = 10
-"""Least number of valid readings of a run."""
+"""Minimum number of valid readings of a run."""
 TESTS: dict[str, Test] = {"ballbar_helix": "helix", "ballbar_circle": "circle", "laser_diagonal": "diagonal", "laser_linear": "linear"}
 """Tests of run-format.md 3; plain diagonals are laser_diagonal without an order."""
 

@@ -67,6 +67,6 @@ def along_mm(start: RunStart, end: RunEnd, columns: Columns) -> F1:
 
 
 def counted_columns(record: RunRecord, columns: Columns, to_mm: float) -> Columns:
-    """The columns of an interrupted run before ``to_mm`` on the whole path."""
+    """The columns of an interrupted run that count: those before position ``to_mm`` on the whole path."""
     start = record.start
     return columns.rows(start.commanded.offset_mm + along_mm(start, record.end, columns) < to_mm)

@@ -171,7 +171,7 @@ class AlarmManager(RetryingStore):
         await self.line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
 
     def _check_again(self, alarms: Sequence[Alarm]) -> FollowUp | None:
-        """Return the check to repeat after a kept push: the check that raised the alarm, once, with which its trend starts anew."""
+        """Return the check to run once after a kept push: the one that raised the alarm. Its trend starts anew with this check."""
         for one in alarms:
             pushed = one.last(AlarmKind.PUSHED)
             schedule = self._schedule_of(one)

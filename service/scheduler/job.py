@@ -28,7 +28,7 @@ log = structlog.get_logger("abbe.job")
 
 T = TypeVar("T")
 FAILURES = (DriverError, AbbeError, OSError, ArithmeticError, ValueError)
-"""Failures that are no defect of this program: devices, the job's own errors, files, numerics
+"""Failures that are not defect of this program: devices, the job's own errors, files, numerics
 (LinAlgError is a ValueError). Anything else ends the service with a traceback, and systemd starts it again."""
 SHUTDOWN_RECORD_S = 1.0
 """How long a job may record its state when the service stops; the service has five seconds for everything."""

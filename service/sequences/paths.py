@@ -194,7 +194,7 @@ class Pump:
         BarOutOfRange, MeasurementFault
             The bar is out of range, or samples are lost.
         StretchDiffers
-            The stretch reads otherwise than before the interruption.
+            The stretch reads differently from before the interruption.
         """
         async for batch in batches:
             await self._recorder.add_bar(batch)

@@ -42,7 +42,7 @@ from abbe.service.sequences.steps import (
 )
 
 LEAD_S, LEAD_MM = 0.5, 5.0
-"""Least time and length of the lead before readings count: the axes reach constant feed and take up their lost motion."""
+"""Minimum time and length of the lead before readings count: the axes reach constant feed and take up their lost motion."""
 SAME_MM = 0.0015
 """Allowed difference of the stretch's median: minutes of drift, but not a displaced cup."""
 STEADY_MM = 0.1
@@ -205,9 +205,9 @@ class StretchComparison:
         self.off_mm = float(np.median(off))
         if abs(self.off_mm) > self._allowed_mm + 3.0 * noise_mm:
             raise StretchDiffers(
-                f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um otherwise than before the break "
+                f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um off its value before the break "
                 f"(allowed: {1e3 * self._allowed_mm:.1f})",
-                "cup or bar was displaced, or the machine has drifted: the path begins again, or is mounted anew",
+                "cup or bar was displaced, or the machine has drifted: the path starts again, or the bar is mounted again",
             )
 
 
@@ -378,7 +378,7 @@ def _from_centre(test: TestPlan) -> tuple[Step, ...]:
 
 
 def anew(test: TestPlan, number: int) -> TestPlan:
-    """Return a test whose set-up carries the number of its mounting in its name."""
+    """Return the test for mounting ``number``: from the second on, the number is appended to the set-up's name."""
     if number == 1:
         return test
     return replace(test, setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})

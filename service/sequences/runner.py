@@ -252,7 +252,7 @@ class Runner:
         off_mm = abs(record["displacement_tenth_nm"] - last["displacement_tenth_nm"]) * MM_PER_COUNT
         if off_mm > REFERENCE_MM:
             raise SetupDisturbed(
-                f"the last point reads {1e3 * off_mm:.1f} um otherwise than before the break (allowed: {1e3 * REFERENCE_MM:.0f})",
+                f"the last point reads {1e3 * off_mm:.1f} um off its value before the break (allowed: {1e3 * REFERENCE_MM:.0f})",
                 "laser or mirror was displaced: the set-up is mounted anew",
             )
         for one in carried:

@@ -42,7 +42,7 @@ def read_key(path: Path) -> Ed25519PrivateKey:
     Raises
     ------
     KeyRefused
-        The file cannot be read, is no Ed25519 key, or is readable by others.
+        The file cannot be read, is not an Ed25519 key, or is readable by others.
     """
     try:
         if os.name == "posix" and path.stat().st_mode & 0o077:

@@ -38,7 +38,7 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
     Raises
     ------
     StoreError
-        The database stays locked, is none, or the disk is full.
+        The database stays locked, the file is not a database, or the disk is full.
     """
     os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
     try:
@@ -100,7 +100,7 @@ def prove_copy(path: Path) -> str:
                 )
             row = copy.execute("SELECT version_num FROM alembic_version").fetchone()
     except sqlite3.Error as err:
-        raise StoreError(f"{path} is no database of Abbe: {err}", "take another backup") from err
+        raise StoreError(f"{path} is not a database of Abbe: {err}", "take another backup") from err
     if row is None:
         raise StoreError(f"{path} has no schema: it was never used", "take another backup")
     return str(row[0])

@@ -50,7 +50,7 @@ class Database:
         Raises
         ------
         StoreError
-            The file cannot be opened, is no database, or belongs to a newer version.
+            The file cannot be opened, is not a database, or belongs to a newer version.
         """
         engine = make_engine(url)
         writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="abbe-store")

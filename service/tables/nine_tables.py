@@ -66,7 +66,7 @@ def check_limits(tables: NineTables, active: NineTables | None, limits: PushLimi
                 before = np.interp(position, active.position_mm[a], active.correction_mm[a][:, i])
             name = f"table of {AXES[i]} over {AXES[a]}"
             if not np.isfinite(values).all():
-                raise TableRefused(f"{name}: holds values that are no numbers", "check the solution; nothing was written")
+                raise TableRefused(f"{name}: holds values that are not numbers", "check the solution; nothing was written")
             if abs(values[0]) > 5e-7:
                 raise TableRefused(f"{name}: not zero at its reference", "shift the table; nothing was written")
             against += [f"{no} ({name})" for no in size_reasons(position.tolist(), values.tolist(), before.tolist(), limits)]

@@ -159,7 +159,7 @@ class People:
             The name or role is invalid, the password is weak, or the name is taken.
         """
         if not NAME.fullmatch(name):
-            raise UserRefused(f"{name!r} is no name of a user", "1 to 64 letters, digits and . _ @ -, beginning with a letter or digit")
+            raise UserRefused(f"{name!r} is not a name of a user", "1 to 64 letters, digits and . _ @ -, beginning with a letter or digit")
         check_new(name, password)
         self._store.people.add(name, role_of(role), self.passwords.hash(password))
 
@@ -262,7 +262,7 @@ class People:
         """
         user = self.get(name)
         if not NAME.fullmatch(title):
-            raise UserRefused(f"{title!r} is no name of a token", "1 to 64 letters, digits and . _ @ -")
+            raise UserRefused(f"{title!r} is not a name of a token", "1 to 64 letters, digits and . _ @ -")
         if not 0 < days <= 3660:
             raise UserRefused(f"{days:g} days is no life of a token", "more than 0, at most 3660")
         beyond = [s for s in scopes if s not in ALLOWED[Role(user.role)]]

@@ -54,7 +54,7 @@ def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
 
 
 def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[AxisTest]]:
-    """Plain diagonals by group: ``body`` or a plane. Step diagonals are no test of ISO 230-6."""
+    """Plain diagonals by group: ``body`` or a plane. Step diagonals are not test of ISO 230-6."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in _open(runs, "laser_diagonal"):
         setup = run.laser
@@ -107,7 +107,7 @@ def _axis(run: Run) -> str:
 
 
 def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTest | None:
-    """Test from readings by position, side and cycle; None if they are no bidirectional test, with the reason in ``refused``."""
+    """Test from readings by position, side and cycle; None if they are not a bidirectional test, with the reason in ``refused``."""
     runs = tuple(r.run_id for r in group)
     try:
         readings = _approaches(name, group)
@@ -139,7 +139,7 @@ def _readings(run: Run, name: str) -> tuple[F1, F1, F1]:
     else:
         along, turned = (axes - start) @ (way / np.linalg.norm(way)), 1.0
     if turned == 0.0 or not np.isfinite(deviation[keep]).all():
-        raise MeasurementFault(f"run {run.run_id}: it is no test along {name}, or a deviation is no number", "leave it out")
+        raise MeasurementFault(f"run {run.run_id}: it is not a test along {name}, or a deviation is not a number", "leave it out")
     sign = run.columns.direction * turned
     return _place(along)[keep], sign[keep], (deviation * turned)[keep]
 
@@ -149,7 +149,7 @@ def _place(along: F1) -> F1:
 
 
 def _turning_points(run: Run, name: str) -> list[float]:
-    """Turning points of recipes with an overrun: they are read but are no target positions."""
+    """Turning points of recipes with an overrun: they are read but are not target positions."""
     setup = run.laser
     if not setup.overrun_mm:
         return []

@@ -74,7 +74,7 @@ def figures(runs: list[Run]) -> VerificationFigures:
     if set(diagonals) != DIAGONALS:
         lost = ", ".join(sorted(DIAGONALS - set(diagonals)))
         raise MeasurementFault(
-            f"these runs are no verification: body diagonal {lost} is missing", "measure the verification campaign again"
+            f"these runs are not a verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
     return VerificationFigures(diagonals, helix, _air_c(runs), frozenset(run.table.crc for run in runs))
 
@@ -90,9 +90,9 @@ def check_before(before: VerificationFigures) -> None:
     Raises
     ------
     TableRefused
-        A figure is no number, or no air temperature is recorded.
+        A figure is not a number, or no air temperature is recorded.
     """
-    what = "" if before.finite else "a figure of it is no number"
+    what = "" if before.finite else "a figure of it is not a number"
     what = what or ("" if before.air_c is not None else "no air temperature was recorded")
     if what:
         raise TableRefused(f"nothing can be compared with the verification before: {what}", "measure it again; nothing was written")
@@ -116,7 +116,7 @@ def incomparable(before: VerificationFigures, after: VerificationFigures, pushed
     ``pushed_crc``: CRC of the new table; all runs of the verification after must have been measured with this table.
     """
     if not (before.finite and after.finite):
-        return "a figure is no number"
+        return "a figure is not a number"
     if pushed_crc is not None and after.tables != {pushed_crc}:
         used = ", ".join(sorted("unrecorded" if crc is None else f"{crc:08X}" for crc in after.tables)) or "unrecorded"
         return f"it was measured with table {used}, brought into force was {pushed_crc:08X}"

@@ -67,7 +67,7 @@ class BallbarDevice:
         self._mounts = 0
         self._pushed = False
         self.too_much: Callable[[F, float, float], F] | None = None
-        """What a hidden effect adds: instants (n,) s, when the bar was hung in, and its nominal length in mm to (n,) mm."""
+        """Hidden effect: error of the readings (n,) mm from times (n,) s, the time when the bar was hung in, and its length in mm."""
         self._noise = generator(draws.seed, STREAM_BAR_NOISE)
         self._taken: list[_Taken] = []
         self._ready: list[Samples] = []

@@ -19,7 +19,7 @@ class CompResult(IntEnum):
 
 
 class BankState(IntEnum):
-    """BANK_STATE."""
+    """State of a bank, as in the register BANK_STATE."""
 
     EMPTY = 0
     WRITING = 1

@@ -102,7 +102,7 @@ class Timetable:
     """
 
     def __init__(self, start_mm: F, blocks: list[tuple[F, float]], start_s: float) -> None:
-        """``blocks``: place (3,) and the seconds that it takes to get there; a rest is its own place again."""
+        """``blocks``: target (3,) and the seconds to reach it; to rest, repeat the present place."""
         self._knots = np.concatenate([[0.0], np.cumsum([seconds for _, seconds in blocks])])
         self._places = np.stack([start_mm, *(place for place, _ in blocks)])
         self._ref_s, self._ref, self._factor = start_s, 0.0, 1.0

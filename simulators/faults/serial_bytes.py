@@ -22,7 +22,7 @@ class Sample:
     status: int
 
     def frame(self) -> bytes:
-        """Its bytes."""
+        """The sample as the bytes of a frame."""
         return encode(SAMPLE, _SAMPLE.pack(self.seq & 0xFFFFFFFF, self.device_us, self.reading_nm, self.status))
 
 
@@ -42,7 +42,7 @@ def cut(data: bytes) -> list[bytes]:
 
 
 def garbage(kind: str, size: int, draw: random.Random) -> bytes:
-    """``size`` bytes that are no frame: ``random``, all ``ones``, ``sync`` patterns, or a ``header`` that promises the longest payload."""
+    """``size`` bytes that are not a frame: ``random``, all ``ones``, ``sync`` bytes or a ``header`` that announces the longest payload."""
     if kind == "random":
         return draw.randbytes(size)
     if kind == "ones":

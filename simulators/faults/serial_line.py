@@ -61,7 +61,7 @@ def _level(line: list[int], at: float) -> int:
 
 
 Spoil = Callable[[bytes], Iterable[bytes]]
-"""Honest bytes to the pieces that arrive, in order; every piece is written by itself."""
+"""Turns undamaged bytes into the pieces that arrive, in order; every piece is written separately."""
 
 
 _BAUD = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}

@@ -172,7 +172,7 @@ def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: li
 
 
 def where(e: Hidden, setting: Setting) -> dict[str, object]:
-    """Where an effect outside of the catalogue lives."""
+    """Axis, time or place to which an effect outside of the catalogue is confined."""
     p = e.parameters
     if e.name in ("clamp_slip", "encoder_count_loss"):
         axis: dict[str, object] = {"axis": e.key} if e.key else {}

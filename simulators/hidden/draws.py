@@ -15,7 +15,7 @@ from abbe.simulators.truth.machine import Geometry, Machine
 KINDS = {"single": 75, "double": 30, "null": 50, "unknown": 18}
 PLAN_WEIGHTS = {"full": 88, "one_way": 20, "minimal": 18, "one_radius": 16, "ballbar": 12, "one_feed": 11, "laser": 8}
 MOTIONS = (0.22, 0.55)
-"""Error motions of these machines as parts of those that the whole-machine scenarios draw."""
+"""Size of the error motions, smallest and largest, as a fraction of those in the whole-machine scenarios."""
 TERMS = ("setup_centre_offset", "bar_length_error", "mirror_tilt")
 CHAINS: dict[str, tuple[float, dict[str, tuple[float, float, float]], str]] = {
     "w-X-b-Y-Z-t": (700.0, {"X": (350.0, 250.0, -150.0), "Y": (0.0, 0.0, 260.0), "Z": (0.0, 0.0, 260.0)}, "Y"),

@@ -61,7 +61,7 @@ def problem(e: Hidden) -> str | None:
     try:
         probe.displacement(np.array([0.0, 1.0]), np.array([[1.0, 2.0, 3.0], [2.0, 3.0, 4.0]]))
     except (KeyError, IndexError, ValueError):
-        return f"hidden.key: {e.key!r} is no key of {e.name}"
+        return f"hidden.key: {e.key!r} is not a key of {e.name}"
     return None
 
 
@@ -82,7 +82,7 @@ class Live:
         self._carriage_mm: float | None = None
 
     def displacement(self, times_s: F, driven_mm: F) -> F:
-        """Where the effect moves the tool at n later instants with the drives at (n, 3) mm: (n, 3) mm."""
+        """Displacement of the tool by the effect, (n, 3) mm, at n later times with the drives at (n, 3) mm."""
         if self.effect.name not in MOVES:
             return np.zeros(driven_mm.shape)
         track = self._track(times_s, driven_mm)

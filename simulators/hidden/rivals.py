@@ -85,7 +85,7 @@ def _fraction(track: Track, axis: int) -> F:
 
 
 def traces(fitted: FittedRuns) -> Iterator[tuple[str, F]]:
-    """Label and columns of one trace of every named effect that is no part of the present model; several traces share a label."""
+    """Label and columns of one trace of every named effect that is not part of the present model; several traces share a label."""
     low, high = fitted.runs[0].track.low_mm, fitted.runs[0].track.high_mm
     for a, axis in enumerate(AXES):
         yield from _drive(fitted, a, axis)

@@ -86,7 +86,7 @@ def straightness(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("positioning_nonlinear")
 def positioning_nonlinear(e: Hidden, track: Track, out: Bend) -> None:
-    """An axis' scale is no straight line: strength um rms over the stroke."""
+    """An axis' scale is not a straight line: strength um rms over the stroke."""
     out.drive[:, e.axis] = e["strength"] * UM * curve(e, track)
 
 

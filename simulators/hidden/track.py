@@ -68,7 +68,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """What the motion so far tells about an axis at n instants: the arrays of `Track` with these names."""
+    """State of an axis at n times, from its motion up to each of them: the arrays that `Track` has under the same names."""
 
     sign: F
     since_mm: F

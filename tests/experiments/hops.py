@@ -76,7 +76,7 @@ class Hops:
 
 
 def _loading(frame: FrameType) -> bool:
-    """Whether a module is being loaded: what it calls for that is no hop of the command."""
+    """Whether a module is being loaded: what it calls for that is not a hop of the command."""
     up: FrameType | None = frame
     while up is not None:
         if up.f_code.co_name == "<module>" and not up.f_code.co_filename.endswith("hops.py") and up.f_globals.get("__name__") != "__main__":

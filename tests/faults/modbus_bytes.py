@@ -29,7 +29,7 @@ def reply(registers: tuple[int, ...], *, rtu: bool) -> bytes:
 
 
 def taken(sent: bytes, heard: bytes, *, rtu: bool) -> tuple[int, ...] | None:
-    """The registers, None as long as (or because) it is no answer."""
+    """The registers, None as long as (or because) it is not an answer."""
     if rtu_mismatch(sent, heard) if rtu else tcp_mismatch(sent, heard):
         return None
     try:

@@ -153,7 +153,7 @@ async def test_m5_slow_is_not_wrong():
         if name == "motion command" and how != "always":
             fault = dataclasses.replace(fault, at=2)
         async with opened(kind.device, timeout_s=timeout_s) as rig:
-            quiet = {"A": "slow within its deadline is no fault"} if float(factor) < 1 else {}
+            quiet = {"A": "slow within its deadline is not a fault"} if float(factor) < 1 else {}
             observed = await observe(rig, "M5", case, many, lambda rig: rig.line.play(scenario(fault)), **quiet)
             assert (observed.told is None) or float(factor) > 1, case
             return observed
@@ -182,7 +182,7 @@ async def test_m6_segments():
     async def play(case: str) -> Observed:
         fault, kind = SEGMENTS[case], KINDS["status"]
         good = case in ("one byte at a time", "two halves")
-        quiet = {"A": "a reply in pieces is no fault"} if good else {}
+        quiet = {"A": "a reply in pieces is not a fault"} if good else {}
         async with opened("cnc") as rig:
             line = rig.line
             before = line.connections  # type: ignore[union-attr]
@@ -348,7 +348,7 @@ async def test_m10_a_disturbed_line():
                 else:
                     rig.line.play(scenario(LINE_FAULTS[name](kind, kind.nth(rig))))
 
-            quiet = {"A": "a gap is no fault"} if name == "gap inside a reply" else {}
+            quiet = {"A": "a gap is not a fault"} if name == "gap inside a reply" else {}
             if name == "foreign master":
                 quiet = {"A": "other traffic is counted; it disturbed no request of ours"}
             observed = await observe(rig, "M10", case, kind, disturb, **quiet)

@@ -180,7 +180,7 @@ async def test_a_knocked_cup_is_seen_on_the_stretch_and_nothing_is_joined(place)
     bar._cup_mm = bar._cup_mm + 0.004 * outwards / np.linalg.norm(outwards)
     assert "test resumes at" in await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
-    assert "otherwise than before the break" in runs(store)[1].reason
+    assert "off its value before the break" in runs(store)[1].reason
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}  # nothing is kept that the cup could contradict
     assert "pieces" not in runs(store)[-1].start_doc["path"]
 
@@ -228,7 +228,7 @@ async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_pa
         ours, theirs = load_run(store, runs(store)[-1].id), load_run(other, record.id)
     assert theirs.columns.equals(ours.columns)
     assert theirs.timing == ours.timing
-    assert not time_issues([theirs])  # a pause of any length is no wrong clock
+    assert not time_issues([theirs])  # a pause of any length is not a wrong clock
     later = ours.columns.t_s + 3600.0 * (np.arange(len(ours.columns)) >= ours.timing.pieces[0].readings)
     assert not time_issues([replace(ours, columns=replace(ours.columns, t_s=later))])
 

@@ -1,4 +1,4 @@
-"""S6, S7, S8: the box restarts, clocks go wrong, readings are no measurements."""
+"""S6, S7, S8: the box restarts, clocks go wrong, readings are not measurements."""
 
 from __future__ import annotations
 

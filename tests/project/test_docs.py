@@ -74,7 +74,7 @@ def test_a_command_exists_with_its_options(words: tuple[str, ...]) -> None:
     name, text = next(((name, text) for name, text in found if text), ([], ""))
     assert text, f"no command abbe {' '.join(words)}"
     for option in (word.partition("=")[0] for word in words if re.match(r"--\w", word)):
-        assert re.search(rf"(?<!\S){option}\b", text), f"{option} is no option of abbe {' '.join(name)}"
+        assert re.search(rf"(?<!\S){option}\b", text), f"{option} is not an option of abbe {' '.join(name)}"
 
 
 def test_the_command_line_answers_as_the_tests_ask_it(capsys: pytest.CaptureFixture[str]) -> None:

@@ -376,7 +376,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             assert table_remarks(store, "lathe", used).remarks == (
                 f"measured with a table (CRC {crc}) that was accepted on machine 'sim', not on this one: not accepted",
             )
-            assert (await StoreBook.new(store, "sim", SystemClock(), site.control))._push == 1  # a word is no push
+            assert (await StoreBook.new(store, "sim", SystemClock(), site.control))._push == 1  # a word is not a push
 
 
 async def test_a_table_verified_on_one_control_is_not_good_on_another_until_a_person_s_word(tmp_path: Path) -> None:

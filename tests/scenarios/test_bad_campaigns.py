@@ -244,7 +244,7 @@ def test_visits_at_one_place_are_no_copy_of_the_line_that_passes_it():
 
 
 def test_noise_alone_makes_no_two_runs_alike():
-    """Repeats of one path, rounded to the ball-bar's resolution, are no copies."""
+    """Repeats of one path, rounded to the ball-bar's resolution, are not copies."""
     rng = np.random.default_rng(1)
     _, runs = measured(3)
     twice = [dict(runs[0], run_id=name, columns=dict(runs[0]["columns"])) for name in ("a", "b")]

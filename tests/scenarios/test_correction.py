@@ -118,7 +118,7 @@ async def stops_take_it_back(shop: Shop) -> None:
     task.uncancel()
     assert (shop.state, await shop.active()) == ("ROLLED_BACK", base)
 
-    # runs that are no verification are refused before anything is written
+    # runs that are not a verification are refused before anything is written
     pushes = len(shop.store.pushes.entries("sim"))
     with pytest.raises(MeasurementFault, match="no verification"):
         await shop.correct("june", shop.before[:3])

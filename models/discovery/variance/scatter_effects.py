@@ -25,14 +25,14 @@ from abbe.models.machine import AXES
 
 
 NEAR_MM, LOUD = 30.0, 3.0
-"""Readings within this distance are of the same place; each counts up to this many standard deviations."""
+"""Readings within `NEAR_MM` of each other belong to one place; each counts with at most `LOUD` standard deviations."""
 RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
 SIZES = np.geomspace(1.5, 60.0, 24)
 """Typical sizes of outliers, in sigmas, to either side."""
 SPREAD = 0.4
 """Relative standard deviation of the outliers' size."""
 SCALES = np.linspace(0.75, 1.1, 15)
-"""Noise of the good readings over the rms of all: free, or a wrong noise would look like outliers."""
+"""Tried ratios of the good readings' noise to the rms of all; with a fixed ratio, a wrong noise would look like outliers."""
 UM = 1e3
 NAME_PRICE = 7.0
 """Paid on top of the number of things tried, as natural logarithm: noise alone gains this with a probability of about exp(-7)."""
@@ -40,7 +40,7 @@ OFF, PLACE_Z = 3.5, 4.0
 """Standard deviations from which a reading is an outlier, and from which those near it prove that the place is the cause, not the beam (of
 13 campaigns with lost beams none above 1.2, of three with a bump none below 4.2)."""
 LEAST_LASER = 60
-"""Least laser readings for estimating a rate of 1 in 100."""
+"""Minimum number of laser readings for estimating a rate of 1 in 100."""
 DRIVES = ("stick_slip", "vibration")
 OVERSHADOWS = 3.0
 """Roughness of one axis shows a little along the others, a spectral line a little at low speed: a finding weaker by this factor counts as
@@ -59,7 +59,7 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
     q_mm : array, shape (n, 3)
         Tool positions.
     rest : array, shape (n,)
-        Whitened residuals; exact zeros are no readings.
+        Whitened residuals; exact zeros are not readings.
     off : array of bool, shape (n,)
         Which of them are outliers.
     """
@@ -193,7 +193,7 @@ def candidates(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """All variance effects with their evidence, also negative; parameters as `extra_variance`."""
+    """All variance effects with their evidence, which may be negative; parameters as `extra_variance`."""
     even = _studentised(whitened, leverage)
     bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
     out: list[VarianceFinding] = []

@@ -33,7 +33,7 @@ LEAST_READINGS = 12.0
 ALIKE = 1.94
 """Divisor for squared second differences, which are correlated from reading to reading for white noise."""
 FEW = 3
-"""The gain of this many readings does not count: a reversal that the mean misses by a reading is no roughness."""
+"""The gain of this many readings does not count: a reversal that the mean misses by a reading is not roughness."""
 WINDOWS_S = (1.0, 2.0, 4.0)
 
 

@@ -1,4 +1,4 @@
-"""Backlash (lost motion): the axis lags half the play behind, in the direction it came from."""
+"""Backlash (lost motion): after a reversal the axis lags its command by half the play."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ EFFECT = Effect(
         Form("modulated", of_path(_modulated)),
         Form("modulated twice", of_path(_modulated_twice)),
     ),
-    needs="at least four readings per pitch along the axis; a laser step that is no multiple of the pitch",
+    needs="at least four readings per pitch along the axis; a laser step that is not a multiple of the pitch",
     signature="a chirp on the circle: fast across the axis, slow near its reversals, the same in both directions",
     remedy="mechanics",
     remedy_text="align screw, bearing and encoder coupling; a control with pitch-wise compensation can take the rest out",

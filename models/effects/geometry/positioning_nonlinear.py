@@ -1,4 +1,4 @@
-"""Positioning error that is no pure scale: a smooth function of the axis' own position, along it."""
+"""Positioning error that is not a pure scale: a smooth function of the axis' own position, along it."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def _offset(path: Path, key: str, values: Values) -> F2:
 
 
 def _sensed(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """The same by the air sensor's rise, K."""
+    """The same error from the rise of the air sensor, K."""
     rise = rise_of(paths, "air")
     return [np.zeros((p.n, 1)) if rise is None else np.asarray(AIR_PER_K * p.travel_mm * rise(p.at.t_s))[:, None] for p in paths]
 

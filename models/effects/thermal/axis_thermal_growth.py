@@ -42,7 +42,7 @@ def _uneven(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _sensed(path: Path, at: Places, key: str, values: Values, rise_k: F1) -> F3:
-    """The same growth by the temperature that the axis' own sensor shows."""
+    """The same growth, from the temperature of the axis's own sensor."""
     return along(axis_of(key), STEEL_PER_K * _from_fixed(path, at, key, values) * rise_k)
 
 

@@ -19,7 +19,7 @@ def _second_time(at: Places, key: str, values: Values) -> F3:
 
 
 def _sensed(path: Path, at: Places, key: str, values: Values, rise_k: F1) -> F3:
-    """The same drift by the spindle's temperature, um per K."""
+    """The same drift, from the spindle's temperature, um per K."""
     return along(axis_of(key), UM * rise_k)
 
 

@@ -70,15 +70,15 @@ class Weights:
     Attributes
     ----------
     variance_factor : float
-        Of the points, 1 or more: residual that no parameter can follow over its degrees of freedom.
+        Factor, 1 or more, for the variance of the points: the residual that no parameter can follow, over its degrees of freedom.
     prior_factor : float
-        Of the prior standard deviations, 1 or more and the same for all, for want of anything that tells them apart: what brings
+        Factor, 1 or more, for all prior standard deviations alike, since the points cannot judge each by itself. It brings
         ``test.chi2`` down to its dof or, from twice the dof on, to dof - 2 (dof / 2 below 4), because a factor that was itself estimated
         from so few directions is too small as often as too large.
     carried : int
         Directions about which the points say more than the prior, with both factors.
     test : PriorTest
-        Of the prior as stated, noise already scaled.
+        Test of the prior as stated, with the noise already scaled.
     """
 
     variance_factor: float
@@ -364,7 +364,7 @@ def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = 
         A command has no position (for the nominal geometry or one tried on the way), or the points lie on a line and cannot place the
         machine.
     ValueError
-        A prior is not positive, or the frame is no rigid motion.
+        A prior is not positive, or the frame is not a rigid motion.
     """
     prior = default_prior() if prior_sd is None else np.asarray(prior_sd, dtype=np.float64)
     if prior.shape != (len(PARAMETERS),) or not (np.isfinite(prior).all() and (prior > 0.0).all()):

@@ -206,7 +206,7 @@ class SphereSurface:
         points_mm : array, shape (n, 3)
         margin : float
             How far X and Y (Z too, where the planes face X or Y) may lie outside the measured range, as a share of its half width. There
-            is no margin across the planes or in height: nothing was measured there.
+            is not a margin across the planes or in height: nothing was measured there.
 
         Raises
         ------
@@ -265,8 +265,8 @@ def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) ->
     Raises
     ------
     SurfaceNotDetermined
-        The points do not determine the terms, or a combination a thousand times worse than the best (RANK_TOLERANCE), with what cannot be
-        separated; or they are not more than the terms.
+        There are not more points than terms, or the points do not determine a combination of terms (its singular value is below
+        ``RANK_TOLERANCE`` times the largest one); the error lists the terms that cannot be separated.
     ValueError
         Shapes differ or a value is not finite.
     """

@@ -136,7 +136,7 @@ def propagate(jacobian: F3, covariance: F2) -> F3:
     Raises
     ------
     ValueError
-        It is no covariance (`abbe.models.geometry.propagation.checked_covariance`).
+        It is not a covariance (`abbe.models.geometry.propagation.checked_covariance`).
     """
     c = checked_covariance(covariance, jacobian.shape[-1])
     return np.asarray(jacobian @ c @ np.swapaxes(jacobian, 1, 2))

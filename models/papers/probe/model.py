@@ -208,7 +208,7 @@ def probe_error_mm(lobing: LobingMap, frame: F3, outward: F2) -> F1:
     Raises
     ------
     ValueError
-        A direction is no unit vector, or points where the map has no data.
+        A direction is not a unit vector, or points where the map has no data.
     """
     return lobing.at(to_probe(frame, unit_vectors(outward)))
 
@@ -230,7 +230,7 @@ def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
     Raises
     ------
     ValueError
-        Shapes do not agree, or a direction is no unit vector.
+        Shapes do not agree, or a direction is not a unit vector.
     """
     off, n, value = finite_vectors(deviation_mm), unit_vectors(outward), np.asarray(probe_mm, dtype=np.float64)
     if off.shape != n.shape or value.shape != n.shape[:-1] or not np.isfinite(value).all():
@@ -266,7 +266,7 @@ def contact_point_mm(reading_mm: F2, combined_mm: F2, effective_radius_mm: float
     Raises
     ------
     ValueError
-        Not finite, or a direction is no unit vector.
+        Not finite, or a direction is not a unit vector.
     """
     if not np.isfinite(effective_radius_mm):
         raise ValueError("contact point: the effective radius must be finite")

@@ -223,7 +223,7 @@ def conditioning(a: F2) -> Conditioning:
     Raises
     ------
     ValueError
-        ``a`` is no matrix, not finite, or all zeros: nothing has been observed.
+        ``a`` is not a matrix, not finite, or all zeros: nothing has been observed.
     """
     if np.ndim(a) != 2 or not np.size(a) or not np.isfinite(a).all() or not np.any(a):
         raise ValueError(f"conditioning: the design of shape {np.shape(a)} must be finite and show at least one parameter")

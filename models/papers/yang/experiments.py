@@ -242,7 +242,7 @@ def origin_plan(stroke_mm: F2, offsets_mm: tuple[tuple[float, float], ...] = DEF
     Raises
     ------
     ValueError
-        ``stroke_mm`` is no finite (3, 2) array of growing pairs, ``axis`` is not 0, 1 or 2, or an origin would lie outside the travel (or
+        ``stroke_mm`` is not a finite (3, 2) array of rising pairs, ``axis`` is not 0, 1 or 2, or an origin would lie outside the travel (or
         nowhere). Whether a hemisphere fits about it, `hemisphere_fits` tells.
     """
     stroke = _stroke(stroke_mm, axis)

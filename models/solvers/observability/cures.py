@@ -332,7 +332,7 @@ class CureTrial:
     observed: F2
 
     def shows(self, combinations: F2) -> int:
-        """How many of some hidden combinations, columns (k, m) of orthonormal coordinates, it makes visible."""
+        """How many of these hidden combinations the addition makes visible; columns (k, m) of orthonormal coordinates."""
         return count_observed(self.observed @ combinations)
 
 

@@ -249,7 +249,7 @@ class HiddenGroup:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to add next: ``rank`` after it, of ``of`` coefficients."""
+    """The best next addition, and the ``rank`` it leads to, out of ``of`` coefficients."""
 
     cure: str
     rank: int

@@ -1,7 +1,7 @@
 """Observed information of a campaign: rank and hidden combinations of the coefficients, and knowledge of every parameter and error motion.
 
 Convention of math.md 4.6: columns of unit length, everything unknown about the set-up projected out, singular values counted down to 1e-9
-(rank) and 1e-3 (effective rank) of the largest. Priors do not count: a typical size is no measurement. Measured or certified knowledge of
+(rank) and 1e-3 (effective rank) of the largest. Priors do not count: typical sizes are not measured. Measured or certified knowledge of
 the set-up (`Knowledge`) counts like readings: a calibrated bar, a laser whose drift the maker states.
 
 The rank does not depend on the functions in which error motions are written, the effective rank does: Legendre polynomials are nearly
@@ -207,7 +207,7 @@ def observed_information(columns: CampaignColumns, known: Knowledge) -> Observed
     """
     strangers = set(known.fixed) | {n for group in known.shared for n in group}
     if strangers - set(columns.setup_names):
-        raise ValueError(f"observability: {', '.join(sorted(strangers - set(columns.setup_names)))} is no set-up unknown of these runs")
+        raise ValueError(f"observability: {', '.join(sorted(strangers - set(columns.setup_names)))} is not a set-up unknown of these runs")
     machine, free, _ = with_knowledge(columns, known)
     unit, factor = unit_columns(_without_rounding(machine))
     _, s, vt = svd(project_out(unit, free), full_matrices=True)

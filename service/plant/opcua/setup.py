@@ -41,7 +41,7 @@ def trusted(files: Sequence[str]) -> dict[bytes, x509.Certificate]:
     Raises
     ------
     ConfigError
-        A file cannot be read, or is no certificate.
+        A file cannot be read, or is not a certificate.
     """
     found = {}
     for name in files:
@@ -52,7 +52,7 @@ def trusted(files: Sequence[str]) -> dict[bytes, x509.Certificate]:
         except OSError as trouble:
             raise ConfigError(f"[opcua] clients: {name}: {trouble.strerror}", "give certificates, PEM or DER") from None
         except ValueError:
-            raise ConfigError(f"[opcua] clients: {name}: is no certificate", "give certificates, PEM or DER") from None
+            raise ConfigError(f"[opcua] clients: {name}: is not a certificate", "give certificates, PEM or DER") from None
         found[certificate.public_bytes(Encoding.DER)] = certificate
     return found
 

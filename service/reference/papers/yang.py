@@ -210,7 +210,7 @@ def _difference_column() -> list[Comparison]:
 
 
 def _in_column(name: str, x_mm: float, number: Printed, value_um: float, how: str) -> Comparison:
-    """Row of a column; the number at the origin is always zero, so it is no evidence."""
+    """Row of a column; the number at the origin is always zero, so it is not evidence."""
     quantity, series = f"{name} at {x_mm:g} mm", f"{name} column"
     if x_mm == 0.0:
         why = "zero by construction: readings and lines start at the origin"

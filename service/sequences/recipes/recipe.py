@@ -407,7 +407,7 @@ def _laser_plan(recipe: LaserRecipe, test: str, setup: dict[str, Any], out: Arra
     if recipe.unmount:
         steps.append(Unmount())
     if test == "laser_diagonal":
-        setup["increment_mm"] = [float(v) for v in (out[-1] - out[0]) / setup["steps"]]  # overruns are no part of a step
+        setup["increment_mm"] = [float(v) for v in (out[-1] - out[0]) / setup["steps"]]  # overruns are not part of a step
     setup |= {"start_mm": list(path[0]), "end_mm": list(path[far]), "nominal_beam": [float(v) for v in beam]}
     if recipe.cycles > 1 or recipe.overrun_mm:
         setup |= {"cycles": recipe.cycles, "overrun_mm": recipe.overrun_mm}

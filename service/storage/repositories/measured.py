@@ -32,7 +32,7 @@ from abbe.service.storage.repository import CAMPAIGN, CHECKPOINT, CHUNK, MACHINE
 from abbe.service.storage.tables import campaigns, checkpoints, chunks, heartbeats, machines, runs
 
 MOST_DIGITS = 10
-"""A text with this many digits or more is no row id."""
+"""A text with this many digits or more is not a row id."""
 
 
 class Machines(Repository):

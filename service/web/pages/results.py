@@ -32,7 +32,7 @@ from abbe.service.web.frame import current
 # Contribution of each error motion of a machine, from a stored solution with its full covariance.
 #
 # The contribution of a motion is the rms length of the deviation that it alone causes, over an even grid of the volume, with the best-fit
-# rigid motion removed (the pose of the workpiece is no error of the machine): c = sqrt(theta^T G theta), G the mean square of its terms.
+# rigid motion removed (the pose of the workpiece is no machine error): c = sqrt(theta^T G theta), G the mean square of its terms.
 # Its uncertainty follows from the covariance of theta (GUM 5.1.2); near zero, where the direction is unknown, the worst direction counts,
 # as in `abbe.service.verification.deviations`. The squares of the contributions do not add up to the square of the whole, since motions can
 # compensate each other.

@@ -179,7 +179,7 @@ def sampled(
     square = dict(squareness_rad or {})
     unknown = [k for k in functions if k not in PLACES] + [k for k in square if k not in SQUARENESS]
     if unknown:
-        raise ValueError(f"table machine: {unknown[0]!r} is no error motion or squareness that one table can hold")
+        raise ValueError(f"table machine: {unknown[0]!r} is not an error motion or squareness that one table can hold")
     if nodes < 2:
         raise ValueError(f"table machine: nodes = {nodes}, expected 2 or more")
     tables = np.zeros((3, nodes, 6))

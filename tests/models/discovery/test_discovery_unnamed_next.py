@@ -29,10 +29,10 @@ def structure(label: str, **where: object) -> Structure:
 @pytest.mark.parametrize(
     ("label", "adds", "words"),
     [
-        ("unnamed_step:X", "longer_session", "3 times in one set-up"),
-        ("unnamed_slip", "longer_session", "what comes back belongs to the machine"),
-        ("unnamed_settling:Z", "longer_session", "3 times in one set-up"),
-        ("unnamed_burst", "longer_session", "3 times in one set-up"),
+        ("unnamed_step:X", "longer_session", "3 times in one undisturbed set-up"),
+        ("unnamed_slip", "longer_session", "what recurs belongs to the machine"),
+        ("unnamed_settling:Z", "longer_session", "3 times in one undisturbed set-up"),
+        ("unnamed_burst", "longer_session", "3 times in one undisturbed set-up"),
         ("unnamed_bump", "second_radius", "through the same place"),
         ("unnamed_lobes:Z3", "ballbar", "another ball in the cup"),
         ("unnamed_surge:X", "second_feed", "at standstill for 410 s"),

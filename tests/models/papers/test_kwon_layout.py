@@ -67,7 +67,7 @@ def test_three_jittered_columns_do_not_carry_a_cube() -> None:
 
 
 def test_heights_do_not_chain() -> None:
-    """81 heights spread over 0.5 mm have no gap above 0.02 mm, and are no plane."""
+    """81 heights spread over 0.5 mm have no gap above 0.02 mm, and are not plane."""
     points = square_grid()
     points[:, 2] = np.random.default_rng(5).permutation(np.linspace(5.0, 5.5, 81))
     where = layout(points, 0.01)

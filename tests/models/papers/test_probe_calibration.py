@@ -193,7 +193,7 @@ def test_a_pattern_becomes_a_map():
 
 
 def test_angles_of_directions_are_the_pattern_again():
-    """There and back the angles differ in the last digit; a whole turn is no turn; lists are arrays; the order does not matter."""
+    """There and back the angles differ in the last digit; a whole turn is not a turn; lists are arrays; the order does not matter."""
     back = np.stack(direction_angles(NORMAL), axis=1)
     assert (back != PATTERN).any()
     turned = PATTERN + np.where(PATTERN[:, 1:] == 0.0, [0.0, 2 * np.pi], 0.0)

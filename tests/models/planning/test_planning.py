@@ -147,7 +147,7 @@ def test_scales_of_unknown_temperature_count_as_in_the_budget_of_a_solution():
     what = problem(MACHINE, TOOLS, 4)
     rows = field_rows(what, 0.8, 5)
     half = 0.8 * MACHINE.length_mm / 2
-    node = np.linspace(-1.0, 1.0, 5)[:, None] * half * 11.5e-6 * 0.2  # a scale is no rigid motion but for its mean
+    node = np.linspace(-1.0, 1.0, 5)[:, None] * half * 11.5e-6 * 0.2  # a scale is not a rigid motion but for its mean
     x, y, z = np.meshgrid(*node.T, indexing="ij")
     found = scale_temperature_mm2(what, rows)
     corner = np.sqrt(x**2 + y**2 + z**2).max()

@@ -125,7 +125,7 @@ YANG_EXPERIMENTS = {
     "d2": Experiment(YANG, STEPS),
     "d3": Experiment(YANG, yang_diagonals(sequential=False)),
 }
-"""Experiments of math.md 4.6 by the letters of the vectors, except the vector maps e1 to e3, which are no runs."""
+"""Experiments of math.md 4.6 by the letters of the vectors, except the vector maps e1 to e3, which are not runs."""
 
 TWO = ("XYZ", "ZYX")
 WANG_EXPERIMENTS = {

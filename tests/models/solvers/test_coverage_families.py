@@ -82,7 +82,7 @@ def test_what_is_stated_as_seen_is_within_its_uncertainty_on_other_machines(fami
     assert np.abs(everything).max() < 6.0
 
 
-@pytest.mark.xfail(strict=True, reason="a motion that stops being rough at order 9 is no smooth process: 78 % are held (coverage.md)")
+@pytest.mark.xfail(strict=True, reason="a motion that stops being rough at order 9 is not a smooth process: 78 % are held (coverage.md)")
 def test_motions_that_fade_slowly_and_stop_at_once_are_held_as_well():
     solved = [distances(t, solve_joint(MACHINE, t.campaign())) for t in map(Series, SEEDS)]
     found = share([np.abs(z) < 1.96 for z, _ in solved], [z for z, _ in solved])

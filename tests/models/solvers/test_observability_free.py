@@ -1,4 +1,4 @@
-"""What is said of the set-up: free unknowns that the readings leave open, one rule for rank and report, rounding that is no reading.
+"""What is said of the set-up: free unknowns that the readings leave open, one rule for rank and report, rounding that is not a reading.
 
 ``ABBE_TEST_LONG=1`` writes numbers with more different digits.
 """

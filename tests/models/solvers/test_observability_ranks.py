@@ -174,5 +174,5 @@ def test_a_bar_counts_as_calibrated_only_if_every_run_says_so():
 def test_refusals():
     with pytest.raises(ValueError, match="no runs"):
         observability(YANG, ())
-    with pytest.raises(ValueError, match="bar_length_7 is no set-up unknown"):
+    with pytest.raises(ValueError, match="bar_length_7 is not a set-up unknown"):
         observability(YANG, ONE, terms=1, known=Knowledge({"bar_length_7": np.zeros(15)}))

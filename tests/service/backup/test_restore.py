@@ -138,7 +138,7 @@ def _edited(made: Path, statement: str) -> None:
         ("DELETE FROM audit WHERE id = 2", "is broken: record 2 is missing"),
         ("UPDATE alembic_version SET version_num = '9999'", "has schema 9999, which this version of Abbe does not know"),
         ("DELETE FROM machines", "rows refer to rows that are not there"),
-        ("DROP TABLE alembic_version", "is no database of Abbe"),
+        ("DROP TABLE alembic_version", "is not a database of Abbe"),
     ],
 )
 def test_what_was_changed_on_purpose_is_refused(

@@ -80,7 +80,7 @@ def test_a_flagged_reading_that_is_no_number_leaves_its_mean_one(monkeypatch: py
     assert columns.valid.all()
     told = thinning([run], picked([run], 40))
     assert told is not None
-    assert told.how == "picked"  # a reading that is no number is not another one
+    assert told.how == "picked"  # a reading that is not a number is not another one
 
 
 def test_a_short_run_beside_long_ones_keeps_its_readings() -> None:
@@ -105,9 +105,9 @@ def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch)
     assert told.highest_hz == pytest.approx(1.0 / (6.0 * step))
     assert 4 <= told.values_with_reversal <= 8  # X and Y turn round twice a turn each; one of these is where the circle begins
     done, hidden, remedy = lines_of(told)
-    assert "every 3 of them became one mean, 80 values in all" in done
-    assert "could not be seen, which does not say that it is absent" in hidden
-    assert f"in {told.values_with_reversal} means an axis turns round" in hidden
+    assert "every 3 of them were averaged, 80 values in all" in done
+    assert "effects that this hides may be present all the same" in hidden
+    assert f"in {told.values_with_reversal} means an axis reverses" in hidden
     assert f"vibration above {told.highest_hz:.2g} Hz" in hidden
     assert "is 1/3 as high" in hidden
     assert f"keeps its height from {6.0 * step:.2g} s on" in hidden  # half as long, it lies in two means
@@ -119,7 +119,7 @@ def test_readings_that_were_left_out_are_told_too() -> None:
     told = thinning(runs, picked(runs, 80))
     assert told is not None
     assert (told.how, told.readings_per_value) == ("picked", 3)
-    assert "of every 3 one was looked at" in lines_of(told)[0]
+    assert "one of every 3 was used, unaveraged" in lines_of(told)[0]
 
 
 def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,8 +137,8 @@ def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, m
     assert (answer["thinning"]["readings"], answer["thinning"]["readings_per_value"]) == (360, 2)
     assert len(answer["thinning"]["not_seen"]) == 3
     page = document_html(found_report(job, journal, finding, "now"))
-    assert "every 2 of them became one mean" in page
-    assert "could not be seen, which does not say that it is absent" in page
+    assert "every 2 of them were averaged" in page
+    assert "effects that this hides may be present all the same" in page
 
 
 def test_a_short_campaign_says_nothing_of_it(tmp_path: Path) -> None:

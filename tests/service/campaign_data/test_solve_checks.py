@@ -153,7 +153,7 @@ def test_one_spike_is_left_to_the_weights_and_many_are_another_unit():
     assert of_lines([spike]) == []
     assert "look like µm" in of_lines([um])[0]
     assert "60 of 300 readings are beyond 2 mm" in of_lines([lost])[0]
-    assert "1e+300 mm in row 6 is no reading" in of_lines([none])[0]
+    assert "1e+300 mm in row 6 is not a reading" in of_lines([none])[0]
 
 
 def test_readings_that_are_all_the_same_are_one_line():

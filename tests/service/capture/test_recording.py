@@ -151,7 +151,7 @@ async def test_the_database_gets_many_chunks_in_one_transaction_and_the_end_wait
             tap.take(batch(first, 20))
             await recorder.flush()
         assert recorder.durable_seq == 199
-    assert given == [7, 3]  # the opening record came with the first, and is no chunk
+    assert given == [7, 3]  # the opening record came with the first, and is not a chunk
     assert [one.seq for one in stored(store, run_id)] == list(range(200))
 
 

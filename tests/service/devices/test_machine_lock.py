@@ -138,7 +138,7 @@ def test_a_folder_that_is_not_there_is_told(folder: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(module, "INSTALLED", folder / "none")
     (folder / "file").touch()
     monkeypatch.setattr(module, "WITHOUT_INSTALLATION", folder / "file")
-    with pytest.raises(UnsafeToMove, match="is no folder"):
+    with pytest.raises(UnsafeToMove, match="is not a folder"):
         lock_folder()
 
 
@@ -187,7 +187,7 @@ def test_a_full_disk_and_what_is_no_file_are_told_in_a_line(folder: Path, monkey
             pass  # nobody hears the holder's name, and it is held
     lock.unlink()
     os.mkfifo(lock)
-    with pytest.raises(UnsafeToMove, match="it is no plain file"), lock_machine(URL):
+    with pytest.raises(UnsafeToMove, match="it is not a plain file"), lock_machine(URL):
         pass
     lock.unlink()
     lock.symlink_to(folder / "elsewhere")

@@ -1,4 +1,4 @@
-"""A machine that is measured again is compared with its last solution: what has changed is named, a table in between is no change."""
+"""A machine that is measured again is compared with its last solution: what has changed is named, a table in between is not a change."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def finding(*effects: EffectFound) -> Finding:
     ids=["repaired", "half of it repaired", "a size without a sign, more of it"],
 )
 def test_only_strengths_of_opposite_sign_cancel(strengths: tuple[float, float], gone: bool) -> None:
-    """A straightness is known to 60 %; more of it found later is no repair."""
+    """A straightness is known to 60 %; more of it found later is not a repair."""
     u = (0.1, 0.1) if min(strengths) < 0 else (6.2, 1.6)
     effects = [found("a", s, v) for s, v in zip(strengths, u, strict=True)]
     book = extended_book(None, finding(*effects), SOURCE, 1)

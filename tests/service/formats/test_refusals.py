@@ -46,7 +46,7 @@ BAD_FILES = [
     ("centroid", "cnc-x.tab", "3 1000\n0\n1\n", "2 values, 3 stated"),
     ("fanuc-lattice", "l.csv", "x,y,z\n", r"l\.csv:1: the heading"),
     ("isg", "v.csv", "X EXX\n0 0\n10 0.1\n5 0.2\n", r"v\.csv:4: position 5 after 10"),
-    ("isg", "v.csv", "X EXX EYY\n0 0 0\n", r"v\.csv:1: EYY is no error motion of X"),
+    ("isg", "v.csv", "X EXX EYY\n0 0 0\n", r"v\.csv:1: EYY is not an error motion of X"),
 ]
 
 
@@ -73,7 +73,7 @@ REFUSED = [
     ("siemens-eec", _table(P, V + 0.001), TOLD, r"\+1\.000 µm at the reference"),
     ("linuxcnc-1", _table(P, V + 0.001), TOLD, "must be zero there"),
     ("linuxcnc-1", _table(P[::-1], V), TOLD, "do not increase"),
-    ("linuxcnc-1", _table(P, np.array([0.0, np.nan, 0.0])), TOLD, "no numbers"),
+    ("linuxcnc-1", _table(P, np.array([0.0, np.nan, 0.0])), TOLD, "not numbers"),
     ("linuxcnc-1", _table(P, 1000.0 * V), TOLD, "the largest allowed is 1 mm"),
     ("linuxcnc-1", Compensation((AxisTable("X", "Y", P, V, V),)), TOLD, "cannot hold the table Y over X"),
     ("fanuc-pitch", _table(P, 30.0 * V), TOLD, "the control holds ±127"),

@@ -102,7 +102,7 @@ def test_runs_of_a_table_that_did_not_act_are_refused(acting: bool | None) -> No
 
 
 def kinked() -> NineTables:
-    """Corrections of X by X that change by 0.4 µm from point to point: kinks that are no error of a machine."""
+    """Corrections of X by X that change by 0.4 µm from point to point: kinks that are not error of a machine."""
     at = np.linspace(0.0, 600.0, 25), np.linspace(0.0, 500.0, 21), np.linspace(0.0, 450.0, 19)
     values = [np.zeros((a.size, 3)) for a in at]
     values[0][1::2, 0] = 4e-4

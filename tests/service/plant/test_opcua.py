@@ -336,7 +336,7 @@ def test_an_exposed_server_needs_to_know_its_clients(setup: OpcUa, words: str) -
 
 def test_a_client_that_is_no_certificate(tmp_path: Path) -> None:
     (tmp_path / "x.pem").write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
-    with pytest.raises(ConfigError, match="is no certificate"):
+    with pytest.raises(ConfigError, match="is not a certificate"):
         check_opcua(OpcUa(host="0.0.0.0", port=4840, certificate="c.pem", key="k.pem", clients=(str(tmp_path / "x.pem"),)))
 
 

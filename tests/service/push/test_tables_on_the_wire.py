@@ -96,7 +96,7 @@ def test_change_is_measured_against_the_active_table():
 def test_a_table_with_nan_or_off_zero_is_refused():
     bad = tables()
     bad.correction_mm[1][1, 2] = np.nan
-    with pytest.raises(TableRefused, match="table of Z over Y: holds values that are no numbers"):
+    with pytest.raises(TableRefused, match="table of Z over Y: holds values that are not numbers"):
         check_limits(bad, None, PushLimits())
     shifted = tables()
     shifted.correction_mm[0][:, 0] += 0.01

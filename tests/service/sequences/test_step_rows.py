@@ -1,4 +1,4 @@
-"""Step diagonals are told from whole ways out only; overruns are no part of a step."""
+"""Step diagonals are told from whole ways out only; overruns are not part of a step."""
 
 import numpy as np
 import pytest

@@ -96,7 +96,7 @@ def test_ready_leaves_nothing_behind_and_sees_each_file(world: World) -> None:
         world.book.ready()
     world.book.head_file.rmdir()
     world.book.key_file.write_bytes(b"short")
-    with pytest.raises(AuditBroken, match="is no key of an audit"):
+    with pytest.raises(AuditBroken, match="is not a key of an audit"):
         world.book.ready()
     world.book.key_file.unlink()
     world.store.close()

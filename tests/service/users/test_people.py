@@ -176,7 +176,7 @@ def test_a_user_that_does_not_exist_takes_as_long(world: World) -> None:
     took: dict[str, list[float]] = {"ana": [], "nobody": []}
     for _ in range(9):
         for name, times in took.items():
-            begin = time.thread_time()  # of this thread: what else the computer does is no part of it
+            begin = time.thread_time()  # of this thread: what else the computer does is not part of it
             assert people.check(name, "something else entirely") is None
             times.append(time.thread_time() - begin)
     assert abs(statistics.median(took["ana"]) - statistics.median(took["nobody"])) < 0.010
