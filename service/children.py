@@ -17,9 +17,9 @@ ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)
 """Parent directory of the package ``abbe``."""
 
 
-def python_command(module: str, *words: object) -> list[str]:
+def python_command(module: str, *arguments: object) -> list[str]:
     """Return the command line that runs a module of Abbe; ``module`` as after ``python -m``."""
-    return [sys.executable, "-P", os.path.abspath(__file__), module, *map(str, words)]
+    return [sys.executable, "-P", os.path.abspath(__file__), module, *map(str, arguments)]
 
 
 @contextmanager

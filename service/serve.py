@@ -66,7 +66,7 @@ STOP_S = 4.5
 """The process promises to end within 5 s of the signal; after this it is cut off. The store survives that."""
 LEAVE_S = 0.3
 """Longest wait for a thread that still computes after everything has closed"""
-HOLD_S = 2.5
+WORK_END_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
@@ -191,7 +191,7 @@ class Service:
                 passed = work.result()
             work.cancel()
             by_hand = parts.create_task(self._jobs.close(), name="jobs")
-            await asyncio.wait({work, by_hand}, timeout=HOLD_S)
+            await asyncio.wait({work, by_hand}, timeout=WORK_END_S)
             self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
             mqtt.cancel()  # a broker that accepts connections and never answers would delay the end

@@ -167,7 +167,7 @@ def _coefficient(effect: Effect, strength: float, values: Values) -> float:
 def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, instruments: SimulatedInstruments) -> Run:
     """A run without readings."""
     paths = [_path_rows(step, begins_s, instruments) for step in test.steps if isinstance(step, RecordPath)]
-    t_s, q_mm, feed, direction = paths[0] if paths else _standing_rows(test, begins_s)
+    t_s, q_mm, feed, direction = paths[0] if paths else _stationary_rows(test, begins_s)
     return Run(
         campaign=campaign,
         run_id=test.label,
@@ -202,7 +202,7 @@ def _path_rows(step: RecordPath, begins_s: float, instruments: SimulatedInstrume
     return begins_s + at / speed, q_mm, np.full(at.size, step.feed_mm_min), np.full(at.size, float(step.direction))
 
 
-def _standing_rows(test: TestPlan, begins_s: float) -> _Rows:
+def _stationary_rows(test: TestPlan, begins_s: float) -> _Rows:
     """Rows of a test that reads at standstill."""
     now_s, here, feed = begins_s, None, 0.0
     rows: list[tuple[float, tuple[float, ...], float, float]] = []

@@ -28,7 +28,7 @@ class BudgetLine:
     """One source: the rms length of the error vector it makes, mm, and its share of the total variance (all shares: 1)."""
 
     name: str
-    words: str
+    text: str
     u_mm: float
     share: float
 
@@ -57,7 +57,7 @@ class Budget:
     def text(self) -> str:
         """The budget as a table for people, micrometres."""
         rows = [f"{'source':<72}{'u, um':>8}{'share':>8}"]
-        rows += [f"{line.words:<72}{1e3 * line.u_mm:8.3f}{line.share:8.1%}" for line in self.lines]
+        rows += [f"{line.text:<72}{1e3 * line.u_mm:8.3f}{line.share:8.1%}" for line in self.lines]
         rows.append(f"{'together':<72}{1e3 * self.u_mm:8.3f}{1.0:8.1%}")
         rows.append(f"largest expanded uncertainty of a component: {1e3 * self.expanded_mm:.3f} um (k = {self.coverage_factor:.2f})")
         return "\n".join(rows)

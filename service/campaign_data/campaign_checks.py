@@ -327,10 +327,10 @@ def _too_few(run: Run, count: int) -> list[CampaignIssue]:
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[CampaignIssue]:
     """Issues of runs whose readings contradict the other runs (`abbe.models.solvers.plausibility.suspects`)."""
     found = suspects(machine, data)
-    return [_suspect(s, alone=len(found) == 1) for s in found]
+    return [_suspect(s, single=len(found) == 1) for s in found]
 
 
-def _suspect(s: SuspectRun, *, alone: bool) -> CampaignIssue:
+def _suspect(s: SuspectRun, *, single: bool) -> CampaignIssue:
     gross = s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
     if s.tied:
         who = " or ".join(("it", *(f"run {name}" for name in s.tied)))
@@ -338,7 +338,7 @@ def _suspect(s: SuspectRun, *, alone: bool) -> CampaignIssue:
         return CampaignIssue(s.run, what, "measure them again", gross or s.cause != "other")
     if s.cause != "other":
         return CampaignIssue(s.run, f"{_READINGS[s.cause]} ({_misfit(s)})", "correct the file, or leave it out (--without)", True)
-    if alone and gross:
+    if single and gross:
         what = f"fits none of the other runs ({_misfit(s)}), which fit each other: another machine, tool or table"
         return CampaignIssue(s.run, what, "leave it out (--without), or measure it again", True)
     what = f"does not fit the other runs ({_misfit(s)}): the machine changed, or its set-up or tool is not what it says"

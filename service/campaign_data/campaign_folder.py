@@ -9,7 +9,7 @@ from typing import Any
 from abbe.service.campaign_data.provenance import machine_digest, run_digest
 from abbe.service.devices.urls import DeviceUrls
 from abbe.service.domain.run import Run
-from abbe.service.domain.solution_file import TableTakenOut
+from abbe.service.domain.solution_file import TableRemoval
 from abbe.service.errors import CampaignRefused
 from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
@@ -30,7 +30,7 @@ class Campaign:
     runs: list[Run]
     folder: Path | None
     doc: dict[str, Any] = field(default_factory=dict)
-    removed: TableTakenOut | None = None
+    removed: TableRemoval | None = None
 
     def without(self, labels: list[str]) -> Campaign:
         """The campaign without the named runs.

@@ -25,11 +25,11 @@ def lines_of(made: FoundThinning) -> tuple[str, ...]:
     each, means = made.readings_per_value, made.how == "means"
     became = f"every {each} of them were averaged" if means else f"one of every {each} was used, unaveraged"
     done = f"{made.readings} ball-bar readings are too many to search one by one: {became}, {made.kept} values in all"
-    hidden = f"effects that this hides may be present all the same: {'; '.join(made.not_seen)}"
+    hidden = f"effects that this hides may be present all the same: {'; '.join(made.unobservable)}"
     return (done, hidden, REMEDY) if means else (done, hidden)
 
 
-def _not_seen(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
+def _unobservable(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
     """What the decimated runs cannot show, one sentence each.
 
     ``each``: readings per value; ``interval_s``: from value to value; ``turning``: number of values in whose readings an axis reverses.
@@ -69,7 +69,7 @@ def thinning(before: list[Run], after: list[Run]) -> FoundThinning | None:
         interval_s=interval,
         highest_hz=0.5 / interval,
         values_with_reversal=turning,
-        not_seen=_not_seen(each=each, means=means, interval_s=interval, turning=turning),
+        not_seen=_unobservable(each=each, means=means, interval_s=interval, turning=turning),
     )
 
 

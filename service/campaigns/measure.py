@@ -50,7 +50,7 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 
 
 @dataclass
-class ProgressMeter:
+class ProgressReporter:
     """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
 
     Time spent waiting for a person (``waited_s``) does not count.
@@ -209,13 +209,13 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     under_way = OpenCampaign(*campaign, dict(resumed.mounted_us) if resumed is not None else {})
     journal = StoreJournal(store, under_way.id)
     campaign_run = await _campaign_run(session, store, site, plan, journal, options, control)
-    progress_meter = ProgressMeter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
+    reporter = ProgressReporter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
     control.now(State.RUNNING)
-    notes, reporting = IncidentNotes(journal, clock), asyncio.create_task(progress_meter.report_states())
-    once = _once(session, store, site, under_way, progress_meter, options.live)
+    notes, reporting = IncidentNotes(journal, clock), asyncio.create_task(reporter.report_states())
+    once = _once(session, store, site, under_way, reporter, options.live)
     try:
         async with incidents_noted(session, notes):
-            run_ids = await _all_tests(plan, [d.duration_s for d in dry], campaign_run, progress_meter, resumed, once)
+            run_ids = await _all_tests(plan, [d.duration_s for d in dry], campaign_run, reporter, resumed, once)
     except BaseException as error:
         await _ended(journal, notes, "stopped" if isinstance(error, Stopped) else "failed", error)
         raise
@@ -277,7 +277,7 @@ async def _all_tests(
     plan: CampaignPlan,
     seconds: list[float],
     campaign_run: CampaignRun,
-    progress_meter: ProgressMeter,
+    reporter: ProgressReporter,
     resumed: Resumed | None,
     once: Callable[[TestPlan, float], Once],
 ) -> list[int]:
@@ -285,35 +285,35 @@ async def _all_tests(
     run_ids: list[int] = []
     done, start = (resumed.done, resumed.start) if resumed is not None else ({}, {})
     for item, duration_s in zip(items(plan), seconds, strict=True):
-        label, base_s = item.test.label, progress_meter.done_s
+        label, base_s = item.test.label, reporter.done_s
         if label in done:
             run_ids.append(done[label])
-            progress_meter.skip(duration_s)
+            reporter.skip(duration_s)
         else:
             item = start.get(label) or in_mounting(item, campaign_run.mountings.get(item.setup, 1))
             run_ids.append(await campaign_run.complete(item, once(item.test, base_s)))
-            progress_meter.done_s = base_s + duration_s
-        progress_meter.at(progress_meter.done_s, label)
+            reporter.done_s = base_s + duration_s
+        reporter.at(reporter.done_s, label)
     return run_ids
 
 
 def _once(
-    session: Session, store: Store, site: Site, under_way: OpenCampaign, progress_meter: ProgressMeter, live: LiveFeed | None
+    session: Session, store: Store, site: Site, under_way: OpenCampaign, reporter: ProgressReporter, live: LiveFeed | None
 ) -> Callable[[TestPlan, float], Once]:
     """Return a factory of functions that run one attempt at a test as one run."""
 
     def of(test: TestPlan, base_s: float) -> Once:
-        breaks = BarBreaks(session, progress_meter.control or Control(), site.watching.suspending)
+        breaks = BarBreaks(session, reporter.control or Control(), site.watching.suspending)
 
         async def once(left: TestPlan, attempt: Attempt, runner: Runner) -> int:
             before_s = max(planned_seconds(test) - planned_seconds(left), 0.0)  # done by earlier attempts
 
             def tick(seconds: float, waited_s: float) -> None:
-                progress_meter.at(base_s + before_s + seconds, test.label, waited_s)
+                reporter.at(base_s + before_s + seconds, test.label, waited_s)
 
             context = AttemptContext(runner, attempt, runner.journal, live)
             try:
-                return await measure_test(session, store, site, under_way, left, tick, progress_meter.clock, context)
+                return await measure_test(session, store, site, under_way, left, tick, reporter.clock, context)
             except DriverError as error:
                 await breaks.wait(error, runner, runner.journal)
                 raise

@@ -439,7 +439,7 @@ def _opened(
     reserve = Reserve(io, folder, 0 if temporary else settings.reserve_bytes)
     opening = about | {"run": run_id, "utc": clock.utc().isoformat(), "started_utc": store.runs.find(run_id).started_utc}
     _make(folder, io)
-    reserve.hold()
+    reserve.allocate()
     path = segment_path(folder, run_id)
     _active.add(_key(path))  # before a recovery could find the file
     try:

@@ -50,7 +50,7 @@ class FileIO(Protocol):
         """Return when the folder's entries are on the disk."""
         ...
 
-    def hold_space(self, path: Path, size: int) -> None:
+    def reserve_space(self, path: Path, size: int) -> None:
         """Create a file that occupies this many bytes of the disk."""
         ...
 
@@ -98,7 +98,7 @@ class RealFileIO:
         finally:
             os.close(descriptor)
 
-    def hold_space(self, path: Path, size: int) -> None:
+    def reserve_space(self, path: Path, size: int) -> None:
         """Create a file that occupies this many bytes of the disk."""
         if path.exists() and path.stat().st_size == size:
             return
@@ -419,9 +419,9 @@ class Reserve:
     def __init__(self, io: FileIO, folder: Path, size: int) -> None:
         self._io, self._folder, self._size = io, folder, size
         self._path = folder / "reserve"
-        self._held = False
+        self._allocated = False
 
-    def hold(self) -> None:
+    def allocate(self) -> None:
         """Create the file unless its size is 0.
 
         Raises
@@ -432,17 +432,17 @@ class Reserve:
         if not self._size:
             return
         try:
-            self._io.hold_space(self._path, self._size)
+            self._io.reserve_space(self._path, self._size)
             self._io.sync_folder(self._folder)
         except OSError as error:
             raise fault(self._path, "reserve disk space", error) from error
-        self._held = True
+        self._allocated = True
 
     def release(self) -> bool:
         """Free the space; False if it is already free or cannot be freed."""
-        if not self._held:
+        if not self._allocated:
             return False
-        self._held = False
+        self._allocated = False
         try:
             self._io.remove(self._path)
             self._io.sync_folder(self._folder)

@@ -192,7 +192,7 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[s
         out.append(f"{form.name}: {form.sign.evidence}; acts after: {form.live}")
         if not form.sign.sure:
             out.append(
-                f"{form.name}: no manual states the sign ({form.sign.words}): write the 10 µm step first and measure it "
+                f"{form.name}: no manual states the sign ({form.sign.text}): write the 10 µm step first and measure it "
                 "(docs/reference/formats.md)"
             )
     return tuple(out)
@@ -422,7 +422,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     expected = ExpectedContent(config.name, site_of(config).limits.digest(), ask.form, [*ask.trusted, *config.signatures.trusted], ask.base)
     found = contents(path)
     claims = check(sealed, found, expected, now)
-    if {f.name: f.text for f in read} != {name: io.StringIO(held.decode("utf-8"), None).read() for name, held in found.items()}:
+    if {f.name: f.text for f in read} != {name: io.StringIO(content.decode("utf-8"), None).read() for name, content in found.items()}:
         raise SignatureRefused(f"{path} was changed while it was read", "try again; nothing was imported")
     return SealStatus(claims, f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)")
 

@@ -243,7 +243,7 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
 
 
 def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int) -> Proposal:
-    """Absolute tables from runs that were measured while ``base`` was active (`taken_out`)."""
+    """Absolute tables from runs that were measured while ``base`` was active (`remove_table`)."""
     solved = solve_runs(site, runs)
     change = nine_tables(solved.joint, GRID)
     predicted = predict_residual(solved.joint, change)

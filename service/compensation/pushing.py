@@ -166,7 +166,7 @@ class Pushing:
 
     async def _order(self, wanted: WantedTable | RestoredTable) -> OperationOrder:
         form = await self.controller.table_format()
-        image, meaning = _image(wanted)
+        image, semantic_digest = _image(wanted)
         if len(image) > 2 * form.bank_registers:
             raise TableRefused(f"the tables need {len(image) // 2} registers, a bank has {form.bank_registers}", "use a coarser grid")
         self.crc = crc32(image)
@@ -174,7 +174,7 @@ class Pushing:
         machine_id = await self.store.write(self.store.machines.add, self.site.name, self.site.doc)
         table_id = await self.store.write(self.store.tables.add, machine_id, wanted.solution_id, image, crc32(image), wanted.doc)
         return OperationOrder(
-            self.site.name, image, crc32(image), meaning, self.site.limits.digest(),
+            self.site.name, image, crc32(image), semantic_digest, self.site.limits.digest(),
             owner=(secrets.randbits(15) + 1) << 16, level=level, attended=self.attended, table=table_id,
             process=asdict(this_process()), control=self.site.control,
         )  # fmt: skip

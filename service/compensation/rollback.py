@@ -122,14 +122,14 @@ async def rollback(
 
 def _base(journal: Journal, how: str) -> KnownTable:
     f = facts(journal)
-    return KnownTable(f.base_image, f.base_meaning, how)
+    return KnownTable(f.base_image, f.base_semantic_digest, how)
 
 
 def _left(journal: Journal) -> KnownTable:
     """The table that was in force after a push."""
     state, number, f = ended_as(journal), journal[-1].push, facts(journal)
     if state is PushState.KEEP:
-        return KnownTable(f.image, f.meaning, f"the table that push {number} brought and kept")
+        return KnownTable(f.image, f.semantic_digest, f"the table that push {number} brought and kept")
     if state in TERMINAL - {PushState.OPERATOR, PushState.ACCEPTED}:
         return _base(journal, f"the table that was in force before and after push {number}")
     raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another")

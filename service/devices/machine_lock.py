@@ -54,7 +54,7 @@ def lock_machine(url: str | None) -> Iterator[None]:
         raise UnsafeToMove(
             f"it is unknown whether the machine at {url} is in use: {path} cannot be used ({error.strerror})", _remedy(path.parent)
         ) from None
-    except _LockHeld as holder:
+    except _AlreadyLocked as holder:
         raise MachineInUse(f"the machine at {url} is in use by {holder}", "wait until it has ended") from None
     try:
         with suppress(OSError):  # the lock is held; on a full disk only the holder's name is missing
@@ -104,7 +104,7 @@ def _shared(folder: Path) -> Path:
     return folder
 
 
-class _LockHeld(Exception):  # noqa: N818 - a state, not an error
+class _AlreadyLocked(Exception):  # noqa: N818 - a state, not an error
     """Another process holds the lock; the text names it."""
 
 
@@ -119,7 +119,7 @@ def _locked(path: Path) -> int:
         except BlockingIOError:
             who = os.pread(handle, 200, 0).decode(errors="replace").strip() or "another process"
             os.close(handle)
-            raise _LockHeld(who) from None
+            raise _AlreadyLocked(who) from None
         except FileNotFoundError:
             pass
         except BaseException:

@@ -94,9 +94,9 @@ def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
 def _before_of(store: Store, record: SolutionRecord) -> _Before:
     book = stored_solution(record.doc, record.id).machine_model
     known, crc = stored_field(store, record).known, _acting(_tables_of(store, record))
-    if book is None or not book.taken_out:
+    if book is None or not book.removed:
         return _Before(record.id, known, crc, None, frozenset())
-    return _Before(record.id, known, crc, book.version, frozenset(book.taken_out))
+    return _Before(record.id, known, crc, book.version, frozenset(book.removed))
 
 
 def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
@@ -169,7 +169,7 @@ def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence
     used, out = [r for r in left.runs if r.identifies], _tables_between(store, campaign, before)
     changed = changed_since(before.known, tuple(run_data(r) for r in (used if out is None else subtract_table(used, out))))
     # The comparison fits the lost motion of the drives; the old solution's motions may have absorbed any other lasting effect.
-    beside = [e.words for e in found if e.family in LASTING and e.name != LOST_MOTION]
+    beside = [e.full_title for e in found if e.family in LASTING and e.name != LOST_MOTION]
     return _record(before.number, changed, tuple(beside))
 
 

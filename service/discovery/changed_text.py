@@ -77,9 +77,9 @@ def _proof(changed: ChangedSince) -> list[str]:
         out = [f"  set-ups take up nearly all of it: the gap is {before} µm rms without and {after} with it where {floor} µm is noise"]
     if judged < NEAR:
         out.append("  runs that did not choose it are not more likely with it")
-    alone = [_name(c.motion, c.part) for c in changed.changes if c.halves < HALVES]
-    if alone:
-        out.append(f"  not chosen by each half of the runs alone: {', '.join(alone)}")
+    unconfirmed = [_name(c.motion, c.part) for c in changed.changes if c.halves < HALVES]
+    if unconfirmed:
+        out.append(f"  not chosen by each half of the runs alone: {', '.join(unconfirmed)}")
     if gap.after_um > LEFT * gap.floor_um:
         out.append("  what is left is more than noise: what the solution did not know, or a change that has no name here")
     return out
@@ -90,7 +90,7 @@ def _hidden(changed: ChangedSince) -> list[str]:
     hidden = changed.hidden_um_m
     named = {c.motion for c in changed.changes if c.part == "linear"}
     each = [f"{NAMES[n]} {plain(v, 2)} {'µm/m' if n[0] == 'E' else 'µrad'}" for n, v in hidden.items()]
-    unseen = [words for n, words in NAMES.items() if n not in hidden and n not in named]
+    unseen = [name for n, name in NAMES.items() if n not in hidden and n not in named]
     out = [f"  what may have changed all the same, at most (k = 2): {', '.join(each)}"] if each else []
     return out + ([f"  not seen by these runs: {', '.join(unseen)}"] if unseen else [])
 

@@ -30,7 +30,7 @@ def answer_doc(finding: Finding) -> dict[str, Any]:
         if found := getattr(finding, name):
             doc[name] = [asdict(one) for one in found]
     doc |= {"suspects": [_effect(e) for e in finding.suspects]} if finding.suspects else {}
-    doc |= {"thinning": finding.thinning.model_dump()} if finding.thinning is not None else {}
+    doc |= {"thinning": finding.thinning.model_dump(by_alias=True)} if finding.thinning is not None else {}
     doc |= {"next_test": _next_test(test)} if test is not None else {}
     if fitted is not None:
         doc |= {"rms_before_um": fitted.before_um, "rms_after_um": fitted.after_um, "noise_floor_um": fitted.floor_um}

@@ -65,7 +65,7 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
     gap = _gap_text(finding)
     if finding.verdict == "none":
         return _nothing_missing_verdict(finding, gap)
-    names = " and ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
+    names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.effects)
     if finding.verdict == "unknown":
         beside = f" Beside it: {names}." if names else _suspect_text(finding)
         there = "; ".join(location_lines(finding.location)) or "it could not be located"
@@ -109,7 +109,7 @@ def _proof_text(judged: Judgement) -> str:
 
 def _suspect_text(finding: Finding) -> str:
     """Effects that the judging runs do not confirm; empty without any."""
-    names = " and ".join(f"{e.words} {size_text(e)}" for e in finding.suspects)
+    names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.suspects)
     return f" Suspected: {names}; but {finding.proof}." if names else ""
 
 
@@ -157,7 +157,7 @@ def book_lines(finding: Finding) -> list[str]:
 
 def effect_lines(effect: EffectFound) -> list[str]:
     """One named effect: size, remedy, place, rivals."""
-    lines = [f"{effect.words}: {size_text(effect)}"]
+    lines = [f"{effect.full_title}: {size_text(effect)}"]
     lines += [f"  {name}: {parameter_text(p)}" for name, p in effect.parameters.items()]
     lines.append(f"  what to do: {effect.remedy_text} ({REMEDIES[effect.remedy]})")
     there = location_lines(effect.location)

@@ -106,7 +106,7 @@ class FoundThinning(FileObject):
     interval_s: float
     highest_hz: float
     values_with_reversal: int
-    not_seen: list[str]
+    unobservable: list[str] = Field(alias="not_seen")
 
 
 class DiscoveryFile(FileObject):

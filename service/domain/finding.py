@@ -95,7 +95,7 @@ class EffectSize:
     location: Location = field(default_factory=Localization)
 
     @property
-    def words(self) -> str:
+    def full_title(self) -> str:
         """Title and place (axis or motion)."""
         return f"{self.title} {self.key}".strip()
 

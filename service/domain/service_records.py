@@ -13,7 +13,7 @@ class AlarmKind(StrEnum):
     """Kind of a line. The first four change the alarm itself, the others record the service's work on it."""
 
     RAISED = "raised"
-    HELD = "held"
+    CONTINUED = "held"
     ACKNOWLEDGED = "acknowledged"
     CLEARED = "cleared"
     BEGUN = "begun"

@@ -148,7 +148,7 @@ class BudgetLineValue(FileObject):
     """
 
     source: str
-    words: str
+    text: str = Field(alias="words")
     u_um: float
     share: float
     type: Literal["A", "B"] | None = None
@@ -225,7 +225,7 @@ class MachineModel(FileObject):
     """Version of the machine's model, its effects that were removed from the readings, and those that no table corrects."""
 
     version: int
-    taken_out: list[str]
+    removed: list[str] = Field(alias="taken_out")
     not_for_tables: list[str]
 
 
@@ -236,7 +236,7 @@ class LostMotion(FileObject):
     u: float
 
 
-class TableTakenOut(FileObject):
+class TableRemoval(FileObject):
     """The table that the runs were measured with; its effect beyond smooth corrections was removed, with this lost motion by axis."""
 
     crc: int | None = None
@@ -281,8 +281,10 @@ class SolutionFile(FileObject):
     step_diagonals: dict[str, dict[str, float]]
     step_diagonals_note: str
     machine_model: MachineModel | None = None
-    table_taken_out: TableTakenOut | None = None
-    table_not_taken_out: str | None = Field(default=None, description="why the side effects of a table in force are still in the readings")
+    table_removal: TableRemoval | None = Field(default=None, alias="table_taken_out")
+    table_not_removed: str | None = Field(
+        default=None, alias="table_not_taken_out", description="why the side effects of a table in force are still in the readings"
+    )
     campaign: str | None = None
     machine: MachineObject | None = None
     solution_id: int | None = None

@@ -311,7 +311,7 @@ def no_table_lines(known: ModelVersion | None) -> list[str]:
     if known is None:
         return []
     return [
-        f"{e.words} (model version {known.version}) needs {REMEDIES[e.remedy]}, not tables: {e.remedy_text}"
+        f"{e.full_title} (model version {known.version}) needs {REMEDIES[e.remedy]}, not tables: {e.remedy_text}"
         for e in known.book.effects
         if e.remedy != "table"
     ]

@@ -82,9 +82,9 @@ def check_same(found: Compensation, expected: Compensation, tolerance_mm: float)
     worst = max(found_differences, key=lambda d: d.size_mm)
     if worst.size_mm <= tolerance_mm:
         return found_differences
-    where = ", ".join(f"{a} {v:g}" for a, v in zip(AXES, worst.at_mm, strict=True))
+    place = ", ".join(f"{a} {v:g}" for a, v in zip(AXES, worst.at_mm, strict=True))
     size = (
-        f"the correction of {worst.axis} differs by {worst.size_mm * 1e3:.2f} µm at {where} moving in {'+' if worst.direction > 0 else '−'}"
+        f"the correction of {worst.axis} differs by {worst.size_mm * 1e3:.2f} µm at {place} moving in {'+' if worst.direction > 0 else '−'}"
     )
     raise TableContradicts(f"{_mistake(found, expected) or 'these are other tables than expected'} ({size})", REMEDY)
 
@@ -103,9 +103,9 @@ def _mistake(found: Compensation, expected: Compensation) -> str:
     swapped = want[::-1]
     if np.linalg.norm(swapped - want) > 1e-3 * size and np.linalg.norm(have - swapped) < ALIKE * np.linalg.norm(swapped - want):
         return "the columns of the two directions are exchanged"
-    for factor, words in FACTORS:
+    for factor, text in FACTORS:
         if np.linalg.norm(have - factor * want) < ALIKE * abs(factor) * size:
-            return words
+            return text
     for a in range(3):
         rest = [k for k in range(3) if k != a]
         one, other = np.linalg.norm(have[..., a] + want[..., a]), np.linalg.norm(want[..., a])

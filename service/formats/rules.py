@@ -143,7 +143,7 @@ class SignRule:
     adds_position: bool
     evidence: Evidence
     sure: bool
-    words: str
+    text: str
 
 
 SIGNS: dict[str, SignRule] = {

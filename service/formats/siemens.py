@@ -84,15 +84,15 @@ def parse(file: TextFile, name: str) -> Assignments:
     return out
 
 
-def grid(found: Assignments, count: int, step: float, first: float, last: float, where: tuple[str, str]) -> F1:
-    """Positions of equidistant points, checked against the stated end; ``where``: variable and index of the end, for the message.
+def grid(found: Assignments, count: int, step: float, first: float, last: float, end_key: tuple[str, str]) -> F1:
+    """Positions of equidistant points, checked against the stated end; ``end_key``: variable and index of the end, for the message.
 
     Raises
     ------
     TableFileError
         The step is not positive, or first + (count − 1) step is not the stated end.
     """
-    line = found.line.get((where[0], tuple(where[1].split(","))), 1)
+    line = found.line.get((end_key[0], tuple(end_key[1].split(","))), 1)
     if not step > 0 or abs(first + (count - 1) * step - last) > 1e-6 * max(1.0, abs(last), count):
         raise found.file.wrong(
             line, f"{count} points from {first:g} in steps of {step:g} mm do not end at {last:g}: positions are not those"

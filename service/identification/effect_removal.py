@@ -12,7 +12,7 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import machine_digest, with_changed_readings
 from abbe.service.domain.finding import EffectSize
 from abbe.service.domain.run import Run
-from abbe.service.domain.solution_file import TableTakenOut
+from abbe.service.domain.solution_file import TableRemoval
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import applies, current, no_table_lines, readings_of
 from abbe.service.identification.table_removal import CampaignTable, remove_table
@@ -34,7 +34,7 @@ class RemovedEffects:
     labels: tuple[str, ...]
     lines: tuple[str, ...]
     version: int | None
-    in_force: TableTakenOut | None = None
+    in_force: TableRemoval | None = None
     not_removed: str = ""
 
     @property

@@ -51,14 +51,14 @@ from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
 from abbe.service.identification.stored_prediction import prediction_of
 from abbe.service.tables.measured_with import distinct
 
-WORDS = ("mostly assumption", "usable with care", "good")
+VERDICTS = ("mostly assumption", "usable with care", "good")
 ENOUGH, HALF = 0.8, 0.5
 """Shares of the volume where the error is larger than its uncertainty."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``word``: one of `WORDS`; ``text``: its basis in numbers; ``reasons``: why it is not better."""
+    """``word``: one of `VERDICTS`; ``text``: its basis in numbers; ``reasons``: why it is not better."""
 
     word: str
     text: str
@@ -67,7 +67,7 @@ class Verdict:
     @property
     def sign(self) -> str:
         """Sign of the verdict: ``ok``, ``open`` or ``bad``."""
-        return ("bad", "open", "ok")[WORDS.index(self.word)]
+        return ("bad", "open", "ok")[VERDICTS.index(self.word)]
 
 
 def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0) -> Verdict:
@@ -90,8 +90,8 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
     """
     u, error = float(prediction.u_vector_mm.max()), float(np.sqrt(np.mean(np.sum(prediction.deviation_mm**2, axis=1))))
     reached = number.before_mm / u if u > 0.0 else np.inf
-    level, reasons = WORDS.index(number.verdict), []
-    if level < WORDS.index("good"):
+    level, reasons = VERDICTS.index(number.verdict), []
+    if level < VERDICTS.index("good"):
         reasons.append(f"the layout of the campaign allows no more than {number.value:.1f} times")
     if reached < GOOD:
         level = min(level, 1 if reached >= USABLE else 0)
@@ -107,7 +107,7 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
         reasons.append(f"{not_noise} run{'s' if not_noise > 1 else ''} with residuals that are not noise")
     largest = float(prediction.expanded_vector_mm.max())
     text = f"Error of {error * 1e3:.2g} µm rms over the volume, known to ± {largest * 1e3:.2g} µm at the worst (95 %, rigid motion removed)"
-    return Verdict(WORDS[level], text + (": " + "; ".join(reasons) if reasons else "") + ".", tuple(reasons))
+    return Verdict(VERDICTS[level], text + (": " + "; ".join(reasons) if reasons else "") + ".", tuple(reasons))
 
 
 def layout_line(number: Number) -> str:
@@ -226,7 +226,7 @@ def solution_doc(solved: Solved | Assessment) -> Doc:
 
 def as_doc(solution: SolutionFile) -> Doc:
     """A solution as JSON, without unset fields."""
-    return solution.model_dump(mode="json", exclude_unset=True)
+    return solution.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
 def solution_verdict(found: Assessment) -> Verdict:
@@ -309,7 +309,7 @@ def _budget_line(found: Assessment, line: BudgetLine) -> BudgetLineValue:
     """A source with its evaluation type and degrees of freedom; None for infinite ones."""
     source = found.sources.source(line.name)
     dof = float(source.dof) if np.isfinite(source.dof) else None
-    return BudgetLineValue(source=line.name, words=line.words, u_um=line.u_mm * 1e3, share=line.share, type=source.evaluation, dof=dof)
+    return BudgetLineValue(source=line.name, words=line.text, u_um=line.u_mm * 1e3, share=line.share, type=source.evaluation, dof=dof)
 
 
 def worst_line(found: Assessment) -> str:

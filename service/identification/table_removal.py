@@ -19,7 +19,7 @@ from abbe.service.campaign_data.campaign_checks import check_files, refuse
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import with_changed_readings
 from abbe.service.domain.run import BarSetup, Run
-from abbe.service.domain.solution_file import LostMotion, TableTakenOut
+from abbe.service.domain.solution_file import LostMotion, TableRemoval
 from abbe.service.errors import TableMismatch
 from abbe.service.runs.observations import run_data
 from abbe.service.site import Site
@@ -86,7 +86,7 @@ def remove_table(campaign: Campaign, table: NineTables | None) -> Campaign:
     refuse(check_files(campaign.site.doc, used))  # refuse an inconsistent run here with one line instead of failing in the solver
     lost = _lost_motion(campaign.site, used, table)
     crc = used[0].table.crc
-    removed = TableTakenOut(crc=crc, lost_motion_mm={axis: LostMotion(value=v, u=u) for axis, (v, u) in lost.items()})
+    removed = TableRemoval(crc=crc, lost_motion_mm={axis: LostMotion(value=v, u=u) for axis, (v, u) in lost.items()})
     out = removed_table(table, np.array([v for v, _ in lost.values()]))
     runs = [_subtracted(run, out) if _had_table(run, crc) else run for run in campaign.runs]
     return replace(campaign, runs=runs, removed=removed)
@@ -96,7 +96,7 @@ def _had_table(run: Run, crc: int | None) -> bool:
     return run.table.crc == crc and run.table.acting is not False
 
 
-def table_line(removed: TableTakenOut) -> str:
+def table_line(removed: TableRemoval) -> str:
     """One line about the removed table."""
     lost = ", ".join(f"{axis} {one.value * 1e3:.1f} µm (u {one.u * 1e3:.1f})" for axis, one in removed.lost_motion_mm.items())
     which = "" if removed.crc is None else f" {removed.crc:08X}"

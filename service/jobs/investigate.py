@@ -120,7 +120,7 @@ async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -
         stopped.set()  # the thread ends at its next report: a service that stops does not wait for the rest of the search
         raise
     _, word, text = verdict_of(finding)
-    names = ", ".join(f"{e.words} {size_text(e)}" for e in finding.effects)
+    names = ", ".join(f"{e.full_title} {size_text(e)}" for e in finding.effects)
     changes = changed_text(finding.changed)
     doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {text}", changes) if t), "discovery": number}
     return await note(AlarmKind.DISCOVERED, doc | _objections(finding, context.store, context.site.name))
@@ -145,7 +145,7 @@ def _objections(finding: Finding, store: Store, machine: str) -> Doc:
     model = current(store, machine)
     known = {e.label for e in model.book.effects} if model is not None else set()
     wrong = [e for e in entering(finding) if e.remedy != "table" and e.label not in known]
-    why = [f"{e.words} is a matter for {REMEDIES[e.remedy]}: {e.remedy_text}" for e in wrong]
+    why = [f"{e.full_title} is a matter for {REMEDIES[e.remedy]}: {e.remedy_text}" for e in wrong]
     if finding.verdict == "unknown":
         why.append("something is missing in the model that the catalogue does not know, and a table would hide it")
     unnamed = finding.verdict == "unknown" and not finding.effects

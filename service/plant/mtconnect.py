@@ -118,8 +118,8 @@ class Agent:
         """Return the Streams document of the current values, or of those when observation ``at`` was made."""
         _only(query, {"at"})
         at = self._number(query, "at", self._next - 1, self._first, self._next - 1)
-        held = self._before | {one.item: one for one in self._buffer if one.sequence <= at}
-        return self._streams(facts, list(held.values()), at + 1)
+        latest = self._before | {one.item: one for one in self._buffer if one.sequence <= at}
+        return self._streams(facts, list(latest.values()), at + 1)
 
     def sample(self, facts: PlantFacts, query: Mapping[str, str]) -> bytes:
         """Return the Streams document of up to ``count`` observations from number ``from`` on."""

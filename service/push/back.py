@@ -159,7 +159,7 @@ def _restage(f: PushFacts, known: Knowledge, truth: Truth, state: PushState) -> 
     if not known.wrote_last:  # the progress of an earlier process is unknown: restart with the present generation
         return record(PushState.ROLLBACK, again="restoring the old table was interrupted")
     image = Image(
-        f.back_bank, f.base_image, f.base_crc, f.base_meaning, known.lease,
+        f.back_bank, f.base_image, f.base_crc, f.base_semantic_digest, known.lease,
         f.restage_gen, f.restage_boot, f.crc, f.chunk_words,
     )  # fmt: skip
     step = stage(image, known)

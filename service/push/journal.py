@@ -30,7 +30,7 @@ class OperationOrder:
         Name of the machine.
     image : bytes
         As the controller will hold it, with its CRC-32 ``crc``.
-    meaning : str
+    semantic_digest : str
         Semantic digest, computed from the tables and not from the image (`abbe.service.push.execute`).
     limits : str
         Digest of the limits that it was checked against.
@@ -53,7 +53,7 @@ class OperationOrder:
     machine: str
     image: bytes
     crc: int
-    meaning: str
+    semantic_digest: str
     limits: str
     owner: int
     level: int = 3
@@ -69,7 +69,7 @@ class OperationOrder:
             "machine": self.machine,
             "image": self.image.hex(),
             "crc": self.crc,
-            "meaning": self.meaning,
+            "meaning": self.semantic_digest,
             "limits": self.limits,
             "owner": self.owner,
             "level": self.level,
@@ -173,7 +173,7 @@ class PushFacts(OperationOrder):
     base_bank: int = NOT_YET
     base_crc: int = NOT_YET
     base_image: bytes = b""
-    base_meaning: str = ""
+    base_semantic_digest: str = ""
     target: int = NOT_YET
     reasons: tuple[str, ...] = ()
     approval: str = ""
@@ -222,13 +222,15 @@ _NO_ORDER: Doc = {
     "machine": "",
     "image": b"",
     "crc": NOT_YET,
-    "meaning": "",
+    "semantic_digest": "",
     "limits": "",
     "owner": NOT_YET,
     "level": NOT_YET,
     "chunk_words": 0,
 }
-_FIELDS = tuple((one.name, _CONVERTED.get(one.name)) for one in fields(PushFacts))
+_KEYS = {"semantic_digest": "meaning", "base_semantic_digest": "base_meaning"}
+"""Keys of the journal's entries that have another name than the fact."""
+_FIELDS = tuple((one.name, _KEYS.get(one.name, one.name), _CONVERTED.get(one.name)) for one in fields(PushFacts))
 _SNAPSHOT = frozenset({
     "machine", "image", "crc", "meaning", "limits", "owner", "level", "attended", "chunk_words", "boot", "gen", "map",
     "base_bank", "base_crc", "base_image", "base_meaning", "target",
@@ -263,7 +265,7 @@ def _merged(journal: Journal) -> Doc:
 
 
 def _parsed(doc: Doc) -> PushFacts:
-    known = {name: doc[name] if convert is None else convert(doc[name]) for name, convert in _FIELDS if name in doc}
+    known = {name: doc[key] if convert is None else convert(doc[key]) for name, key, convert in _FIELDS if key in doc}
     return PushFacts(**(_NO_ORDER | known))
 
 

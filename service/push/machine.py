@@ -138,7 +138,7 @@ def _precheck(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _stage(f: PushFacts, known: Knowledge) -> Operation:
-    image = Image(f.target, f.image, f.crc, f.meaning, f.owner, f.gen, f.boot, f.base_crc, f.chunk_words)
+    image = Image(f.target, f.image, f.crc, f.semantic_digest, f.owner, f.gen, f.boot, f.base_crc, f.chunk_words)
     step = stage(image, known)
     if isinstance(step, Coherent):
         return record(PushState.STAGED, staged_gen=step.truth.gen)

@@ -75,7 +75,7 @@ class VolumeMap:
     """Deviation (actual minus nominal, best-fit rigid motion removed) at the nodes of an even grid over the strokes, X slowest.
 
     Nodes lie at every combination of ``x_mm``, ``y_mm``, ``z_mm``. ``motions``: the motions that make up the map. ``deviation_um``: dX, dY,
-    dZ; ``expanded_um``: their U and that of the length, k = 2. ``told`` (significant): whether the 95 % ellipsoid around the deviation
+    dZ; ``expanded_um``: their U and that of the length, k = 2. ``significant``: whether the 95 % ellipsoid around the deviation
     excludes zero; otherwise neither error nor direction is known. ``hidden``: motions without a map of their own.
     """
 
@@ -87,7 +87,7 @@ class VolumeMap:
     z_mm: list[float]
     deviation_um: list[tuple[float, float, float]]
     expanded_um: list[tuple[float, float, float, float]]
-    told: list[bool]
+    significant: list[bool]
     coverage_factor: float = 2.0
     hidden: list[HiddenMotion]
 
@@ -137,7 +137,7 @@ def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) 
         z_mm=z,
         deviation_um=[(dx, dy, dz) for dx, dy, dz in found.deviation_um.round(3).tolist()],
         expanded_um=[(ux, uy, uz, u) for ux, uy, uz, u in (2.0 * found.u_um).round(3).tolist()],
-        told=found.significant.tolist(),
+        significant=found.significant.tolist(),
         hidden=[HiddenMotion(motion=name, reason=why) for name, why in stored.hidden.items()],
     )
 

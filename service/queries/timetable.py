@@ -9,28 +9,28 @@ from zoneinfo import ZoneInfo
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.queries.reader import Reader
-from abbe.service.scheduler.slots import cron_in_words, next_slot
+from abbe.service.scheduler.slots import next_slot, rule_as_text
 
 LATEST = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NextDue:
-    """Next slot of a schedule; ``cron_words``, ``words``: its rule and the due time in English."""
+    """Next slot of a schedule; ``rule_text``, ``due_text``: its rule and the due time in English."""
 
     schedule: str
     recipe: str
     due_utc: datetime
     timezone: str
-    cron_words: str
-    words: str
+    rule_text: str
+    due_text: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduleState(Schedule):
     """One line of the timetable. ``next_due_utc`` None: the expression never matches again; ``latest``: slots, newest first."""
 
-    in_words: str
+    rule_text: str
     next_due_utc: datetime | None
     latest: list[SlotRecord]
 
@@ -42,8 +42,8 @@ def next_due(schedule: Schedule, slot_utc: datetime, now: datetime) -> NextDue:
         recipe=schedule.recipe,
         due_utc=slot_utc,
         timezone=schedule.timezone,
-        cron_words=cron_in_words(schedule),
-        words=due_in_words(slot_utc, now, ZoneInfo(schedule.timezone)),
+        rule_text=rule_as_text(schedule),
+        due_text=due_as_text(slot_utc, now, ZoneInfo(schedule.timezone)),
     )
 
 
@@ -51,7 +51,7 @@ def schedule_state(reader: Reader, schedule: Schedule) -> ScheduleState:
     """A schedule with its next slot and the outcome of its latest slots."""
     return ScheduleState(
         **{name: getattr(schedule, name) for name in Schedule.__dataclass_fields__},
-        in_words=cron_in_words(schedule),
+        rule_text=rule_as_text(schedule),
         next_due_utc=next_slot(schedule, reader.clock.utc()),
         latest=past_slots(reader, schedule.name, LATEST),
     )
@@ -62,7 +62,7 @@ def past_slots(reader: Reader, schedule: str, limit: int) -> list[SlotRecord]:
     return reader.store.slots.latest(f"{reader.machine}/{schedule}", limit)
 
 
-def due_in_words(due: datetime, now: datetime, zone: tzinfo) -> str:
+def due_as_text(due: datetime, now: datetime, zone: tzinfo) -> str:
     """A due time as text: ``Monday 23 November 06:00, in 2 days``."""
     left_s = (due - now).total_seconds()
     local = due.astimezone(zone)

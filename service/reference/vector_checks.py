@@ -154,8 +154,8 @@ class Checks:
         if large.any():
             q.max_rel = max(q.max_rel, float((off[large] / size[large]).max()))
         for i in np.flatnonzero(off > allowed)[:3]:
-            where = f"[{i}]" if off.size > 1 else ""
-            q.failures.append(f"{stored.label}{where}: stored {float(expected.ravel()[i])!r}, computed {float(got.ravel()[i])!r}")
+            index = f"[{i}]" if off.size > 1 else ""
+            q.failures.append(f"{stored.label}{index}: stored {float(expected.ravel()[i])!r}, computed {float(got.ravel()[i])!r}")
 
     def assume(self, text: str) -> None:
         """Record a fact of the layout that the file does not state, found by trial: the figures agree only with it."""
@@ -169,8 +169,8 @@ class Checks:
     @property
     def ok(self) -> bool:
         """Whether every comparison and form holds, every number was used, no input was refused, and the file was readable."""
-        held = all(q.ok for q in (*self.quantities.values(), *self.forms.values()))
-        return held and bool(self.quantities) and not (self.error or self.refused or self.unread)
+        passed = all(q.ok for q in (*self.quantities.values(), *self.forms.values()))
+        return passed and bool(self.quantities) and not (self.error or self.refused or self.unread)
 
     def to_document(self) -> dict[str, Any]:
         """JSON value for ``--json``."""

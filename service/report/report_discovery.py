@@ -163,7 +163,7 @@ def _verdict(finding: Finding) -> tuple[str, str, str]:
 
 def _sections(found: _Found) -> list[Section]:
     finding = found.finding
-    out = [Section(f"{e.words}: {size_text(e)}", [Facts(_card(e))]) for e in finding.effects]
+    out = [Section(f"{e.full_title}: {size_text(e)}", [Facts(_card(e))]) for e in finding.effects]
     if changed := changed_lines(finding.changed):
         out.append(Section("What has changed", [Lines([line.strip() for line in changed])]))
     if located := location_lines(finding.location):
@@ -229,7 +229,7 @@ def _pictures(found: _Found) -> list[Block]:
 def _figures(finding: Finding) -> list[ReportFigure]:
     out = []
     for e in finding.effects:
-        group = f"Effect: {e.words}"
+        group = f"Effect: {e.full_title}"
         out.append(ReportFigure(group, e.label, e.title, e.strength, e.u_strength, unit(e.unit), e.source))
         out += [ReportFigure(group, n, n.replace("_", " "), p.value, p.u, unit(p.unit)) for n, p in e.parameters.items()]
     for role, gap in finding.gaps.items():
@@ -243,7 +243,7 @@ def _figures(finding: Finding) -> list[ReportFigure]:
 
 def _open(finding: Finding) -> list[str]:
     out = ["these runs cannot tell it from: " + ", ".join(finding.confounded_with)] if finding.confounded_with else []
-    out += [f"{e.words} could also be: {line}" for e in finding.effects for line in rival_lines(e)]
+    out += [f"{e.full_title} could also be: {line}" for e in finding.effects for line in rival_lines(e)]
     return out + unseen_lines(finding)
 
 

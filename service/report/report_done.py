@@ -144,7 +144,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
             "Corrections are what the controller adds to the command, as the independent decoder reads them; they have no U of their own."
         ],
         provenance=parts.provenance(parts.doc_digest([e.digest for e in journal]))
-        | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": known.meaning},
+        | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": known.semantic_digest},
         appendix=[*_drawn(tables), Section("Journal", [TextTable(("Entry", "What happened"), lines)])],
     )
     return with_later_changes(document, store, machine, journal[-1].utc, []) if journal[-1].state is PushState.KEEP else document

@@ -204,7 +204,7 @@ def _residuals(solution: SolutionResult | None) -> list[Section]:
 def _budget(solution: SolutionResult | None) -> list[Section]:
     if solution is None:
         return []
-    rows = [(b.words, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.solution.uncertainty.budget]
+    rows = [(b.text, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.solution.uncertainty.budget]
     title = "Uncertainty budget of the predicted deviation, rms over the volume"
     return [Section(title, [TextTable(("Source", "u in µm", "Share"), rows)])]
 

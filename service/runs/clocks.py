@@ -59,9 +59,9 @@ def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunCl
     tries: list[tuple[float, float, str]] = []
     path_us = end.path_us
     if edges.whole and path_us is not None and edges.last_us > edges.first_us:
-        seen_s = (edges.last_us - edges.first_us) * 1e-6 + edges.period_s
+        recorded_s = (edges.last_us - edges.first_us) * 1e-6 + edges.period_s
         run_s = (path_us[1] - path_us[0]) * 1e-6
-        tries.append((run_s / seen_s, float(np.sqrt(1.0 / 6.0)) * edges.period_s / seen_s, "sync line"))
+        tries.append((run_s / recorded_s, float(np.sqrt(1.0 / 6.0)) * edges.period_s / recorded_s, "sync line"))
     if isinstance(found, tuple):
         tries.append((*relative_rate(*found), "arrivals"))
         doc |= _compared(found, end, edges)

@@ -175,7 +175,7 @@ class AlarmManager(RetryingStore):
         for one in alarms:
             pushed = one.last(AlarmKind.PUSHED)
             schedule = self._schedule_of(one)
-            if pushed is None or pushed.doc.get("word") != "kept" or one.held_seq > pushed.seq or schedule is None:
+            if pushed is None or pushed.doc.get("word") != "kept" or one.judged_seq > pushed.seq or schedule is None:
                 continue
             if (one.number, pushed.seq) not in self._checked_again:
                 # Marked when it begins: a check that may not start yet is offered again.
@@ -229,7 +229,7 @@ class AlarmManager(RetryingStore):
         if messages:
             self._channels.posted()
         log.warning(doc["text"], alarm=entry.alarm, kind=str(kind))
-        if kind is not AlarmKind.HELD:
+        if kind is not AlarmKind.CONTINUED:
             target = f"{self._machine}, alarm {entry.alarm}" if entry.alarm != NO_ALARM else self._machine
             try:
                 event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": doc["text"]})

@@ -75,7 +75,7 @@ def slots_between(schedule: Schedule, after_utc: datetime, until_utc: datetime) 
         yield slot
 
 
-def cron_in_words(schedule: Schedule) -> str:
+def rule_as_text(schedule: Schedule) -> str:
     """Return the schedule as a sentence, for people."""
     if schedule.every_h:
         return f"Every {schedule.every_h:g} hours, counted from {schedule.first.astimezone(UTC):%Y-%m-%d %H:%M} UTC"

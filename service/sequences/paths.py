@@ -1,6 +1,6 @@
 """Paths: the ball-bar streams while the axes run a polyline; an error ends both.
 
-Motion never outlives the block that commanded it (`motion_guard`); if the stop fails, the error tells the person to press e-stop.
+Motion never outlives the block that commanded it (`motion_interlock`); if the stop fails, the error tells the person to press e-stop.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ UNDELIVERED = "the stop could not be delivered: press e-stop"
 
 
 @asynccontextmanager
-async def motion_guard(controller: Motion, spare: Spare | None = None) -> AsyncIterator[None]:
+async def motion_interlock(controller: Motion, spare: Spare | None = None) -> AsyncIterator[None]:
     """Stop the axes when an error or a cancellation ends this block. The error leaves with a warning if the stop failed.
 
     ``spare`` returns whether another program controls the machine and nothing of ours can move: then no stop is sent.
@@ -114,7 +114,7 @@ async def record_path(
     stretch = None if remainder is None else StretchComparison(remainder, step.rate_hz)
     pump = Pump(recorder, step.rate_hz, way, stretch)
     # The guard stands inside the stream: closing the stream of a silent box takes seconds, and the axes must stop before that.
-    async with session.need_ballbar().stream(step.rate_hz, recorder.tap()) as batches, motion_guard(controller):
+    async with session.need_ballbar().stream(step.rate_hz, recorder.tap()) as batches, motion_interlock(controller):
         try:
             async with asyncio.TaskGroup() as group:
                 pumping = group.create_task(pump.run(batches))
@@ -132,7 +132,7 @@ async def record_path(
 async def follow_path(controller: Paths, step: FollowPath, control: Control) -> None:
     """Run a path without recording."""
     await controller.load_path(step.points_mm)
-    async with motion_guard(controller):
+    async with motion_interlock(controller):
         await controller.start_path(feed_mm_min=step.feed_mm_min)
         await follow(controller, control)
 
@@ -153,7 +153,7 @@ async def follow(controller: Motion, control: Control, way: PathProgress | None 
         if way is not None and status.path_running:
             way.add(status)
         if control.pausing or control.stopping:
-            await hold(controller)
+            await feed_hold(controller)
             control.check()
             raise RunInterrupted("paused on the path: its readings are kept as evidence", "the path is measured again after the pause")
         if status.path_points_done != points:
@@ -163,7 +163,7 @@ async def follow(controller: Motion, control: Control, way: PathProgress | None 
         await asyncio.sleep(POLL_S)
 
 
-async def hold(controller: Motion) -> None:
+async def feed_hold(controller: Motion) -> None:
     """Apply feed hold and wait until the axes stand: a real machine then brakes along its path, which an abort need not do."""
     await controller.hold()
     until_s, last = asyncio.get_running_loop().time() + STAND_S, None

@@ -278,7 +278,7 @@ def rest_of(
         How far the path was read in this mounting.
     """
     first = 0 if hand is None else hand + 1
-    start = before if hand is None else _standing(test.steps[:first])
+    start = before if hand is None else _final_position(test.steps[:first])
     if hand is not None and isinstance(test.steps[hand], TakeBarOut) and start is None:
         start = before
     steps = test.steps[first:]
@@ -386,10 +386,10 @@ def anew(test: TestPlan, number: int) -> TestPlan:
 
 def end_of(test: TestPlan) -> Point | None:
     """Position of the machine after a test."""
-    return _standing(test.steps)
+    return _final_position(test.steps)
 
 
-def _standing(steps: tuple[Step, ...]) -> Point | None:
+def _final_position(steps: tuple[Step, ...]) -> Point | None:
     trail = _trail(None, steps)
     return trail[-1] if trail else None
 

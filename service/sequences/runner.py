@@ -17,7 +17,7 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
-from abbe.service.sequences.paths import bar_trouble, follow_path, motion_guard, record_path
+from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back
 from abbe.service.sequences.steps import (
     ChangeBar,
@@ -136,7 +136,7 @@ class Runner:
         # The guard is outermost: its warning of a failed stop must not be lost among the watcher's errors.
         check_ours(await self._s.controller.status())  # before the guard, whose stop would end another program
         self._stands = not plan.mounts
-        async with motion_guard(self._s.controller, self._spared), watched(self._s, self._control, self._watching) as watch:
+        async with motion_interlock(self._s.controller, self._spared), watched(self._s, self._control, self._watching) as watch:
             check_interlocks(await self._s.controller.status())
             here = await self._gone_back(attempt, recorder, watch)
             for k, step in enumerate(plan.steps):

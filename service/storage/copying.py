@@ -44,9 +44,9 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
     try:
         with closing(_reader(source)) as origin, closing(sqlite3.connect(target)) as copy:
             try:
-                origin.backup(copy, pages=PAGES, progress=_stall_guard(locked_s, RESTARTS), sleep=0.05)
+                origin.backup(copy, pages=PAGES, progress=_stall_detection(locked_s, RESTARTS), sleep=0.05)
             except _RestartedTooOftenError:
-                origin.backup(copy, pages=-1, progress=_stall_guard(locked_s, None), sleep=0.05)
+                origin.backup(copy, pages=-1, progress=_stall_detection(locked_s, None), sleep=0.05)
             copy.execute("PRAGMA journal_mode=DELETE")  # one file: a copy in WAL mode would need two more
     except _LockedError:
         raise StoreError(f"database {source}: locked for {locked_s:g} s", "another process is writing: stop it or try again") from None
@@ -55,7 +55,7 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
     sync_file(target)
 
 
-def _stall_guard(locked_s: float, restarts: int | None) -> Callable[[int, int, int], None]:
+def _stall_detection(locked_s: float, restarts: int | None) -> Callable[[int, int, int], None]:
     """Return a callback for SQLite's backup steps that ends a copy without progress."""
     last = {"left": -1, "restarts": 0}
     moved_s = [time.monotonic()]

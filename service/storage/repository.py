@@ -141,16 +141,21 @@ class Repository:
         self._db = database
 
     def _all(
-        self, of: RecordMapping[R], *where: ColumnElement[bool], order: Order | None = None, newest: bool = False, limit: int | None = None
+        self,
+        of: RecordMapping[R],
+        *conditions: ColumnElement[bool],
+        order: Order | None = None,
+        newest: bool = False,
+        limit: int | None = None,
     ) -> list[R]:
         """All records that match, by ``order`` (default: id); with ``newest`` in descending order."""
         by = of.table.c.id if order is None else order
-        query = of.select().where(*where).order_by(by.desc() if newest else by).limit(limit)
+        query = of.select().where(*conditions).order_by(by.desc() if newest else by).limit(limit)
         return [of.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]
 
-    def _first(self, of: RecordMapping[R], *where: ColumnElement[bool]) -> R | None:
+    def _first(self, of: RecordMapping[R], *conditions: ColumnElement[bool]) -> R | None:
         """The first record that matches, None if there is none."""
-        return next(iter(self._all(of, *where, limit=1)), None)
+        return next(iter(self._all(of, *conditions, limit=1)), None)
 
     def _get(self, of: RecordMapping[R], number: int, what: str, remedy: str = "") -> R:
         """The record of an id. Raises NotStored."""

@@ -334,10 +334,10 @@ def push_log(journal: Journal) -> tuple[str, ...]:
     lines = []
     for entry in journal:
         known = facts((entry,))
-        words = [known.why, known.pending, known.again, known.approved_by, known.probe, known.verify]
+        parts = [known.why, known.pending, known.again, known.approved_by, known.probe, known.verify]
         if entry.state is PushState.SNAPSHOT:
-            words = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; to come: CRC {known.crc:08X}"]
-        lines.append(": ".join([str(entry.state), *filter(None, words)]) + f" ({entry.utc})")
+            parts = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; to come: CRC {known.crc:08X}"]
+        lines.append(": ".join([str(entry.state), *filter(None, parts)]) + f" ({entry.utc})")
     return tuple(lines)
 
 

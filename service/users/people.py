@@ -230,10 +230,10 @@ class People:
             return ANONYMOUS
         session, user = found
         now = self._clock.utc()
-        seen, begun = parse_utc(session.seen_utc), parse_utc(session.created_utc)
-        if session.ended_utc is not None or user.disabled_utc is not None or now - seen > IDLE or now - begun > LONGEST:
+        last_used, begun = parse_utc(session.seen_utc), parse_utc(session.created_utc)
+        if session.ended_utc is not None or user.disabled_utc is not None or now - last_used > IDLE or now - begun > LONGEST:
             return ANONYMOUS
-        if in_use and now - seen > TOUCH:
+        if in_use and now - last_used > TOUCH:
             self._store.people.touch_session(session.id)
         role = Role(user.role)
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)

@@ -77,7 +77,7 @@ class Alarm:
     last_seq: int
     changed_utc: str
     active: bool = True
-    held_seq: int = 0
+    judged_seq: int = 0
     acknowledged_by: str = ""
     acknowledged_utc: str = ""
     cleared_utc: str = ""
@@ -106,7 +106,7 @@ def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
         return None
     if now is None or not now.active:
         return AlarmKind.RAISED if found.signals else None
-    return AlarmKind.CLEARED if not found.signals and found.verdict == "pass" else AlarmKind.HELD
+    return AlarmKind.CLEARED if not found.signals and found.verdict == "pass" else AlarmKind.CONTINUED
 
 
 def folded(lines: Iterable[AlarmEntryRecord]) -> list[Alarm]:
@@ -135,7 +135,7 @@ def _raised(line: AlarmEntryRecord) -> Alarm:
         d["verification"],
         line.seq,
         line.utc,
-        held_seq=line.seq,
+        judged_seq=line.seq,
     )
 
 
@@ -152,7 +152,7 @@ def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:
         return replace(alarm, work=(*alarm.work, line))
     if not alarm.active:
         return alarm
-    alarm = replace(alarm, signals=_signals(d), text=d["text"], verification=d["verification"], held_seq=line.seq)
+    alarm = replace(alarm, signals=_signals(d), text=d["text"], verification=d["verification"], judged_seq=line.seq)
     return replace(alarm, active=False, cleared_utc=line.utc) if kind is AlarmKind.CLEARED else alarm
 
 
@@ -170,7 +170,7 @@ def next_step(alarm: Alarm) -> AlarmKind | None:
         return None
     failed = alarm.last(AlarmKind.FAILED)
     often = sum(s.kind is AlarmKind.FAILED for s in alarm.work) >= TRIES
-    if often or (failed is not None and alarm.work[-1] is failed and alarm.held_seq < failed.seq):
+    if often or (failed is not None and alarm.work[-1] is failed and alarm.judged_seq < failed.seq):
         return None
     if alarm.last(AlarmKind.DISCOVERED) is not None:
         return AlarmKind.PROPOSED

@@ -25,7 +25,7 @@ from abbe.service.runs.points import POSITION, TOOL, PointsFile, read_points
 from abbe.service.site import machine_from_doc
 
 FORMAT = "abbe-deviations/1"
-MEANING = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"
+CONVENTION = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"
 SLACK_MM = 1e-9
 """Tolerance for rounding at the ends of a stroke."""
 CHUNK = 65_536
@@ -216,7 +216,7 @@ def deviations_json(found: Deviations) -> Iterator[str]:
         "format": FORMAT,
         "machine": found.machine,
         "model": found.model,
-        "meaning": MEANING,
+        "meaning": CONVENTION,
         "uncertainty": {"given": found.u_mm is not None, "text": found.uncertainty},
         "not_observable": found.not_observable,
         "warnings": found.warnings,

@@ -66,8 +66,8 @@ def evaluate(runs: Sequence[Run], instruments: dict[str, Any] | None = None) -> 
     out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]
     for test in linear:
         _axis(out, test, budget)
-    for where, tests in along.items():
-        _diagonals(out, where, tests, budget)
+    for plane, tests in along.items():
+        _diagonals(out, plane, tests, budget)
     if linear or along:
         known = StatedInputs()
         numbers = {"wave": known.u_wavelength * 1e6, "kelvin": known.u_scale_temperature_k, "expansion": known.scale_expansion_per_k * 1e6}
@@ -130,9 +130,9 @@ def _positioning(label: str, x_label: str, p: Positioning) -> Picture:
     return Picture(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=text)], "wide")
 
 
-def _diagonals(out: Evaluated, where: str, tests: list[AxisTest], budget: ScaleBudget) -> None:
-    found = diagonals({t.name: t.readings for t in tests}, BODY if where == "body" else FACE, budget)
-    what = "Body diagonals" if where == "body" else f"Face diagonals {where}"
+def _diagonals(out: Evaluated, plane: str, tests: list[AxisTest], budget: ScaleBudget) -> None:
+    found = diagonals({t.name: t.readings for t in tests}, BODY if plane == "body" else FACE, budget)
+    what = "Body diagonals" if plane == "body" else f"Face diagonals {plane}"
     group = f"{what}: ISO 230-6"
     rows = [
         ("E_d", "systematic deviation, both directions, of diagonal {}", found.E_d),

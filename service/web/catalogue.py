@@ -37,7 +37,7 @@ class ErrorEntry:
 
     code: str
     name: str
-    meaning: str
+    description: str
     status: int | None
 
 
@@ -69,16 +69,16 @@ def status_of(kind: type[AbbeError]) -> int:
 
 def entries() -> list[ErrorEntry]:
     """The catalogue, in the order of the codes."""
-    found = {code: ErrorEntry(code, f"HTTP {status}", meaning, status) for status, (code, meaning) in HTTP.items()}
+    found = {code: ErrorEntry(code, f"HTTP {status}", description, status) for status, (code, description) in HTTP.items()}
     for kind in (*_tree(AbbeError), *_tree(DriverError)):
         status = status_of(kind) if issubclass(kind, AbbeError) else None
-        found[kind.code] = ErrorEntry(kind.code, kind.__name__, _meaning(kind), None if status == 500 else status)
+        found[kind.code] = ErrorEntry(kind.code, kind.__name__, _description(kind), None if status == 500 else status)
     return [found[code] for code in sorted(found)]
 
 
 def page() -> str:
     """The catalogue as a Markdown page."""
-    rows = [f"| {one.code} | {one.name} | {one.status or ''} | {one.meaning} |" for one in entries()]
+    rows = [f"| {one.code} | {one.name} | {one.status or ''} | {one.description} |" for one in entries()]
     head = (
         "# Error codes\n\n"
         "Every error has a permanent code. The command line prints cause and remedy and ends with exit code 2; the HTTP\n"
@@ -97,7 +97,7 @@ def _tree(kind: type[AbbeError] | type[DriverError]) -> Iterator[type[AbbeError]
             yield from _tree(below)
 
 
-def _meaning(kind: type) -> str:
+def _description(kind: type) -> str:
     """The first paragraph of a class's docstring, on one line."""
     text = inspect.getdoc(kind) or ""
     return " ".join(text.split("\n\n")[0].split()).replace("|", "\\|")

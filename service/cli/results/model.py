@@ -58,7 +58,7 @@ def show_model(
         print_json(_doc(found))
         return
     typer.echo(f"machine {machine}, model version {found.version}: {found.book.why}")
-    rows = [(e.words, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
+    rows = [(e.full_title, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
     print_table(("effect", "size, U (k = 2)", "remedy", "from campaign"), rows)
     if found.book.gone:
         typer.echo("no longer there: " + ", ".join(found.book.gone))

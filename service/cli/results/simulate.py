@@ -113,7 +113,7 @@ def errors(
 
 
 def _print_deviations(found: Deviations) -> None:
-    from abbe.service.verification.deviations import MEANING
+    from abbe.service.verification.deviations import CONVENTION
 
     count, norm, u = len(found.points.lines), found.norm_mm, found.u_mm
     headings = ["x", "y", "z", "dX", "dY", "dZ", "norm"]
@@ -132,7 +132,7 @@ def _print_deviations(found: Deviations) -> None:
     at = ", ".join(f"{value:g}" for value in found.points.axes_mm[worst])
     spread = "" if u is None else f" (U = {2e3 * u[worst, 3]:.4f} µm)"
     typer.echo(f"{count} points, largest deviation {norm[worst] * 1e3:.4f} µm{spread} at ({at})")
-    typer.echo(MEANING)
+    typer.echo(CONVENTION)
     typer.echo(found.uncertainty)
     for text in found.warnings:
         typer.echo(f"warning: {text}")

@@ -209,10 +209,10 @@ def _print(summary: Assessment, solution: SolutionFile) -> None:
     typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well.")
     typer.echo(worst_line(summary))
     _tables(solution)
-    if solution.table_taken_out is not None:
-        typer.echo(table_line(solution.table_taken_out))
-    if solution.table_not_taken_out is not None:
-        typer.echo(f"look at this: {solution.table_not_taken_out}")
+    if solution.table_removal is not None:
+        typer.echo(table_line(solution.table_removal))
+    if solution.table_not_removed is not None:
+        typer.echo(f"look at this: {solution.table_not_removed}")
     if solution.machine_model is not None:
         _lines("model book, not for tables (taken out of the readings where it lasts):", solution.machine_model.not_for_tables)
     _lines("noise found:", noise_lines(summary.joint))

@@ -31,7 +31,7 @@ def list_formats(as_json: JsonOption = False) -> None:
     from abbe.service.formats.controls import CONTROLS
     from abbe.service.formats.registry import FORMATS
 
-    rows = [(f.key, f.name, _holds(f.limits), str(f.limits.points), f.sign.evidence, f.sign.words) for f in FORMATS.values()]
+    rows = [(f.key, f.name, _holds(f.limits), str(f.limits.points), f.sign.evidence, f.sign.text) for f in FORMATS.values()]
     if as_json:
         keys = ("format", "name", "holds", "points", "evidence", "sign")
         print_json({"formats": [dict(zip(keys, r, strict=True)) for r in rows], "controls": {c.key: c.name for c in CONTROLS.values()}})

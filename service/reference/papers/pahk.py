@@ -85,7 +85,7 @@ PATTERN_STEP_DEG, PATTERN_POINTS, PATTERN_CIRCLES, PATTERN_ON_CIRCLES = printed(
 # Numbers of math.md 8 about the two machines, with all its digits.
 MATH_DIAGONAL_MM: dict[str, Printed] = {"CMM A": Printed("1140.449"), "CMM B": Printed("1905.256")}
 MATH_MEAN_UM: dict[str, Printed] = {"CMM A": Printed("-3.2"), "CMM B": Printed("-16.95")}
-MATH_ALONE_UM: dict[str, tuple[Printed, ...]] = {
+MATH_SINGLE_UM: dict[str, tuple[Printed, ...]] = {
     "CMM A": printed("-17.8", "30.7", "-17.9", "5.0"),
     "CMM B": printed("-65.5", "127.7", "-72.8", "10.7"),
 }
@@ -168,7 +168,7 @@ def _known(cmm: Cmm) -> list[Comparison]:
         stated(location, "mean of the printed diagonals", "µm", MATH_MEAN_UM[cmm.name], mean_um, "printed diagonals"),
         *(
             stated(location, f"{name} of squareness alone", "µm", number, 1e3 * value, of_type)
-            for (name, value), number in zip(diagonals_mm.items(), MATH_ALONE_UM[cmm.name], strict=True)
+            for (name, value), number in zip(diagonals_mm.items(), MATH_SINGLE_UM[cmm.name], strict=True)
         ),
         stated(location, "best order of the diagonals misses by", "µrad", MATH_MISFIT_URAD[cmm.name], misfit_rad / URAD, trials),
     ]

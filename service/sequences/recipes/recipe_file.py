@@ -37,15 +37,15 @@ def shared_setups(recipes: tuple[Recipe, ...], source: str) -> tuple[Recipe, ...
     if twice:
         raise ConfigError(f"{source}: two tests are labelled {twice[0]!r}", "give every test its own label")
     out: list[Recipe] = []
-    seen: set[str] = set()
+    setups: set[str] = set()
     for setup, members in groupby(recipes, key=lambda r: r.setup_id):
         group = list(members)
-        if setup in seen:
+        if setup in setups:
             raise ConfigError(
                 f"{source}: test {group[0].label!r} uses set-up {setup!r}, which was taken down before",
                 "put its tests in a row, or name a new set-up",
             )
-        seen.add(setup)
+        setups.add(setup)
         for before, after in pairwise(group):
             _check_shared(before, after, source)
         out += [_mounting(group, k) for k in range(len(group))]

@@ -181,12 +181,12 @@ class Runs(Repository):
 
     def latest(self, limit: int, *, campaign: str = "", test: str = "", status: str = "") -> list[RunRecord]:
         """List the newest runs, newest first, of a campaign, test and stored status; empty: any."""
-        where = (
+        conditions = (
             *if_given(campaigns.c.name, campaign or None),
             *if_given(runs.c.test, test or None),
             *if_given(runs.c.status, status or None),
         )
-        return self._all(RUN, *where, newest=True, limit=limit)
+        return self._all(RUN, *conditions, newest=True, limit=limit)
 
     def find(self, id_or_label: int | str) -> RunRecord:
         """Find a run by its label (``"r01"``, or ``"campaign/r01"`` where several campaigns use it), or by its id (also as text).
@@ -331,8 +331,8 @@ class Chunks(Repository):
 
     def between(self, run_id: int, channel: str, first: int, last: int) -> list[ChunkRecord]:
         """Chunks ``first`` to ``last`` of a channel, with their payloads, in order."""
-        where = (chunks.c.run_id == run_id, chunks.c.channel == channel, chunks.c.seq.between(first, last))
-        return self._all(CHUNK, *where, order=chunks.c.seq)
+        conditions = (chunks.c.run_id == run_id, chunks.c.channel == channel, chunks.c.seq.between(first, last))
+        return self._all(CHUNK, *conditions, order=chunks.c.seq)
 
     def crcs(self, run_id: int) -> dict[tuple[str, int], int]:
         """CRC of every chunk of a run by channel and number, without reading payloads."""

@@ -95,9 +95,9 @@ class Pages(Repository):
         ``filters``: required values by column, None for any; ``before``: only rows with a smaller id, the last one of the page before.
         """
         listing = LISTINGS[kind]
-        where = [listing.columns[name] == filters[name] for name in listing.filters if filters.get(name) is not None]
-        where += [] if before is None else [listing.columns["id"] < before]
-        query = listing.query().where(*where).order_by(listing.columns["id"].desc()).limit(limit)
+        conditions = [listing.columns[name] == filters[name] for name in listing.filters if filters.get(name) is not None]
+        conditions += [] if before is None else [listing.columns["id"] < before]
+        query = listing.query().where(*conditions).order_by(listing.columns["id"].desc()).limit(limit)
         return [dict(row) for row in self._db.read(lambda connection: connection.execute(query).mappings().all())]
 
     def row(self, kind: str, number: int) -> Doc | None:

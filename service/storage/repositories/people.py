@@ -112,9 +112,9 @@ class People(Repository):
         """List all tokens with their users."""
         return self._tokens()
 
-    def _tokens(self, *where: ColumnElement[bool]) -> list[tuple[TokenRecord, UserRecord]]:
+    def _tokens(self, *conditions: ColumnElement[bool]) -> list[tuple[TokenRecord, UserRecord]]:
         query = TOKEN.select().add_columns(*USER.columns).join(users, users.c.id == api_tokens.c.user_id)
-        rows = self._db.read(lambda connection: connection.execute(query.where(*where).order_by(api_tokens.c.id)).all())
+        rows = self._db.read(lambda connection: connection.execute(query.where(*conditions).order_by(api_tokens.c.id)).all())
         return [(TOKEN.read(row), USER.read(row)) for row in rows]
 
     def revoke_token(self, token_id: int) -> None:

@@ -97,7 +97,7 @@ def _size(value_um: float, digits: int) -> str:
 
 def _source(b: BudgetLineValue) -> SourceLine:
     dof = "–" if b.type is None else "∞" if b.dof is None else plain(b.dof, 3)
-    return SourceLine(_name(b), b.words, _size(b.u_um, 2), f"{b.share:.1%}", b.type or "–", dof)
+    return SourceLine(_name(b), b.text, _size(b.u_um, 2), f"{b.share:.1%}", b.type or "–", dof)
 
 
 def _worst(worst: WorstPoint) -> list[IntervalLine]:

@@ -170,7 +170,7 @@ def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
         picture,
         solution.not_observable,
         solution.advice,
-        [(b.words, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.uncertainty.budget],
+        [(b.text, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.uncertainty.budget],
         [(k, str(r.readings), plain(r.rms_um), plain(r.expected_um), str(r.outliers)) for k, r in solution.runs.items()],
         solution.flags,
     )

@@ -47,7 +47,7 @@ class ScheduleLine:
     """A schedule: its next slot as text in the reader's language, and the outcome of past slots."""
 
     due: NextDue
-    in_words: str
+    due_text: str
     slots: Sequence[SlotRecord]
 
 

@@ -3,7 +3,7 @@
 const STEPS = 5;
 
 export function colourOf(map, k, style) {
-  if (!map.told[k]) return style.grey;
+  if (!map.significant[k]) return style.grey;
   return style.steps[Math.min(STEPS - 1, Math.floor((STEPS * map.length[k]) / style.top))];
 }
 
@@ -25,7 +25,7 @@ export function prepared(answer, unit) {
   const [deviation, expanded] = [answer.deviation_um, answer.expanded_um].map((rows) => rows.map((row) => row.map((v) => v / unit.um)));
   const length = deviation.map((d) => Math.hypot(...d));
   const box = mm.map((a) => (a[n - 1] - a[0]) / span / 2);
-  return { n, axes, at: nodes(axes), places, length, box, deviation, expanded, told: answer.told, move: (unit.um * 1e-3) / span };
+  return { n, axes, at: nodes(axes), places, length, box, deviation, expanded, significant: answer.significant, move: (unit.um * 1e-3) / span };
 }
 
 export function moved(map, k, factor) {
@@ -95,13 +95,13 @@ export function shape(map, view, style) {
       push(lines, map.places[a], style.nominal);
       push(lines, map.places[b], style.nominal);
       for (const [k, other] of [[a, b], [b, a]]) {
-        push(lines, moved(map, k, view.factor), map.told[other] ? colourOf(map, k, style) : style.grey);
+        push(lines, moved(map, k, view.factor), map.significant[other] ? colourOf(map, k, style) : style.grey);
       }
     });
   }
   if (view.arrows) {
     map.places.forEach((place, k) => {
-      if (inCut(map, k, view.cut) && map.told[k]) arrow(lines, corners, place, moved(map, k, view.factor), colourOf(map, k, style));
+      if (inCut(map, k, view.cut) && map.significant[k]) arrow(lines, corners, place, moved(map, k, view.factor), colourOf(map, k, style));
     });
   }
   if (view.cut) sheet(map, view.cut, corners, style);

@@ -81,7 +81,7 @@ class SmallDisk(RealFileIO):
         self.room += os.fstat(handle).st_size - size
         super().truncate(handle, size)
 
-    def hold_space(self, path: Path, size: int) -> None:
+    def reserve_space(self, path: Path, size: int) -> None:
         if size > self.room:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self.room, self._held = self.room - size, size
@@ -150,7 +150,7 @@ class Tape(RealFileIO):
     def close(self, handle: int) -> None:
         self.operations.append(("close", b""))
 
-    def hold_space(self, path: Path, size: int) -> None:
+    def reserve_space(self, path: Path, size: int) -> None:
         pass
 
 

@@ -209,7 +209,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
             raise
 
     running.investigate = deaf
-    running.store.alarms.append("mill-7", 1, running.alarm().last_seq + 1, AlarmKind.HELD, RAISED, [])
+    running.store.alarms.append("mill-7", 1, running.alarm().last_seq + 1, AlarmKind.CONTINUED, RAISED, [])
     await running.until(lambda: running.alarm().work[-1].kind is AlarmKind.BEGUN)
     assert (await running.steer("abort"))[0] == "done"  # at once: nothing of the work looks at the control
     await running.until(lambda: len(running.jobs("done: failed")) == 2)

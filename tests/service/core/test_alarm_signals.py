@@ -251,7 +251,7 @@ async def test_a_push_that_the_service_did_not_survive_is_said_and_not_begun_aga
 
 def test_a_line_on_old_knowledge_is_refused(bench: Bench) -> None:
     bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, {})
-    bench.store.alarms.append("mill-7", 1, 1, AlarmKind.HELD, {})
+    bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CONTINUED, {})
     with pytest.raises(StoreError, match="another process changed alarm 1 of mill-7"):
         bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CLEARED, {})
     assert bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, {}).alarm == NO_ALARM

@@ -57,10 +57,10 @@ def test_the_life_of_an_alarm() -> None:
     assert book.check(BAD) is AlarmKind.RAISED
     assert book.alarms[0].word == "raised"
     assert book.check(NOT_MEASURED) is None
-    assert book.check(UNSURE) is AlarmKind.HELD  # too near to the limit to say that it is over
+    assert book.check(UNSURE) is AlarmKind.CONTINUED  # too near to the limit to say that it is over
     book.acknowledge()
     assert book.alarms[0].word == "acknowledged"
-    assert book.check(BAD) is AlarmKind.HELD
+    assert book.check(BAD) is AlarmKind.CONTINUED
     assert book.alarms[0].word == "acknowledged"
     assert book.check(GOOD) is AlarmKind.CLEARED
     assert book.alarms[0].word == "closed"
@@ -92,12 +92,12 @@ def test_whatever_happens(acts: list[FiredRule | str]) -> None:
         else:
             kind = book.check(act)
             if act is BAD:
-                assert kind is (AlarmKind.HELD if on else AlarmKind.RAISED)
+                assert kind is (AlarmKind.CONTINUED if on else AlarmKind.RAISED)
                 count, seen, on = (count, seen, True) if on else (count + 1, False, True)
             elif act is NOT_MEASURED or not on:
                 assert kind is None
             else:
-                assert kind is (AlarmKind.CLEARED if act is GOOD else AlarmKind.HELD)
+                assert kind is (AlarmKind.CLEARED if act is GOOD else AlarmKind.CONTINUED)
                 on = act is not GOOD
         alarms = book.alarms
         assert len(alarms) == count
@@ -126,7 +126,7 @@ def test_a_restart_anywhere_finds_the_same(acts: list[FiredRule | str], cut: int
 def test_lines_that_cannot_follow_are_left_out() -> None:
     stray = [
         AlarmEntryRecord(0, "mill-7", 0, 0, AlarmKind.PUSHED, {"text": "no alarm asked for it"}, "t"),
-        AlarmEntryRecord(0, "mill-7", 7, 0, AlarmKind.HELD, {}, "t"),
+        AlarmEntryRecord(0, "mill-7", 7, 0, AlarmKind.CONTINUED, {}, "t"),
         AlarmEntryRecord(0, "mill-7", 7, 1, AlarmKind.ACKNOWLEDGED, {}, "t"),
     ]
     assert folded(stray) == []

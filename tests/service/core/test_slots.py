@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from abbe.service.domain.schedule import Schedule
-from abbe.service.scheduler.slots import cron_in_words, next_slot, previous_slot, slots_after, slots_between
+from abbe.service.scheduler.slots import next_slot, previous_slot, rule_as_text, slots_after, slots_between
 
 ZONES = ["Europe/Berlin", "America/New_York", "Australia/Lord_Howe", "UTC"]
 CRONS = ["0 6 * * 1", "30 2 * * *", "0,30 2 * * *", "*/30 * * * *", "15 1-3 * * *", "0 0 1 * *", "45 1 * * *"]
@@ -106,4 +106,4 @@ def test_a_bad_line_is_named(cron: str, zone: str, word: str) -> None:
 
 
 def test_words() -> None:
-    assert "Monday" in cron_in_words(plan("0 6 * * 1"))
+    assert "Monday" in rule_as_text(plan("0 6 * * 1"))

@@ -15,7 +15,7 @@ from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ready import DeviceReadings, Ready
-from abbe.service.scheduler.slots import covers, cron_in_words, next_slot, previous_slot, slots_between
+from abbe.service.scheduler.slots import covers, next_slot, previous_slot, rule_as_text, slots_between
 from tests.pretended_status import READY, controller_status
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
 
@@ -133,7 +133,7 @@ def test_intervals_are_counted_from_a_fixed_instant() -> None:
     assert next_slot(every, utc(2026, 1, 2, 6)) == utc(2026, 1, 3, 18)
     assert previous_slot(every, utc(2026, 1, 2, 6)) == utc(2026, 1, 2, 6)
     assert previous_slot(every, utc(2026, 1, 2, 5)) == utc(2025, 12, 31, 18)
-    assert cron_in_words(every) == "Every 36 hours, counted from 2026-01-02 06:00 UTC"
+    assert rule_as_text(every) == "Every 36 hours, counted from 2026-01-02 06:00 UTC"
 
 
 @pytest.mark.parametrize(

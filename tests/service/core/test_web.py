@@ -72,7 +72,7 @@ async def test_status_of_a_fresh_service(site: Site) -> None:
     assert status["machine"] == "mill-7"
     assert status["job"] is None
     assert [device["state"] for device in status["devices"]] == ["not used yet"] * 2
-    assert status["next_due"][0]["words"] == "Monday 23 November 06:00, in 2 days"
+    assert status["next_due"][0]["due_text"] == "Monday 23 November 06:00, in 2 days"
     assert status["mqtt"] == {"configured": True, "broker": "mqtt://127.0.0.1:1883", "connected": False, "waiting": 0, "dropped": 0}
     assert status["last"] == []
 

@@ -51,7 +51,7 @@ def page() -> str:
         held = ", ".join(w for w in words if getattr(f.limits, w))
         held += "; both directions" if f.limits.own and f.limits.directional else ""
         sure = "" if f.sign.sure else " **(see the step first)**"
-        text += f"| `{f.key}` {f.name} | {held} | {f.limits.points} | {f.sign.words}{sure} | {f.sign.evidence} | {f.live} |\n"
+        text += f"| `{f.key}` {f.name} | {held} | {f.limits.points} | {f.sign.text}{sure} | {f.sign.evidence} | {f.live} |\n"
     text += _PROOF
     for p in all_proofs():
         at = ", ".join(f"{v:g}" for v in p.at_mm)

@@ -5,7 +5,7 @@ import pytest
 
 from abbe.models.solvers.observability.volume import Number
 from abbe.models.uncertainty.prediction import Prediction
-from abbe.service.identification.solve_report import WORDS, verdict
+from abbe.service.identification.solve_report import VERDICTS, verdict
 
 
 def layout(value: float, word: str) -> Number:
@@ -57,5 +57,5 @@ def test_one_weak_point_holds_the_word_down_and_is_named(number, prediction, sha
 
 def test_more_weak_points_never_make_it_better():
     all_of_them = verdict(layout(4.0, "usable with care"), known(0.02, 0.025), 0.3, flags=1, not_noise=1)
-    assert all_of_them.word == WORDS[0]
+    assert all_of_them.word == VERDICTS[0]
     assert len(all_of_them.reasons) == 5

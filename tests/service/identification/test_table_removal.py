@@ -145,7 +145,7 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
         assert prepare(before, catalogue(), None).digest != job.digest
     capsys.readouterr()
     assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6", "--json"]) == 0
-    told = SolutionFile.model_validate_json(capsys.readouterr().out).table_taken_out
+    told = SolutionFile.model_validate_json(capsys.readouterr().out).table_removal
     assert told is not None
     assert told.crc == crc32(image)
     assert told.lost_motion_mm == left.removed.lost_motion_mm

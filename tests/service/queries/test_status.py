@@ -31,7 +31,7 @@ async def test_the_running_check_is_shown_as_the_core_has_it(reader: Reader, pla
     found = await status_of(reader, board)
     assert found.job is board.job
     assert json_value(found)["job"] == json_value(board.job)
-    assert (found.next_due[0].schedule, found.next_due[0].words) == ("daily", "Monday 23 November 06:00, in 20 h")
+    assert (found.next_due[0].schedule, found.next_due[0].due_text) == ("daily", "Monday 23 November 06:00, in 20 h")
 
 
 async def test_the_revision_changes_with_more_than_progress(reader: Reader, plant: Plant) -> None:

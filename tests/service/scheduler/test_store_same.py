@@ -271,7 +271,7 @@ def refused(ask: Any) -> None:
     )
     ask.discoveries.add_step(1, 0, "BEGUN", DOC), ask.models.add(NewVersion("mill-7", None, DOC))
     (
-        ask.alarms.append("mill-7", 1, 1, AlarmKind.HELD, DOC),
+        ask.alarms.append("mill-7", 1, 1, AlarmKind.CONTINUED, DOC),
         ask.verifications.add(77, None, "pass", DOC),
         ask.checkpoints.add(77, "begun", DOC),
     )

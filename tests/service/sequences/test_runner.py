@@ -8,10 +8,10 @@ import pytest
 
 from abbe.drivers.api import BarBatch, BarSample, Condition
 from abbe.drivers.errors import LinkDown, ReplyTimeout
-from abbe.service.campaigns.measure import OpenCampaign, ProgressMeter, measure_test
+from abbe.service.campaigns.measure import OpenCampaign, ProgressReporter, measure_test
 from abbe.service.devices.session import Session
 from abbe.service.errors import MeasurementFault
-from abbe.service.sequences.paths import UNDELIVERED, motion_guard, warnings_of
+from abbe.service.sequences.paths import UNDELIVERED, motion_interlock, warnings_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
 from tests.pretended_status import READY, controller_status
@@ -143,7 +143,7 @@ async def test_a_stop_that_does_not_get_through_is_part_of_the_error():
 
 async def test_errors_of_the_job_keep_kind_and_remedy_when_the_stop_fails():
     with pytest.raises(MeasurementFault) as caught:
-        async with motion_guard(FakeController([], deaf=True)):
+        async with motion_interlock(FakeController([], deaf=True)):
             raise MeasurementFault("feed hold was pressed", "start again")
     assert (caught.value.detail, caught.value.remedy) == (f"feed hold was pressed; {UNDELIVERED}", "start again")
 
@@ -152,7 +152,7 @@ async def test_a_cancelled_job_whose_stop_fails_stays_cancelled_and_says_so():
     entered = asyncio.Event()
 
     async def job() -> None:
-        async with motion_guard(FakeController([], deaf=True)):
+        async with motion_interlock(FakeController([], deaf=True)):
             entered.set()
             await asyncio.Event().wait()
 
@@ -174,7 +174,7 @@ class Clock:
 
 def test_the_time_a_person_takes_does_not_spoil_the_eta():
     clock, seen = Clock(), []
-    meter = ProgressMeter("job", 100.0, seen.append, clock)
+    meter = ProgressReporter("job", 100.0, seen.append, clock)
     clock.now_s = 300.0
     meter.at(0.0, "mounted", waited_s=300.0)
     clock.now_s = 310.0

@@ -192,7 +192,7 @@ async def test_codes_are_one_catalogue_and_one_page(client):
     told = (await got(client, "/errors"))["errors"]
     assert [one["code"] for one in told] == [one.code for one in entries()]
     assert len(told) == len({one["code"] for one in told}) > 60
-    assert all(one["meaning"] for one in told)
+    assert all(one["description"] for one in told)
     assert (ROOT / "docs" / "reference" / "error-codes.md").read_text(encoding="utf-8") == page(), (
         "python -m abbe.service.web.catalogue > docs/reference/error-codes.md"
     )

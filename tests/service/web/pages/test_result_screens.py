@@ -58,8 +58,8 @@ def test_the_interface_answers_the_map_with_the_whole_covariance(running: Served
     covariances = np.einsum("mik,kl,mjl->mij", d, covariance, d, optimize=True) + doc["prediction"]["scatter_mm"] ** 2 * np.eye(3)
     off = d @ coefficients
     far = np.einsum("mi,mij,mj->m", off, np.linalg.inv(covariances), off)
-    assert told["told"] == (far > chi2.ppf(0.95, 3)).tolist()
-    assert any(told["told"])
+    assert told["significant"] == (far > chi2.ppf(0.95, 3)).tolist()
+    assert any(told["significant"])
     assert {h["motion"] for h in told["hidden"]} == {n for n, s in statuses(running).items() if s == "not observable"}
     assert set(told["motions"]) == set(statuses(running))
 
