@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from abbe.drivers.api import BarBatch, Point
 from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.service.domain.bounds import WORD
-from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.progress import RecordedPath
 from abbe.service.runs.helix_axis import about_axis, helix_axis
 
 F1 = NDArray[np.float64]

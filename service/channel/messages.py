@@ -20,10 +20,8 @@ from typing import Annotated, Literal, Self, TypeVar
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from abbe.service.domain.bounds import Number, Text, Word
-from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.progress import RunningCheck
-from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken
 

@@ -18,8 +18,7 @@ from abbe.service.channel.messages import Snapshot
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.domain.bounds import TEXT, WORD
-from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.progress import Progress, RunningCheck
+from abbe.service.domain.progress import DeviceStatus, Progress, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import StoreError
 from abbe.service.mqtt.publisher import Publisher

@@ -40,7 +40,7 @@ from abbe.service.children import python_command
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Orders
-from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.progress import RecordedPath
 from abbe.service.errors import AbbeError, ChannelBroken
 
 # Sends the web process the samples of the running path, twenty times a second, and never waits for it.

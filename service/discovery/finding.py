@@ -18,6 +18,8 @@ from abbe.service.domain.finding import (
     EffectFound,
     Finding,
     GapUm,
+    PackedCovariance,
+    PackedReadings,
     ParameterFound,
     RefittedModel,
     RivalEffect,
@@ -25,7 +27,6 @@ from abbe.service.domain.finding import (
     RunSeries,
     Unnamed,
 )
-from abbe.service.domain.packed_arrays import PackedCovariance, PackedReadings
 
 
 def finding_of(

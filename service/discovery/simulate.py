@@ -14,8 +14,7 @@ from abbe.models.discovery.solved_model import left_together, predictions, solve
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discover import DiscoveryJob
 from abbe.service.discovery.finding import noise_mm_of, rms
-from abbe.service.domain.finding import Finding, GapUm, RunFit, RunSeries
-from abbe.service.domain.packed_arrays import PackedReadings
+from abbe.service.domain.finding import Finding, GapUm, PackedReadings, RunFit, RunSeries
 
 FORMAT = "abbe-simulation/1"
 ROLES: tuple[Role, ...] = ("identify", "holdout")

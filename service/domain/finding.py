@@ -1,16 +1,63 @@
-"""Findings of a discovery, as they are stored, reported and drawn. Gaps in µm, predictions in mm."""
+"""Findings of a discovery, as they are stored, reported and drawn, and the arrays in them. Gaps in µm, predictions in mm."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import Field
 
+from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Agreement, BlindSpot, Fitted, Localization, NextTest, Unjudged, Verdict
 from abbe.service.domain.discovery_file import FoundThinning
-from abbe.service.domain.packed_arrays import PackedCovariance, PackedReadings
+
+READINGS = "base64 of float32, little endian, mm"
+MATRIX = "base64 of float64, little endian, lower triangle by rows"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackedReadings:
+    """Residuals or predictions of one run, mm; float32 keeps 7 digits, a nanometre of 10 mm."""
+
+    n: int
+    data: str
+    encoding: str = READINGS
+
+    @classmethod
+    def of(cls, values_mm: F1) -> Self:
+        """Pack readings, shape (n,)."""
+        return cls(n=int(values_mm.size), data=base64.b64encode(np.asarray(values_mm, dtype="<f4").tobytes()).decode())
+
+    @property
+    def values_mm(self) -> F1:
+        """The readings, shape (n,)."""
+        return np.frombuffer(base64.b64decode(self.data), dtype="<f4").astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackedCovariance:
+    """A symmetric matrix, its lower triangle only."""
+
+    n: int
+    data: str
+    encoding: str = MATRIX
+
+    @classmethod
+    def of(cls, matrix: F2) -> Self:
+        """Pack a symmetric matrix, shape (n, n)."""
+        lower = np.asarray(matrix, dtype=np.float64)[np.tril_indices(len(matrix))]
+        return cls(n=len(matrix), data=base64.b64encode(lower.astype("<f8").tobytes()).decode())
+
+    @property
+    def matrix(self) -> F2:
+        """The matrix, shape (n, n)."""
+        out = np.zeros((self.n, self.n))
+        out[np.tril_indices(self.n)] = np.frombuffer(base64.b64decode(self.data), dtype="<f8")
+        return np.asarray(out + np.tril(out, -1).T)
+
 
 Kind = Literal["mean", "variance"]
 """Whether an effect moves the readings or makes them noisier."""

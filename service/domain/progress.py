@@ -1,10 +1,13 @@
-"""Progress of long work: one record from the work itself to page, JSON, OPC UA and MTConnect."""
+"""Progress of long work, the path in recording and the devices: one record from the work itself to page, JSON, OPC UA and MTConnect."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from abbe.service.domain.bounds import Number, Text, Word
 
@@ -55,3 +58,31 @@ class RunningCheck(Progress):
     def percent(self) -> float | None:
         """Elapsed share of the planned time, percent; None if there is no plan."""
         return 100.0 * self.done / self.total if self.total > 0 else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedPath:
+    """A path that is being recorded. ``angle_deg``: about the axis of the test, at even parts of the path's length, not wrapped.
+
+    ``number`` 0: no path is being recorded.
+    """
+
+    number: Number = 0
+    run: Word = ""
+    test: Word = ""
+    radius_mm: float = 0.0
+    feed_mm_min: float = 0.0
+    rate_hz: Number = 0
+    duration_s: float = 0.0
+    angle_deg: Annotated[tuple[float, ...], Field(max_length=1000)] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeviceStatus:
+    """State of a device of the machine file, and when it last answered. It is not polled between checks."""
+
+    role: Word
+    url: Text
+    state: Literal["not used yet", "in use", "answered", "fault"]
+    at_utc: datetime | None = None
+    text: Text = ""

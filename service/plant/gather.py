@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol
 
-from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.push_entry import BEFORE_ACTIVATION, PushEntry, PushState
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import CheckFailure, Verification

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal, Protocol
 
-from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmKind
 from abbe.service.domain.verification import Verification

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from fastapi import Path, Query
 
-from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.progress import DeviceStatus
 from abbe.service.domain.schedule import Schedule
 from abbe.service.queries.reader import Reader
 from abbe.service.report.report_parts import Rules

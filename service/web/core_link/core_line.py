@@ -25,9 +25,8 @@ from abbe.service.channel.messages import (
     from_core,
 )
 from abbe.service.clock import Clock
-from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import CoreSilent
 from abbe.service.web.core_link.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard

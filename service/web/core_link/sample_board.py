@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pydantic import TypeAdapter
 
 from abbe.service.channel.messages import LiveSamples
-from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.progress import RecordedPath
 from abbe.service.errors import ChannelBroken
 
 VERSION = 1

@@ -16,8 +16,8 @@ from pydantic import AfterValidator
 
 from abbe.service.compensation.proved_levels import KIND
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.measured import CampaignRecord
+from abbe.service.domain.progress import DeviceStatus
 from abbe.service.domain.utc import utc_text
 from abbe.service.queries.fleet import FleetFigure, MachineStatus, machine_statuses
 from abbe.service.secrets import mask_secrets

@@ -21,10 +21,8 @@ from abbe.service.channel.messages import FULL_B, Wire
 from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
-from abbe.service.domain.device_status import DeviceStatus
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.progress import RunningCheck
-from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreSilent
 from abbe.service.storage.store import Store

@@ -10,8 +10,7 @@ import pytest
 
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.domain.discovery import FindingSource
-from abbe.service.domain.finding import EffectFound, Finding
-from abbe.service.domain.packed_arrays import PackedCovariance
+from abbe.service.domain.finding import EffectFound, Finding, PackedCovariance
 from abbe.service.effects.model_book import extended_book, total
 
 SOURCE = FindingSource(campaign="c1", machine_digest="m")

@@ -7,8 +7,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from abbe.service.domain.device_status import DeviceStatus
-from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.verification import Verdict, Verification
 from abbe.service.errors import StoreError
 from abbe.service.plant.gather import ActiveTable, PlantAlarm, PlantFacts

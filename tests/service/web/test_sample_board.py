@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from abbe.service.channel.messages import LiveSamples
-from abbe.service.domain.recorded_path import RecordedPath
+from abbe.service.domain.progress import RecordedPath
 from abbe.service.errors import ChannelBroken
 from abbe.service.web.core_link.sample_board import HEAD, KEPT_FRAMES, MOST_EACH, MOST_LISTENERS, QUEUE, SampleBoard
 

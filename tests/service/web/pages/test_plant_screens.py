@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from abbe.service.clock import SystemClock
-from abbe.service.domain.device_status import DeviceStatus
+from abbe.service.domain.progress import DeviceStatus
 from abbe.service.queries.fleet import FleetFigure, MachineLine
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
