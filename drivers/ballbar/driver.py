@@ -28,7 +28,7 @@ from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.shielded import run_to_end
 
 _ANSWER_S = 1.0
-_SILENCE_S = 1.0
+_SAMPLE_TIMEOUT_S = 1.0
 _BUFFER_S = 30.0
 _FRAME_BYTES = 24
 _DRAIN_S = 10.0
@@ -233,7 +233,7 @@ class SerialBallBar:
             self._attach(stream)
             self.incidents.good()
             await self._talk.command(frames.START, lambda tag: frames.start_command(tag, rate_hz))
-            yield self._batches(stream, max(_SILENCE_S, 50 / rate_hz))
+            yield self._batches(stream, max(_SAMPLE_TIMEOUT_S, 50 / rate_hz))
             self._judge(stream, self.counters.bad_bytes - bad_bytes)
         except DriverError as error:
             if error.device == self.name:  # the caller may have failed at another device
@@ -294,16 +294,16 @@ class SerialBallBar:
         """Fill of the ring between reading and storing, 0 to 1."""
         return 0.0 if self._framing is None else self._framing.ring.fill
 
-    async def _batches(self, stream: Stream, silence_s: float) -> AsyncIterator[BarBatch]:
+    async def _batches(self, stream: Stream, timeout_s: float) -> AsyncIterator[BarBatch]:
         while True:
             try:
-                batch = await stream.get(silence_s)
+                batch = await stream.get(timeout_s)
             except TimeoutError:
                 break
             yield batch
         # Silence: a restarted box is idle. Check for that, so that the error names the true reason.
         await self._box.check_boot()
-        raise ReplyTimeout(self.name, "read samples", f"no sample for {silence_s:g} s", "box switched off, or stopped by another program?")
+        raise ReplyTimeout(self.name, "read samples", f"no sample for {timeout_s:g} s", "box switched off, or stopped by another program?")
 
     async def _ready(self) -> None:
         await self._box.check_boot()

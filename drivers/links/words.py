@@ -91,7 +91,7 @@ def bytes_of(words: Sequence[int]) -> bytes:
 
 
 _ORDERS = {"CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}
-_WORDS = {
+_ORDER_NAMES = {
     "CDAB": "the two registers of a value are swapped (CDAB)",
     "BADC": "the bytes inside a register are swapped (BADC)",
     "DCBA": "registers and bytes are swapped (DCBA)",
@@ -121,7 +121,7 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
     if canary != CANARY_I32 or bits != CANARY_F32_BITS:
         detail = f"the canary registers hold {canary:08x} {bits:08x} instead of {CANARY_I32:08x} {CANARY_F32_BITS:08x}"
         orders = {"int32": _order(CANARY_I32, canary), "float32": _order(CANARY_F32_BITS, bits)}
-        named = [f"{name}: {_WORDS[order]}" for name, order in orders.items() if order]
+        named = [f"{name}: {_ORDER_NAMES[order]}" for name, order in orders.items() if order]
         raise WrongDevice(device, "identify", "; ".join([detail, *named]), _SET_ORDER if named else _WHO)
     if counts["MAP_VER"] != map_version:
         detail = f"register map version {counts['MAP_VER']} instead of {map_version}"
