@@ -155,7 +155,7 @@ async def test_the_word_is_the_journal_s(
 
 
 async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) -> None:
-    assert "nothing to take back" in (await bench.ask()).text
+    assert "nothing to roll back" in (await bench.ask()).text
     await bench.push({}, OLD, OTHER, TAKEN_BACK)
     assert "no push of this machine was kept" in (await bench.ask()).text
     await bench.push({}, OLD, NEW, KEPT)
