@@ -232,7 +232,7 @@ async def test_a_path_that_was_interrupted_never_enters_the_solution(place):
     assert store.chunks.of_run(evidence.id)  # kept
     assert evidence.reason.startswith("SEQ-006: paused on the path")
     used = from_store(store, record.name).runs
-    assert [r["run_id"] for r in used] == ["helix-2"]
+    assert [r.run_id for r in used] == ["helix-2"]
     assert again.status == "complete"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import Localization
-from abbe.models.discovery.experiment.additions import LATE_S
+from abbe.models.discovery.experiment.additions import REPEAT_LATE_S
 from abbe.service.discovery.discovery_text import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
 from abbe.service.sequences.recipes.recipe import Helix
@@ -31,7 +31,7 @@ def test_every_addition_is_planned_or_left_to_a_person(add: str, runs: list[Doc]
         return
     assert found.plan is not None
     assert found.by_hand == ()
-    assert found.after_s == (LATE_S if add == "longer_session" else 0.0)
+    assert found.after_s == (REPEAT_LATE_S if add == "longer_session" else 0.0)
     assert all(t.label.startswith("n1-") and t.setup["setup_id"].startswith("n1-") for t in found.plan.tests)
     assert all(t.role == "identify" for t in found.plan.tests)
 

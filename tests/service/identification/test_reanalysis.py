@@ -94,7 +94,10 @@ def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[Re
 def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     for words, told in (
         (["solve-all", "july-*", "--store", url], "error STO-002: no campaign matches 'july-*'"),
-        (["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--store", url], "error CFG-001: --workers and --dask exclude each other"),
+        (
+            ["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--store", url],
+            "error CFG-001: --workers and --dask exclude each other",
+        ),
     ):
         assert run(words) == 2
         err = capsys.readouterr().err
