@@ -96,7 +96,7 @@ def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> 
         (["solve-all", "july-*", "--store", url], "error STO-002: no campaign matches 'july-*'"),
         (
             ["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--store", url],
-            "error CFG-001: --workers and --dask exclude each other",
+            "error CFG-001: --workers and --dask exclude",
         ),
     ):
         assert run(words) == 2
