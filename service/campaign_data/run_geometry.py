@@ -108,6 +108,8 @@ def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None
     beam = setup.nominal_beam
     if beam is not None and float(np.dot(beam, unit)) < 0.999 * float(np.linalg.norm(beam)):
         return GeometryMistake("nominal_beam does not point from start_mm to end_mm", "correct the set-up: exchanged or reversed axes")
+    if test == "laser_linear" and not setup.axis:
+        return GeometryMistake("its set-up states no axis", "state axis: X, Y or Z")
     if test == "laser_linear" and abs(unit["XYZ".index(setup.axis)]) < 0.999:
         moved = "XYZ"[int(np.argmax(np.abs(unit)))]
         return GeometryMistake(f"axis is {setup.axis}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.owner import Owner
 from abbe.service.domain.run_start import RunEnd, RunStart
+from abbe.service.errors import StoreError
+
+T = TypeVar("T")
 
 RUNNING = "running"
 INCOMPLETE = "incomplete"
@@ -63,13 +68,20 @@ class RunRecord(RunFacts):
 
     @property
     def start(self) -> RunStart:
-        """The start document, parsed."""
-        return RunStart.from_document(self.start_doc)
+        """The start document, parsed. Raises StoreError if a field has another type."""
+        return self._parsed(RunStart.from_document, self.start_doc)
 
     @property
     def end(self) -> RunEnd:
-        """The end document, parsed."""
-        return RunEnd.from_document(self.end_doc)
+        """The end document, parsed. Raises StoreError if a field has another type."""
+        return self._parsed(RunEnd.from_document, self.end_doc)
+
+    def _parsed(self, parse: Callable[[Any], T], doc: Doc | None) -> T:
+        try:
+            return parse(doc)
+        except (AttributeError, KeyError, TypeError, ValueError) as err:
+            text = f"run {self.campaign}/{self.label}: its documents lack or garble {err}"
+            raise StoreError(text, "it was not written by Abbe") from None
 
     @property
     def visible_status(self) -> str:

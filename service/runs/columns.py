@@ -99,6 +99,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
     try:
         start = record.start
         columns, timing = _measured(record, start, chunks)
+        _check_documents(record)
         return Run(
             campaign=record.campaign,
             run_id=record.label,
@@ -111,10 +112,18 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
             timing=RunTiming.from_document(timing),
             ended_utc=record.ended_utc or "",
         )
-    except (KeyError, TypeError) as err:
+    except (AttributeError, KeyError, TypeError, ValueError) as err:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
         ) from None
+
+
+def _check_documents(record: RunRecord) -> None:
+    """Raise KeyError where a default would change the readings: clock, machine, rate of a path, start of a path that has an end."""
+    for key in ("machine", "setup", "ctrl0_us", *(("rate_hz",) if record.start_doc.get("path") else ())):
+        record.start_doc[key]
+    if record.end.path_end_us and record.end.path_start_us is None:
+        raise KeyError("path_start_us")
 
 
 def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:

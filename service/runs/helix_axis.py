@@ -46,7 +46,9 @@ def about_axis(at_mm: F2, axis: int) -> F1:
 
 
 def circle_axis(plane: str) -> int:
-    """Axis normal to a plane given by two letters, 0 to 2."""
+    """Axis normal to a plane given by two letters, 0 to 2. Raises MeasurementFault for anything else."""
+    if len(plane) != 2:
+        raise MeasurementFault(f"a circle lies in a plane of two axes, not in {plane!r}", "state the plane in its set-up, for example XY")
     return 3 - sum(AXES.index(letter) for letter in plane)
 
 

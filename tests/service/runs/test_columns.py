@@ -192,6 +192,29 @@ def test_documents_of_strangers_give_one_error(store: Store, campaign_id: int) -
         load_run(store, run_id)
 
 
+@pytest.mark.parametrize("lost", ["rate_hz", "ctrl0_us", "machine", "setup"])
+def test_a_start_document_that_lost_a_field_is_refused_not_read_with_a_default(store: Store, campaign_id: int, lost: str) -> None:
+    doc = start_doc()
+    del doc[lost]
+    run_id = store.runs.start(campaign_id, "r01", "ballbar_helix", "identify", doc)
+    part = stream()
+    store.chunks.append(run_id, "bar", 0, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
+    store.runs.finish(run_id, "complete", "", END)
+    with pytest.raises(StoreError, match="its documents lack or garble"):
+        load_run(store, run_id)
+
+
+def test_an_end_document_without_the_start_of_its_path_is_refused(store: Store, campaign_id: int) -> None:
+    with pytest.raises(StoreError, match="lack or garble 'path_start_us'"):
+        stored(store, campaign_id, stream(), {"path_end_us": END["path_end_us"]})
+
+
+def test_a_start_document_of_other_types_gives_one_error(store: Store, campaign_id: int) -> None:
+    run_id = store.runs.start(campaign_id, "r01", "ballbar_helix", "identify", start_doc() | {"rate_hz": "fast"})
+    with pytest.raises(StoreError, match="c1/r01: its documents lack or garble"):
+        load_run(store, run_id)
+
+
 def test_a_set_up_was_mounted_when_the_end_document_says(store: Store) -> None:
     campaign = store.campaigns.add(store.machines.add("m", MACHINE), "c", {})
     run = stored(store, campaign, stream(), END | {"mounted_us": 7_250_000})

@@ -38,10 +38,10 @@ def figures(
         (figures(40, helix=None), figures(10, helix=None), True, "40.0 → 10.0"),
         (figures(40, u=20), figures(10, u=20), False, "no improvement beyond its uncertainty"),
         (figures(40), figures(10, u_helix=20), False, "cannot tell whether nothing got worse: the helix is uncertain by 40.0 µm"),
-        (figures(40), figures(float("nan")), False, "no number"),
-        (figures(40), figures(10, helix=float("nan")), False, "no number"),
-        (figures(40), figures(10, u_helix=float("inf")), False, "no number"),
-        (figures(float("nan")), figures(10), False, "no number"),
+        (figures(40), figures(float("nan")), False, "not a number"),
+        (figures(40), figures(10, helix=float("nan")), False, "not a number"),
+        (figures(40), figures(10, u_helix=float("inf")), False, "not a number"),
+        (figures(float("nan")), figures(10), False, "not a number"),
         (figures(40), figures(10, air=(20.9, 21.1)), False, "20.0 to 21.1 °C"),
         (figures(40), figures(10, air=(20.8, 20.9)), True, "40.0 → 10.0"),
         (figures(40), figures(10, air=None), False, "how warm the air was is not known"),
@@ -69,7 +69,7 @@ def test_the_worst_verdict_counts_and_nothing_judged_is_no_pass():
     assert overall([]) == "cannot tell"
 
 
-@pytest.mark.parametrize(("before", "why"), [(figures(float("nan")), "no number"), (figures(40, air=None), "how warm the air was")])
+@pytest.mark.parametrize(("before", "why"), [(figures(float("nan")), "not a number"), (figures(40, air=None), "no air temperature was recorded")])
 def test_a_verification_that_nothing_compares_with_is_refused_before_anything_is_written(before, why):
     with pytest.raises(TableRefused, match=why):
         check_before(before)
