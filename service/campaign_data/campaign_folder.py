@@ -61,7 +61,7 @@ def from_folder(folder: Path) -> Campaign:
         For the first mistake in any file.
     """
     content = read_folder(folder)
-    return _campaign(content.campaign["campaign"], content.campaign, content.runs(), folder)
+    return _campaign(content.campaign["campaign"], content.campaign, content.runs, folder)
 
 
 def from_store(store: Store, name: str) -> Campaign:

@@ -141,6 +141,8 @@ class _Finder:
             setup, number = one.setup, one.mounting
             self.mountings[setup] = max(number, self.mountings.get(setup, 1))
             if one.phase == "done" and one.what in MOUNTS:
+                if one.ctrl_us is None:
+                    raise PreconditionsChanged(f"the journal states no time for the mounting of set-up {setup}", "measure a new campaign")
                 self.mounted_us[setup if number == 1 else f"{setup}-{number}"] = one.ctrl_us
 
     async def starts(self, session: Session, confirm: Confirm, messages: list[str]) -> dict[str, Item]:

@@ -13,7 +13,7 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import CampaignRecord, ImportedRun, RunRecord
 from abbe.service.domain.run import Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
-from abbe.service.errors import FileFormatError
+from abbe.service.errors import FileFormatError, StoreError
 from abbe.service.runs.checks import check, check_run, read_json
 from abbe.service.runs.codec import JSON_CODEC, encode_json
 from abbe.service.runs.columns import pack_columns, run_document, single_run, whole_run
@@ -26,15 +26,15 @@ COMPLETE = "complete"
 
 @dataclass(frozen=True, slots=True)
 class Folder:
-    """Content of a checked campaign folder: ``campaign.json``, its run files in order, and the errors file of its ``current_model``."""
+    """Content of a checked campaign folder: ``campaign.json``, its runs in order, and the errors file of its ``current_model``.
+
+    ``run_files``: the documents of ``runs`` as they stand in the files, for an import that keeps unknown keys.
+    """
 
     campaign: Doc
     run_files: list[Doc]
+    runs: list[Run]
     errors: Doc | None
-
-    def runs(self) -> list[Run]:
-        """The runs, parsed."""
-        return [Run.from_document(run) for run in self.run_files]
 
 
 def read_folder(folder: Path) -> Folder:
@@ -50,7 +50,7 @@ def read_folder(folder: Path) -> Folder:
         raise FileFormatError(f"{folder} is a file, expected a folder", f"give the folder that holds {CAMPAIGN_FILE} and its run files")
     campaign = read_json(head)
     parsed = check(head, campaign, CampaignFile)
-    runs = []
+    files, runs = [], []
     for number, entry in enumerate(parsed.runs, start=1):
         path = folder / entry.file
         run = read_json(path)
@@ -63,13 +63,22 @@ def read_folder(folder: Path) -> Folder:
         ):
             if got != wanted:
                 raise FileFormatError(f"{path}: {key}: expected {wanted!r} as in {CAMPAIGN_FILE}, runs[{number}], got {got!r}")
-        runs.append(run)
+        files.append(run)
+        runs.append(_parsed(path, run))
     errors = None
     if parsed.current_model.errors is not None:
         path = folder / parsed.current_model.errors
         errors = read_json(path)
         check(path, errors, ErrorsFile)
-    return Folder(campaign, runs, errors)
+    return Folder(campaign, files, runs, errors)
+
+
+def _parsed(path: Path, run: Doc) -> Run:
+    """The run of a checked file. Keys that only Abbe writes, such as ``table``, may still have another type."""
+    try:
+        return Run.from_document(run)
+    except StoreError as err:
+        raise FileFormatError(f"{path}: {err.detail}", "leave out what Abbe did not write, or correct it") from None
 
 
 def import_folder(store: Store, folder: Path) -> int:
@@ -84,7 +93,7 @@ def import_folder(store: Store, folder: Path) -> int:
     """
     content = read_folder(folder)
     campaign, machine = content.campaign, content.campaign["machine"]
-    imported = [_imported(entry, run) for entry, run in zip(campaign["runs"], content.run_files, strict=True)]
+    imported = [_imported(*one) for one in zip(campaign["runs"], content.run_files, content.runs, strict=True)]
     doc = {"imported": campaign, "errors": content.errors}
     return store.runs.import_campaign((machine.get("name") or campaign["campaign"], machine), (campaign["campaign"], doc), imported)
 
@@ -131,6 +140,8 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
         read = whole_run(store, run) if run.status == COMPLETE else single_run(run, chunks)
         entry = run.start.entry or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
+        if read.setup.t_set_s is None:
+            raise StoreError(f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe")
         setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
         _write_json(folder / entry["file"], run_document(read, run, chunks))
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
@@ -150,8 +161,8 @@ def _campaign_document(store: Store, record: CampaignRecord, entries: list[Doc],
     return base | assumed | record.doc | {"setups": setups, "runs": entries}
 
 
-def _imported(entry: Doc, run: Doc) -> ImportedRun:
-    read, payload = Run.from_document(run), encode_json(pack_columns(run["columns"]))
+def _imported(entry: Doc, run: Doc, read: Run) -> ImportedRun:
+    payload = encode_json(pack_columns(run["columns"]))
     start_doc = {"setup": read.setup.document, "machine": read.machine, "entry": entry, "imported": run | {"columns": None}}
     return ImportedRun(read.run_id, read.test, read.role, start_doc, len(read.columns), JSON_CODEC, payload)
 

@@ -173,8 +173,8 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Col
     return Columns(
         t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
         q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
-        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
-        direction=np.array([one["direction"] for one in records], dtype=np.float64),
+        feed_mm_min=_numbers(records, "feed_mm_min"),
+        direction=_numbers(records, "direction"),
         deviation_mm=np.array([np.mean(one["reading_nm"]) * 1e-6 for one in records], dtype=np.float64),
         valid=np.array([all(bar_is_valid(s) for s in one["status"]) for one in records], dtype=np.bool_),
         further={
@@ -217,13 +217,13 @@ def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
     return Columns(
         t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
         q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
-        feed_mm_min=np.array([one["feed_mm_min"] for one in records], dtype=np.float64),
-        direction=np.array([one["direction"] for one in records], dtype=np.float64),
+        feed_mm_min=_numbers(records, "feed_mm_min"),
+        direction=_numbers(records, "direction"),
         deviation_mm=np.array([_deviation_mm(one, first, beam) for one in records], dtype=np.float64),
         valid=np.array([not (one.get("missing") or beam_is_gone(one["status"])) for one in records], dtype=np.bool_),
         further={
-            "temp_air_C": np.array([one["air_temp_c"] for one in records], dtype=np.float64),
-            "pressure_air_Pa": np.array([one["air_pressure_pa"] for one in records], dtype=np.float64),
+            "temp_air_C": _numbers(records, "air_temp_c"),
+            "pressure_air_Pa": _numbers(records, "air_pressure_pa"),
             "status": np.array([one["status"] for one in records], dtype=np.int64),
             "signal_permille": np.array([one["signal_permille"] for one in records], dtype=np.int64),
         },
@@ -235,3 +235,8 @@ def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[flo
         return 0.0
     nominal_mm = sum(b * (now - before) for b, now, before in zip(beam, one["target_mm"], first["target_mm"], strict=True))
     return float((one["displacement_tenth_nm"] - first["displacement_tenth_nm"]) * MM_PER_COUNT - nominal_mm)
+
+
+def _numbers(records: Sequence[dict[str, Any]], key: str) -> Array:
+    """One number of each record, shape (n,). Raises TypeError for null: NumPy would make it NaN."""
+    return np.array([float(one[key]) for one in records], dtype=np.float64)

@@ -32,14 +32,14 @@ class BegunLine:
 
     plan: str
     source: Doc = field(default_factory=dict)
-    boot_id: int = 0
-    table_crc: int = 0
+    boot_id: int
+    table_crc: int
     owner: Owner | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HandLine:
-    """A manual step of a test: ``phase`` is "asked" or "done"; ``what``: class of the step; ``ctrl_us``: when it was done."""
+    """A manual step of a test: ``phase`` is "asked" or "done"; ``what``: class of the step; ``ctrl_us``: when it was done, None before."""
 
     test: str
     setup: str
@@ -47,7 +47,7 @@ class HandLine:
     step: int
     what: str
     phase: str
-    ctrl_us: int = 0
+    ctrl_us: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

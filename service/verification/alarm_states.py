@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from abbe.service.domain.document import Doc
+from abbe.service.domain.document import Doc, record
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 
 OF_WORK = (
@@ -140,7 +140,7 @@ def _raised(line: AlarmEntryRecord) -> Alarm:
 
 
 def _signals(doc: Doc) -> tuple[Signal, ...]:
-    return tuple(Signal(**one) for one in doc["signals"])
+    return tuple(record(Signal, one, "the alarm") for one in doc["signals"])
 
 
 def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:

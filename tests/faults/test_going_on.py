@@ -16,6 +16,7 @@ from abbe.service.domain.progress import Progress
 from abbe.service.errors import DoorOpen, EstopPressed, Interlock, PreconditionsChanged, Stopped, TemperatureOutside, UnsafeToMove
 from abbe.service.sequences.control import State
 from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.journal import HAND
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadLaser, RecordPath
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import AtStep, Bench, bench, small
@@ -245,6 +246,16 @@ async def test_a_changed_world_is_refused_in_one_line(place):
     with pytest.raises(PreconditionsChanged, match="the controller was restarted since this campaign began"):
         await resume(b.session, store, b.site, plan, "c", yes)
     assert len(statuses(store)) == 1
+
+
+async def test_a_mounting_without_a_time_in_the_journal_is_refused_in_one_line(place):
+    b, store = place
+    plan = await broken_off(b, store)
+    campaign = store.campaigns.all()[-1].id
+    done = next(one.doc for one in store.checkpoints.of_campaign(campaign) if one.kind == HAND and one.doc["what"] == "MountLaser")
+    store.checkpoints.add(campaign, HAND, {**done, "phase": "done", "ctrl_us": None})
+    with pytest.raises(PreconditionsChanged, match="states no time for the mounting of set-up"):
+        await resume(b.session, store, b.site, plan, "c", yes)
 
 
 async def test_a_campaign_that_somebody_measures_is_left_alone(place):

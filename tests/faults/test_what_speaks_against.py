@@ -232,7 +232,7 @@ async def test_a_window_for_the_air_needs_somebody_who_reads_it(place):
 def test_a_campaign_whose_journal_names_no_recipe_is_one_line(tmp_path):
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         campaign = store.campaigns.add(store.machines.add("m", {}), "c", {})
-        store.checkpoints.add(campaign, "begun", {"plan": "", "source": {}})
+        store.checkpoints.add(campaign, "begun", {"plan": "", "source": {}, "boot_id": 1, "table_crc": 2})
         with pytest.raises(PreconditionsChanged, match="the journal of campaign 'c' does not name its recipe"):
             begun_source(store, "c")
 

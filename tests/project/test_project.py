@@ -9,9 +9,11 @@ import shutil
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import pytest
+from setuptools.discovery import PEP420PackageFinder
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base
 from abbe.service.backup.restore import SQLITE_SUFFIXES
@@ -90,6 +92,13 @@ def test_one_package_is_installed_and_its_parts_are_links_to_the_folders() -> No
     spec = importlib.util.find_spec("abbe")
     assert spec is not None
     assert spec.origin == str(ROOT / "abbe" / "__init__.py")
+
+
+def test_folders_that_the_demonstration_leaves_are_not_packages(tmp_path: Path) -> None:
+    include = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]["find"]["include"]
+    for name in ("abbe/service", "abbe-demo", "abbe_notes", "service"):
+        (tmp_path / name).mkdir(parents=True)
+    assert sorted(PEP420PackageFinder.find(str(tmp_path), include=include)) == ["abbe", "abbe.service"]
 
 
 def test_nothing_is_imported_but_through_abbe() -> None:

@@ -84,7 +84,7 @@ async def test_a_new_name_continues_the_history_of_its_control(store: Store) -> 
     entries = store.pushes.entries("mill-A", HERE)
     check_chain(entries)
     assert {e.push for e in entries} == {1, 2}
-    assert entries == store.pushes.entries("mill-A") == store.pushes.entries("mill-a")  # also for whoever knows a name only
+    assert entries == store.pushes.entries("mill-A") == store.pushes.entries("mill-a")  # also under the other name
 
 
 async def test_an_open_push_of_the_control_is_finished_before_one_under_a_new_name(store: Store) -> None:

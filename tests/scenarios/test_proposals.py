@@ -119,7 +119,7 @@ CHANGED: dict[str, tuple[Callable[[Site], Site], float, str]] = {
     "another limit": (lambda s: replace(s, limits=replace(s.limits, value_mm=0.2)), 0.0, "LIMITS: .*value_mm 0.1 then, 0.2 now"),
     "an old measurement": (lambda s: s, 73.0, "STALE: measured 73"),
     "too few runs for these limits": (lambda s: replace(s, limits=replace(s.limits, runs=99)), 0.0, "RUNS"),
-    "nobody's approval": (lambda s: s, 0.0, "APPROVAL: not approved yet"),
+    "no approval": (lambda s: s, 0.0, "APPROVAL: not approved yet"),
 }
 
 
@@ -128,7 +128,7 @@ def test_what_is_not_as_it_was_refuses_the_push_and_writes_nothing(shop, what):
     change, hours, reason = CHANGED[what]
     with Store.open(shop.url) as store:
         number = shop.copy(store)
-        if what != "nobody's approval":
+        if what != "no approval":
             approve(store, number, "anna", 24.0, SystemClock())
         with pytest.raises(TableRefused, match=reason):
             try_push(shop, store, number, site=change(shop.site), hours=hours)

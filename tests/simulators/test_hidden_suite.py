@@ -37,7 +37,7 @@ def test_the_product_reads_what_is_public(folder: Path) -> None:
     assert len(found) == SMALL[1]
     for public in found:
         read = read_folder(public)
-        case = case_of(read.campaign, machine_from_doc(read.campaign["machine"]), read.runs())
+        case = case_of(read.campaign, machine_from_doc(read.campaign["machine"]), read.runs)
         assert {r.role for r in case.runs} == {"identify", "holdout", "sealed"}
         assert all((r.deviation_mm is None) == (r.role == "sealed") for r in case.runs)
         text = "".join(p.read_text() for p in public.iterdir())

@@ -69,7 +69,7 @@ def measured_bar_readings(case: Case) -> int:
 def read_case(folder: Path, name: str) -> Case:
     """A campaign as `abbe discover` reads it; its truth is not looked at."""
     campaign = read_folder(folder / "public" / name)
-    return case_of(campaign.campaign, machine_from_doc(campaign.campaign["machine"]), campaign.runs())
+    return case_of(campaign.campaign, machine_from_doc(campaign.campaign["machine"]), campaign.runs)
 
 
 def truth(folder: Path, name: str) -> dict:

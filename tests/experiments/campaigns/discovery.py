@@ -28,7 +28,7 @@ from abbe.service.site import machine_from_doc
 def answered(folder: Path, out: Path) -> tuple[str, float]:
     """Discover one campaign and write its answer; its name and the seconds of processor time it took."""
     campaign = read_folder(folder)
-    case = case_of(campaign.campaign, machine_from_doc(campaign.campaign["machine"]), campaign.runs())
+    case = case_of(campaign.campaign, machine_from_doc(campaign.campaign["machine"]), campaign.runs)
     start = time.process_time()
     found = discover(case, CATALOGUE)
     seconds = time.process_time() - start

@@ -92,7 +92,7 @@ def test_no_ball_bar_is_offered_where_none_has_room() -> None:
 def real(shared: Path, name: str):  # type: ignore[no-untyped-def]
     """What is found in a real test of an axis of a slit (shared/spec/foreign.md)."""
     folder = read_folder(shared / "data" / "foreign" / "bifrost" / name)
-    return found_in(case_of(folder.campaign, machine_from_doc(folder.campaign["machine"]), folder.runs()))
+    return found_in(case_of(folder.campaign, machine_from_doc(folder.campaign["machine"]), folder.runs))
 
 
 @pytest.mark.parametrize("name", BIFROST)

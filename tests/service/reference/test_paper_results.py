@@ -22,7 +22,7 @@ def test_all_four_papers_have_rows_and_every_row_has_its_reason(everything):
         assert found.numbers
         for r in found.numbers:
             assert (r.computed is not None and r.how) or r.why
-            assert not (r.status == "differs" and not (r.erratum or r.why)), f"{r.location} {r.quantity}: differs and nobody says why"
+            assert not (r.status == "differs" and not (r.erratum or r.why)), f"{r.location} {r.quantity}: differs without a reason"
 
 
 def test_yang_tables_come_out_as_math_md_8_says(everything):

@@ -165,6 +165,17 @@ def test_laser_columns(store: Store, campaign_id: int) -> None:
     assert columns["pressure_air_Pa"] == [101325.0] * 3
 
 
+@pytest.mark.parametrize("key", ["air_temp_c", "air_pressure_pa", "feed_mm_min"])
+def test_a_laser_record_without_a_number_is_refused_it_does_not_become_nan(store: Store, campaign_id: int, key: str) -> None:
+    start = {"setup": {"setup_id": "L", "t_set_s": 0.0, "nominal_beam": [1.0, 0.0, 0.0]}, "machine": MACHINE, "ctrl0_us": 1_000_000}
+    run_id = store.runs.start(campaign_id, "r02", "laser_linear", "holdout", start)
+    damaged = encode_json([laser_record(1_000_000, 10.0, 50) | {key: None}])
+    store.chunks.append(run_id, "laser", 0, 1, JSON_CODEC, damaged, 0.0, 0.0, 0, 0)
+    store.runs.finish(run_id, "complete", "", {})
+    with pytest.raises(StoreError, match="its documents lack or garble"):
+        load_run(store, "r02")
+
+
 def test_imported_run_comes_back_as_it_was(store: Store) -> None:
     columns = {"t_s": [0, 1.0], "x_mm": [0, 0], "y_mm": [0, 0], "z_mm": [1, 2.5], "feed_mm_min": [100, 100], "direction": [1, 1]}
     columns |= {"load_percent": [1e-05, 3], "temp_air_C": None, "deviation_mm": None}

@@ -134,6 +134,8 @@ BAD_RUNS = [
     (set_at("columns", "load_furlong", value=[1, 2, 3]), "columns.load_furlong: unknown unit suffix 'furlong'"),
     (set_at("columns", value=[]), "columns: expected an object"),
     (set_at("run_id", value="r77"), "run_id: expected 'r01' as in campaign.json"),
+    (set_at("table", value={"crc": "B1"}), "r01-x.json: run c1/r01: its document has a missing or invalid field"),
+    (set_at("setup", "span_deg", value="half"), "r01-x.json: run c1/r01: its document has a missing or invalid field"),
     (set_at("campaign", value="c2"), "campaign: expected 'c1' as in campaign.json"),
 ]
 
@@ -178,6 +180,15 @@ BAD_ERRORS = [
 @pytest.mark.parametrize(("change", "message"), BAD_ERRORS, ids=[message[:40] for _, message in BAD_ERRORS])
 def test_bad_errors_file(file_store: Store, campaign_folder: Path, change: Change, message: str) -> None:
     assert_refused(file_store, campaign_folder, "errors.json", change, message)
+
+
+def test_a_run_without_a_mounting_time_is_not_exported_as_a_folder_that_no_import_takes(file_store: Store, tmp_path: Path) -> None:
+    start = {"setup": {"setup_id": "L", "nominal_beam": [1.0, 0.0, 0.0]}, "machine": {"name": "m"}, "ctrl0_us": 0}
+    campaign = file_store.campaigns.add(file_store.machines.add("m", {"name": "m"}), "c", {})
+    file_store.runs.finish(file_store.runs.start(campaign, "r1", "laser_linear", "identify", start), "complete", "", {})
+    with pytest.raises(StoreError, match="run c/r1: its set-up has no t_set_s"):
+        export_folder(file_store, "c", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def assert_refused(store: Store, folder: Path, name: str, change: Change, message: str) -> None:

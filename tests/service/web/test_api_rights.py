@@ -41,7 +41,7 @@ def table_of(plant: Plant) -> list[tuple[str, str, Need | None]]:
 async def test_every_route_answers_who_may(plant: Plant) -> None:
     """The whole application, by session and by token: without content 404, without a body 422, and the auth first.
 
-    Every role, and whoever may nothing, at the auth: `tests/service/users/test_access.py`.
+    Every role, and visitors without any right, at the auth: `tests/service/users/test_access.py`.
     """
     async with httpx.AsyncClient(transport=httpx.ASGITransport(plant.app, False), base_url=BASE) as client:
         sessions = {role: {**plant.session(role), "Origin": BASE} for role in Role}
