@@ -50,7 +50,7 @@ class RtuLine:
 
 TICK_S = 0.005
 REST_S = 0.2
-"""Time between two ticks while nothing moves, streams or waits in the buffer: every request brings the world up to date anyway."""
+"""Time between two ticks while nothing streams or waits in the buffer: every request brings the world up to date anyway."""
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
 
 
@@ -123,7 +123,7 @@ class Site:
         self._advance()
         self.box.flush()
         self._port.pump()
-        self._resting = not (self.world.controller.moving or self.world.ballbar.rate_hz or self._port.backlog)
+        self._resting = not (self.world.ballbar.rate_hz or self._port.backlog)
         self._ticking = asyncio.get_running_loop().call_later(REST_S if self._resting else TICK_S, self._tick)
 
     def _received(self, data: bytes) -> None:
