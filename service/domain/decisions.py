@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from abbe.service.domain.document import Doc
+from abbe.service.domain.document import DocumentRow
 
 
-@dataclass(frozen=True, slots=True)
-class ProposalRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalRecord(DocumentRow):
     """Proposed tables with all their sources. Never changed; ``digest``: SHA-256 of ``doc``."""
 
-    id: int
     machine: str
     solution_id: int
-    doc: Doc
     digest: str
-    created_utc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

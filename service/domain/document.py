@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -14,6 +15,36 @@ Doc = dict[str, Any]
 GENESIS = "0" * 64
 """Stands for the digest of the previous entry in the first entry of a hash chain."""
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What the database adds to a record when it stores it: a number, and the time (UTC). 0 and empty before that."""
+
+    id: int = 0
+    created_utc: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DocumentRow(Row):
+    """A row that holds a document."""
+
+    doc: Doc
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryRow:
+    """One line of a history that only grows: never changed after writing; ``seq`` counts from 0.
+
+    ``id``: 0 before it is stored.
+    """
+
+    id: int = 0
+    seq: int
+    doc: Doc
+    utc: str
+
+
 _adapters: dict[type[Any], TypeAdapter[Any]] = {}
 
 

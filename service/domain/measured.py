@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from abbe.service.domain.document import Doc
+from abbe.service.domain.document import Doc, DocumentRow, HistoryRow
 from abbe.service.domain.owner import Owner
 from abbe.service.domain.run_start import RunEnd, RunStart
 from abbe.service.errors import StoreError
@@ -20,26 +20,20 @@ DISK_FULL = "disk_full"
 FINISHED = ("complete", "stopped", "aborted", "failed", INTERRUPTED, DISK_FULL)
 
 
-@dataclass(frozen=True, slots=True)
-class MachineRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineRecord(DocumentRow):
     """A description of a machine; another description is another record."""
 
-    id: int
     name: str
-    doc: Doc
     doc_hash: str
-    created_utc: str
 
 
-@dataclass(frozen=True, slots=True)
-class CampaignRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignRecord(DocumentRow):
     """Runs that belong together: one machine, one clock zero."""
 
-    id: int
     machine_id: int
     name: str
-    doc: Doc
-    created_utc: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,16 +119,12 @@ class ChannelRecord:
     samples: int
 
 
-@dataclass(frozen=True, slots=True)
-class CheckpointRecord:
-    """One entry of a campaign's journal. Never changed after writing; ``seq`` counts from 0."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckpointRecord(HistoryRow):
+    """One entry of a campaign's journal."""
 
-    id: int
     campaign_id: int
-    seq: int
     kind: str
-    doc: Doc
-    utc: str
 
 
 @dataclass(frozen=True, slots=True)

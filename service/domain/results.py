@@ -4,32 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from abbe.service.domain.document import Doc
+from abbe.service.domain.document import Doc, DocumentRow, HistoryRow
 
 
-@dataclass(frozen=True, slots=True)
-class SolutionRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolutionRecord(DocumentRow):
     """The result of a solver from some runs."""
 
-    id: int
     campaign_id: int
     kind: str
     run_ids: list[int]
-    doc: Doc
-    created_utc: str
 
 
-@dataclass(frozen=True, slots=True)
-class TableRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableRecord(DocumentRow):
     """A compensation table as the controller would hold it. ``solution_id`` None: it was read back from the controller."""
 
-    id: int
     machine_id: int
     solution_id: int | None
     image: bytes = field(repr=False)
     crc: int
-    doc: Doc
-    created_utc: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,39 +38,29 @@ class VerificationRecord:
     utc: str
 
 
-@dataclass(frozen=True, slots=True)
-class DiscoveryRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoveryRecord(DocumentRow):
     """One search for what a campaign's model lacks. ``digest``: of readings, model and program, equal for equal searches."""
 
-    id: int
     campaign_id: int
     digest: str
-    doc: Doc
-    created_utc: str
 
 
-@dataclass(frozen=True, slots=True)
-class StepRecord:
-    """One state that a discovery reached, with its evidence. Never changed after writing; ``seq`` counts from 0."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepRecord(HistoryRow):
+    """One state that a discovery reached, with its evidence."""
 
-    id: int
     discovery_id: int
-    seq: int
     state: str
-    doc: Doc
-    utc: str
 
 
-@dataclass(frozen=True, slots=True)
-class ModelRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelRecord(DocumentRow):
     """One version of a machine's model. Never changed; ``version`` counts from 1; ``discovery_id`` None: a person made it."""
 
-    id: int
     machine: str
     version: int
     discovery_id: int | None
-    doc: Doc
-    created_utc: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from abbe.service.domain.document import Doc
+from abbe.service.domain.document import Doc, HistoryRow, Row
 from abbe.service.domain.owner import Owner
 
 
@@ -26,17 +26,13 @@ class AlarmKind(StrEnum):
     PUSHED = "pushed"
 
 
-@dataclass(frozen=True, slots=True)
-class AlarmEntryRecord:
-    """One event of a machine's alarm. Never changed; ``alarm`` counts from 1 for each machine, ``seq`` from 0."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmEntryRecord(HistoryRow):
+    """One event of a machine's alarm. ``alarm`` counts from 1 for each machine."""
 
-    id: int
     machine: str
     alarm: int
-    seq: int
     kind: AlarmKind
-    doc: Doc
-    utc: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,14 +58,12 @@ class HeartbeatRecord:
     owner: Owner
 
 
-@dataclass(frozen=True, slots=True)
-class OutboxRecord:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutboxRecord(Row):
     """A message that waits for the broker."""
 
-    id: int
     topic: str
     payload: bytes
-    created_utc: str
 
 
 @dataclass(frozen=True, slots=True)

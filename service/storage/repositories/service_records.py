@@ -137,7 +137,7 @@ class Alarms(Repository):
         def work(connection: Connection) -> AlarmEntryRecord:
             last = select(func.coalesce(func.max(alarm_entries.c.alarm), 0)).where(alarm_entries.c.machine == machine)
             number = alarm if alarm is not None else int(connection.execute(last).scalar_one()) + 1
-            entry = AlarmEntryRecord(0, machine, number, seq, kind, doc, self._db.now())
+            entry = AlarmEntryRecord(machine=machine, alarm=number, seq=seq, kind=kind, doc=doc, utc=self._db.now())
             try:
                 entry_id = insert_row(connection, alarm_entries, **ALARM_ENTRY.values(entry, "id"))
             except IntegrityError:

@@ -20,6 +20,10 @@ UNSURE = FiredRule(True, "cannot tell")
 NOT_MEASURED = FiredRule(False, "cannot tell")
 
 
+def entry(number: int, seq: int, kind: AlarmKind, doc: dict[str, Any], utc: str = "t") -> AlarmEntryRecord:
+    return AlarmEntryRecord(machine="mill-7", alarm=number, seq=seq, kind=kind, doc=doc, utc=utc)
+
+
 @dataclass
 class Book:
     """Lines as the store keeps them, and what a check or a person adds."""
@@ -37,7 +41,7 @@ class Book:
     def add(self, number: int | None, kind: AlarmKind, **doc: Any) -> None:
         number = number or max((line.alarm for line in self.lines), default=0) + 1
         seq = max((line.seq for line in self.lines if line.alarm == number), default=-1) + 1
-        self.lines.append(AlarmEntryRecord(0, "mill-7", number, seq, kind, doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
+        self.lines.append(entry(number, seq, kind, doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
 
     def check(self, found: FiredRule) -> AlarmKind | None:
         now = self.active
@@ -125,9 +129,9 @@ def test_a_restart_anywhere_finds_the_same(acts: list[FiredRule | str], cut: int
 
 def test_lines_that_cannot_follow_are_left_out() -> None:
     stray = [
-        AlarmEntryRecord(0, "mill-7", 0, 0, AlarmKind.PUSHED, {"text": "no alarm asked for it"}, "t"),
-        AlarmEntryRecord(0, "mill-7", 7, 0, AlarmKind.CONTINUED, {}, "t"),
-        AlarmEntryRecord(0, "mill-7", 7, 1, AlarmKind.ACKNOWLEDGED, {}, "t"),
+        entry(0, 0, AlarmKind.PUSHED, {"text": "no alarm asked for it"}),
+        entry(7, 0, AlarmKind.CONTINUED, {}),
+        entry(7, 1, AlarmKind.ACKNOWLEDGED, {}),
     ]
     assert folded(stray) == []
 
