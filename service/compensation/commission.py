@@ -29,7 +29,7 @@ from abbe.service.push.operations import Verdict
 from abbe.service.sequences.interlocks import Suspending
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.tables.nine_tables import Base, check_limits, read_base
+from abbe.service.tables.nine_tables import Base, check_test_step, read_base
 
 KIND = "sign-proof"
 STEP_MM, FIRST_MM = 0.010, 0.0005
@@ -128,7 +128,7 @@ def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
     x, y, z = (quantise(_stepped(context, tables, (axis,), step_mm), lsb_mm) for axis in range(3))
     small = quantise(_stepped(context, tables, (0, 1, 2), small_mm), lsb_mm)
     for one in (small, x, y, z):
-        check_limits(one, base.tables, context.site.limits)
+        check_test_step(one, base.tables, context.site.limits)
     return _Steps(lsb_nm, small_mm, small, step_mm, (x, y, z))
 
 

@@ -13,9 +13,10 @@ from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
 from abbe.service.formats.files import FormatSettings, TextFile, integers
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_table, from_file, to_file
+from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_table
 
 LIMITS = FormatLimits(points=1000, equidistant=True, directional=False)
+SIGN = SignRule(-1, False, "by manual", False, "amount of correction to apply: −e; not stated in a manual")
 WHAT = "Centroid ballscrew table"
 
 
@@ -37,7 +38,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
             raise FormatRefused(f"{WHAT}, table {table.name}: the reference {reference:g} is neither end of the table", NOTHING)
         way = 1 if abs(reference - ends[0]) <= 1e-6 else -1
         travel = way * round(float(np.ptp(table.position_mm)) * settings.counts_per_mm)
-        counts = integers(to_file("centroid", table.forward_mm, table.position_mm), 1.0 / settings.counts_per_mm)[::way]
+        counts = integers(SIGN.to_file(table.forward_mm, table.position_mm), 1.0 / settings.counts_per_mm)[::way]
         lines = [f"{table.position_mm.size} {travel}", *map(str, counts)]
         files.append(TextFile(f"cnc-{table.axis.lower()}.tab", "\n".join(lines) + "\n"))
     return tuple(files)
@@ -69,5 +70,5 @@ def _read_one(file: TextFile, settings: FormatSettings) -> AxisTable:
     start = 0.0 if settings.reference_mm is None else settings.reference_mm[AXES.index(axis)]
     position = start + np.linspace(0.0, travel / settings.counts_per_mm, count)
     way = 1 if travel > 0 else -1
-    value = from_file("centroid", values / settings.counts_per_mm, position)[::way]
+    value = SIGN.from_file(values / settings.counts_per_mm, position)[::way]
     return AxisTable(axis, axis, position[::way], value, value)

@@ -11,9 +11,10 @@ import numpy as np
 from abbe.service.errors import FormatRefused
 from abbe.service.formats.files import FormatSettings, TextFile, integers, whole
 from abbe.service.formats.model import Compensation, Lattice
-from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_positions, check_size, from_file, to_file
+from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_positions, check_size
 
 LIMITS = FormatLimits(points=1000, equidistant=True, own=False, lattice=True)
+SIGN = SignRule(-1, False, "by manual", False, "pulses that are added: −e; not stated in a manual")
 WHAT = "Fanuc 3-D error compensation"
 NAME = "LATTICE.CSV"
 HEADER = "node,x_mm,y_mm,z_mm,x_units,y_units,z_units"
@@ -40,7 +41,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         for j, y in enumerate(positions[1]):
             for i, x in enumerate(positions[0]):
                 node += 1
-                numbers = integers(to_file("fanuc-lattice", values[i, j, k], np.zeros(3)), unit)
+                numbers = integers(SIGN.to_file(values[i, j, k], np.zeros(3)), unit)
                 lines.append(",".join([str(node), *(whole(v, 6) for v in (x, y, z)), *map(str, numbers)]))
     return (TextFile(NAME, "\n".join(lines) + "\n"),)
 
@@ -75,5 +76,5 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
         raise file.wrong(len(rows) + 1, "the nodes are not a complete grid with X fastest")
     unit = settings.unit_mm * settings.magnification
     units = table[:, 4:].reshape(nz, ny, nx, 3).transpose(2, 1, 0, 3)
-    value = from_file("fanuc-lattice", units * unit, np.zeros(units.shape))
+    value = SIGN.from_file(units * unit, np.zeros(units.shape))
     return Compensation(lattice=Lattice((axes[0], axes[1], axes[2]), value))

@@ -19,9 +19,10 @@ from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
 from abbe.service.formats.files import FormatSettings, TextFile, integers, whole
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_table, from_file, to_file
+from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_table
 
 LIMITS = FormatLimits(points=129, equidistant=True)
+SIGN = SignRule(-1, False, "by manual", False, "pulses that are added from point to point: −Δe; not stated in a manual")
 WHAT = "Fanuc pitch error compensation"
 NAME = "PITCH.TXT"
 LAST_POINT = 1023
@@ -60,7 +61,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         check_table(table, limits, WHAT, settings.reference_mm, unit)
         axis, at = AXES.index(table.axis) + 1, _node(table, settings.reference_mm)
         there, back = (
-            np.array(integers(to_file("fanuc-pitch", v - table.forward_mm[at], table.position_mm), unit))
+            np.array(integers(SIGN.to_file(v - table.forward_mm[at], table.position_mm), unit))
             for v in (table.forward_mm, table.backward_mm)
         )
         # point n_ref belongs to the section that ends at the reference; the first section's point is the most negative
@@ -161,9 +162,7 @@ def _axis_table(file: TextFile, data: _Data, axis: int, settings: FormatSettings
         begin = int(value(FIRST_BACK))
         back = _sums(file, data, begin, begin + last - first, begin + reference - first, value(VALUE_BACK))
     table = AXES[axis - 1]
-    return AxisTable(
-        table, table, position, from_file("fanuc-pitch", there * unit, position), from_file("fanuc-pitch", back * unit, position)
-    )
+    return AxisTable(table, table, position, SIGN.from_file(there * unit, position), SIGN.from_file(back * unit, position))
 
 
 def _sums(file: TextFile, data: _Data, first: int, last: int, reference: int, at_reference: float) -> F1:

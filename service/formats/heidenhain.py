@@ -14,9 +14,10 @@ from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
 from abbe.service.formats.files import FormatSettings, TextFile, fixed, increasing
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_table, from_file, to_file
+from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_table
 
 LIMITS = FormatLimits(points=256, cross=True)
+SIGN = SignRule(-1, False, "by manual", False, "compensation value: −e; manuals differ (error or correction)")
 WHAT = "Heidenhain .COM"
 POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"
@@ -78,8 +79,8 @@ def _com(axis: str, tables: list[AxisTable], settings: FormatSettings) -> str:
     own = next((t for t in tables if t.own), None)
     columns: dict[str, F1] = {}
     if own is not None and own.directional:
-        columns["BACKLASH"] = to_file("heidenhain", own.backward_mm, position)
-    columns |= {t.output: to_file("heidenhain", t.forward_mm, position) for t in sorted(tables, key=lambda t: t.output)}
+        columns["BACKLASH"] = SIGN.to_file(own.backward_mm, position)
+    columns |= {t.output: SIGN.to_file(t.forward_mm, position) for t in sorted(tables, key=lambda t: t.output)}
     lines = [f"BEGIN {axis}.COM MM", "NR   AXISPOS      " + "".join(f"{c:<12}" for c in columns).rstrip()]
     for k, p in enumerate(position):
         cells = "".join(f"{fixed(v[k], settings.decimals):<12}" for v in columns.values())
@@ -147,6 +148,6 @@ def _read_com(file: TextFile, axis: str) -> list[AxisTable]:
         raise file.wrong(3, "fewer than 2 points")
     increasing(file, [v[1] for v in values], [n for n, _ in rows])
     position = np.array([v[1] for v in values])
-    column = {c: from_file("heidenhain", np.array([v[k] for v in values]), position) for k, c in enumerate(columns) if k > 1}
+    column = {c: SIGN.from_file(np.array([v[k] for v in values]), position) for k, c in enumerate(columns) if k > 1}
     back = column.get("BACKLASH")
     return [AxisTable(axis, c, position, v, back if c == axis and back is not None else v) for c, v in column.items() if c != "BACKLASH"]

@@ -14,9 +14,10 @@ from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
 from abbe.service.formats.files import FormatSettings, TextFile, increasing, short
 from abbe.service.formats.model import AxisCurve, Compensation, Motions
-from abbe.service.formats.rules import NOTHING, FormatLimits, check_kinds, check_positions, check_size, check_table, from_file, to_file
+from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_positions, check_size, check_table
 
 LIMITS = FormatLimits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
+SIGN = SignRule(1, False, "by manual", False, "the error itself; the kernel can turn it over (parameter negate)")
 WHAT = "ISG volumetric CSV"
 NAME = "volcomp.csv"
 ANGLE_DECIMALS = 3
@@ -38,7 +39,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     square = {} if comp.motions is None else {n: v for n, v in comp.motions.squareness_rad.items() if v}
     blocks = []
     if square:
-        numbers = to_file("isg", -np.array(list(square.values())), np.zeros(len(square)))
+        numbers = SIGN.to_file(-np.array(list(square.values())), np.zeros(len(square)))
         blocks.append([" ".join(square), " ".join(short(v, settings.decimals + ANGLE_DECIMALS) for v in numbers)])
     blocks += [_block(axis, mine, settings) for axis in AXES if (mine := {n: c for n, c in curves.items() if c.axis == axis})]
     for k, block in enumerate(blocks):
@@ -49,12 +50,12 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 def _curves(comp: Compensation, settings: FormatSettings) -> dict[str, AxisCurve]:
     """Error motions by name, in ISO order."""
     if comp.motions is not None:
-        found = {n: AxisCurve(c.axis, c.position_mm, to_file("isg", -c.value, c.position_mm)) for n, c in comp.motions.curves.items()}
+        found = {n: AxisCurve(c.axis, c.position_mm, SIGN.to_file(-c.value, c.position_mm)) for n, c in comp.motions.curves.items()}
     else:
         found = {}
         for t in comp.tables:
             check_table(t, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
-            found[f"E{t.output}{t.axis}"] = AxisCurve(t.axis, t.position_mm, to_file("isg", t.forward_mm, t.position_mm))
+            found[f"E{t.output}{t.axis}"] = AxisCurve(t.axis, t.position_mm, SIGN.to_file(t.forward_mm, t.position_mm))
     return {name: found[name] for name in PLACES if name in found}
 
 
@@ -130,7 +131,7 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
     if not arguments:
         if len(rows) != 1 or not set(names) <= set(SQUARENESS):
             raise file.wrong(rows[0][0], "a table without an argument has one row, of C0Y, B0Z, A0Z")
-        square.update({n: -float(v) for n, v in zip(names, from_file("isg", table[0], np.zeros(len(names))), strict=True)})
+        square.update({n: -float(v) for n, v in zip(names, SIGN.from_file(table[0], np.zeros(len(names))), strict=True)})
         return
     axis = arguments[0]
     position = table[:, names.index(axis)]
@@ -140,4 +141,4 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
             continue
         if name not in PLACES or AXES[PLACES[name][0]] != axis:
             raise file.wrong(line, f"{name} is not an error motion of {axis}")
-        curves[name] = AxisCurve(axis, position, -from_file("isg", table[:, k], position))
+        curves[name] = AxisCurve(axis, position, -SIGN.from_file(table[:, k], position))

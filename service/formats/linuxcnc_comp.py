@@ -12,9 +12,14 @@ import numpy as np
 
 from abbe.service.formats.files import FormatSettings, TextFile, fixed, increasing, whole
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.rules import PLAUSIBLE_MM, SIGNS, FormatLimits, check_kinds, check_table, from_file, to_file
+from abbe.service.formats.rules import PLAUSIBLE_MM, FormatLimits, SignRule, check_kinds, check_table
 
 LIMITS = FormatLimits(points=256)
+SIGNS = {
+    1: SignRule(-1, False, "verified by execution", True, "what is added to the motor's command: −e"),
+    0: SignRule(1, True, "verified by execution", True, "the position that was reached: nominal + e"),
+}
+"""By the type of the file."""
 POSITION_DECIMALS = 6
 
 
@@ -31,7 +36,7 @@ def write(comp: Compensation, settings: FormatSettings, *, kind: int = 1) -> tup
     files = []
     for table in comp.tables:
         check_table(table, LIMITS, what, settings.reference_mm, settings.step_mm)
-        columns = [to_file(f"linuxcnc-{kind}", v, table.position_mm) for v in (table.forward_mm, table.backward_mm)]
+        columns = [SIGNS[kind].to_file(v, table.position_mm) for v in (table.forward_mm, table.backward_mm)]
         rows = zip(table.position_mm, *columns, strict=True)
         lines = [f"{whole(p, POSITION_DECIMALS)} {fixed(f, settings.decimals)} {fixed(b, settings.decimals)}" for p, f, b in rows]
         files.append(TextFile(f"{table.axis.lower()}.comp", "\n".join(lines) + "\n"))
@@ -68,7 +73,7 @@ def _read_one(file: TextFile, kind: int) -> AxisTable:
         raise file.wrong(lines[LIMITS.points], f"LinuxCNC takes {LIMITS.points} points and leaves out the rest")
     increasing(file, [r[0] for r in rows], lines)
     position = np.array([r[0] for r in rows])
-    there, back = (from_file(f"linuxcnc-{kind}", np.array([r[k] for r in rows]), position) for k in (1, 2))
+    there, back = (SIGNS[kind].from_file(np.array([r[k] for r in rows]), position) for k in (1, 2))
     _right_type(file, kind, lines, np.maximum(np.abs(there), np.abs(back)))
     return AxisTable(axis, axis, position, there, back)
 
@@ -77,7 +82,7 @@ def _right_type(file: TextFile, kind: int, lines: list[int], size_mm: np.ndarray
     """Refuse implausible corrections: a table of the other type has positions in place of corrections, or vice versa."""
     k = int(np.argmax(size_mm))
     if size_mm[k] > PLAUSIBLE_MM:
-        other = "0 (positions reached)" if not SIGNS[f"linuxcnc-{kind}"].adds_position else "1 (corrections)"
+        other = "0 (positions reached)" if not SIGNS[kind].adds_position else "1 (corrections)"
         raise file.wrong(
             lines[k],
             f"as type {kind} this is a correction of {size_mm[k]:.3f} mm: the file looks like type {other}",

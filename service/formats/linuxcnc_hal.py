@@ -14,9 +14,10 @@ import numpy as np
 
 from abbe.service.formats.files import FormatSettings, TextFile, increasing, short
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable
-from abbe.service.formats.rules import FormatLimits, check_kinds, check_positions, check_size, check_table, from_file, to_file
+from abbe.service.formats.rules import FormatLimits, SignRule, check_kinds, check_positions, check_size, check_table
 
 LIMITS = FormatLimits(points=16, directional=False, own=True, cross=True, products=True)
+SIGN = SignRule(-1, False, "verified by execution", True, "what is added to the drive's command: −e")
 LEVERS = FormatLimits(points=16, size_mm=1e5)
 WHAT = "LinuxCNC HAL network"
 NAME = "abbe.hal"
@@ -49,7 +50,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     curves: list[tuple[str, str, AxisCurve, int]] = []
     for table in comp.tables:
         check_table(table, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
-        number = to_file("linuxcnc-hal", table.forward_mm, table.position_mm)
+        number = SIGN.to_file(table.forward_mm, table.position_mm)
         name = f"t-{table.output}{table.axis}".lower()
         curves.append((name, table.output, AxisCurve(table.axis, table.position_mm, number), settings.decimals))
     for p in comp.products:
@@ -57,7 +58,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
             check_positions(curve.position_mm, limits, f"{WHAT}, {p.name}")
             check_size(curve.position_mm, curve.value, limits, f"{WHAT}, {p.name}")
         tail = f"{p.output}{p.angle.axis}{p.lever.axis}".lower()
-        number = to_file("linuxcnc-hal", p.angle.value, p.angle.position_mm)
+        number = SIGN.to_file(p.angle.value, p.angle.position_mm)
         curves.append((f"a-{tail}", p.output, AxisCurve(p.angle.axis, p.angle.position_mm, number), settings.decimals + ANGLE_DECIMALS))
         curves.append((f"l-{tail}", p.output, p.lever, settings.decimals))
     return (TextFile(NAME, "\n".join(_hal(comp, curves)) + "\n"),)
@@ -119,13 +120,13 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     for name, curve in curves.items():
         if (m := _TABLE.fullmatch(name)) is not None:
             out, axis = m.group(1).upper(), m.group(2).upper()
-            value = from_file("linuxcnc-hal", curve.value, curve.position_mm)
+            value = SIGN.from_file(curve.value, curve.position_mm)
             tables.append(AxisTable(axis, out, curve.position_mm, value, value))
         elif (m := _PART.fullmatch(name)) is not None and m.group(1) == "a":
             lever = curves.get(f"l{name[1:]}")
             if lever is None:
                 raise file.wrong(1, f"the curve l{name[1:]} of a product is missing")
-            angle = AxisCurve(m.group(3).upper(), curve.position_mm, from_file("linuxcnc-hal", curve.value, curve.position_mm))
+            angle = AxisCurve(m.group(3).upper(), curve.position_mm, SIGN.from_file(curve.value, curve.position_mm))
             products.append(ProductTable(m.group(2).upper(), angle, AxisCurve(m.group(4).upper(), lever.position_mm, lever.value)))
     return Compensation(tuple(tables), tuple(products))
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from abbe.service.formats.files import FormatSettings, TextFile, fixed, short
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.rules import FormatLimits, check_kinds, check_table, from_file, to_file
+from abbe.service.formats.rules import FormatLimits, SignRule, check_kinds, check_table
 
 LIMITS = FormatLimits(points=10000, equidistant=True)
+SIGN = SignRule(-1, False, "by manual", True, "expected − actual: −e")
 WHAT = "Mach4 screw map"
 HEADER = "point,position_mm,error_plus_mm,error_minus_mm"
 _HEAD = ("axis", "start_mm", "length_mm", "points")
@@ -32,7 +33,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         position = table.position_mm
         values = (table.axis, short(position[0], 6), short(np.ptp(position), 6), str(position.size))
         lines = [f"{k},{v}" for k, v in zip(_HEAD, values, strict=True)] + [HEADER]
-        plus, minus = (to_file("mach4", v, position) for v in (table.forward_mm, table.backward_mm))
+        plus, minus = (SIGN.to_file(v, position) for v in (table.forward_mm, table.backward_mm))
         for k, p in enumerate(position):
             lines.append(f"{k + 1},{short(p, 6)},{fixed(plus[k], settings.decimals)},{fixed(minus[k], settings.decimals)}")
         files.append(TextFile(f"mach4-{table.axis.lower()}.csv", "\n".join(lines) + "\n"))
@@ -68,5 +69,5 @@ def _read_one(file: TextFile) -> AxisTable:
     if len(rows) != count:
         raise file.wrong(len(lines), f"{len(rows)} points, {count:g} stated: the file is cut off")
     table = np.array(rows)
-    plus, minus = (from_file("mach4", table[:, k], table[:, 1]) for k in (2, 3))
+    plus, minus = (SIGN.from_file(table[:, k], table[:, 1]) for k in (2, 3))
     return AxisTable(head["axis"], head["axis"], table[:, 1], plus, minus)

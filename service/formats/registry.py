@@ -21,7 +21,7 @@ from abbe.service.formats import (
 )
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import Compensation
-from abbe.service.formats.rules import SIGNS, FormatLimits, SignRule
+from abbe.service.formats.rules import FormatLimits, SignRule
 
 Write = Callable[[Compensation, FormatSettings], tuple[TextFile, ...]]
 Read = Callable[[tuple[TextFile, ...], FormatSettings], Compensation]
@@ -34,24 +34,21 @@ class Format:
     key: str
     name: str
     limits: FormatLimits
+    sign: SignRule
     write: Write
     read: Read
     live: str
-
-    @property
-    def sign(self) -> SignRule:
-        """Its sign rule."""
-        return SIGNS[self.key]
 
 
 FORMATS: dict[str, Format] = {
     f.key: f
     for f in (
-        Format("isg", "Beckhoff/ISG volumetric CSV (neutral)", isg.LIMITS, isg.write, isg.read, "#VOLCOMP in the NC program"),
+        Format("isg", "Beckhoff/ISG volumetric CSV (neutral)", isg.LIMITS, isg.SIGN, isg.write, isg.read, "#VOLCOMP in the NC program"),
         Format(
             "linuxcnc-1",
             "LinuxCNC COMP_FILE type 1",
             linuxcnc_comp.LIMITS,
+            linuxcnc_comp.SIGNS[1],
             partial(linuxcnc_comp.write, kind=1),
             partial(linuxcnc_comp.read, kind=1),
             "restart of LinuxCNC, home",
@@ -60,6 +57,7 @@ FORMATS: dict[str, Format] = {
             "linuxcnc-0",
             "LinuxCNC COMP_FILE type 0",
             linuxcnc_comp.LIMITS,
+            linuxcnc_comp.SIGNS[0],
             partial(linuxcnc_comp.write, kind=0),
             partial(linuxcnc_comp.read, kind=0),
             "restart of LinuxCNC, home",
@@ -68,6 +66,7 @@ FORMATS: dict[str, Format] = {
             "linuxcnc-hal",
             "LinuxCNC HAL network",
             linuxcnc_hal.LIMITS,
+            linuxcnc_hal.SIGN,
             linuxcnc_hal.write,
             linuxcnc_hal.read,
             "at once (halcmd), with the machine at rest",
@@ -76,6 +75,7 @@ FORMATS: dict[str, Format] = {
             "siemens-eec",
             "Siemens ENC_COMP",
             siemens_eec.LIMITS,
+            siemens_eec.SIGN,
             siemens_eec.write,
             siemens_eec.read,
             "load with MD32700 = 0, then 1, reset, reference",
@@ -84,6 +84,7 @@ FORMATS: dict[str, Format] = {
             "siemens-cec",
             "Siemens CEC",
             siemens_cec.LIMITS,
+            siemens_cec.SIGN,
             siemens_cec.write,
             siemens_cec.read,
             "load with MD32710 = 0, then 1; SD41300 switches tables",
@@ -92,6 +93,7 @@ FORMATS: dict[str, Format] = {
             "fanuc-pitch",
             "Fanuc stored pitch error compensation",
             fanuc_pitch.LIMITS,
+            fanuc_pitch.SIGN,
             fanuc_pitch.write,
             fanuc_pitch.read,
             "power off and on, G28",
@@ -100,15 +102,30 @@ FORMATS: dict[str, Format] = {
             "fanuc-lattice",
             "Fanuc 3-D error compensation (sheet)",
             fanuc_lattice.LIMITS,
+            fanuc_lattice.SIGN,
             fanuc_lattice.write,
             fanuc_lattice.read,
             "entered by hand; power off and on, G28",
         ),
         Format(
-            "heidenhain", "Heidenhain .COM and .CMA", heidenhain.LIMITS, heidenhain.write, heidenhain.read, "active line (*) of the .CMA"
+            "heidenhain",
+            "Heidenhain .COM and .CMA",
+            heidenhain.LIMITS,
+            heidenhain.SIGN,
+            heidenhain.write,
+            heidenhain.read,
+            "active line (*) of the .CMA",
         ),
-        Format("mach4", "Mach4 screw map (sheet)", mach4.LIMITS, mach4.write, mach4.read, "entered by hand"),
-        Format("centroid", "Centroid ballscrew table, version 1", centroid.LIMITS, centroid.write, centroid.read, "restart of the control"),
+        Format("mach4", "Mach4 screw map (sheet)", mach4.LIMITS, mach4.SIGN, mach4.write, mach4.read, "entered by hand"),
+        Format(
+            "centroid",
+            "Centroid ballscrew table, version 1",
+            centroid.LIMITS,
+            centroid.SIGN,
+            centroid.write,
+            centroid.read,
+            "restart of the control",
+        ),
     )
 }
 

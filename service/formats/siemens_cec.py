@@ -15,10 +15,11 @@ import numpy as np
 from abbe.models.machine import AXES
 from abbe.service.formats.files import FormatSettings, TextFile, short
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable
-from abbe.service.formats.rules import FormatLimits, check_kinds, check_positions, check_size, check_table, from_file, to_file
+from abbe.service.formats.rules import FormatLimits, SignRule, check_kinds, check_positions, check_size, check_table
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
 
 LIMITS = FormatLimits(points=2000, equidistant=True, own=True, cross=True, products=True)
+SIGN = SignRule(-1, False, "by manual", False, "added to the setpoint of the compensated axis: −e; not stated in a manual")
 LEVERS = FormatLimits(points=2000, equidistant=True, size_mm=1e5)
 WHAT = "Siemens CEC"
 NAME = "NC_CEC.INI"
@@ -51,13 +52,13 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     for table in comp.tables:
         check_table(table, limits, WHAT, settings.reference_mm, settings.step_mm)
         for way, values in ((1, table.forward_mm), (-1, table.backward_mm)) if table.directional else ((0, table.forward_mm),):
-            curve = AxisCurve(table.axis, table.position_mm, to_file("siemens-cec", values, table.position_mm))
+            curve = AxisCurve(table.axis, table.position_mm, SIGN.to_file(values, table.position_mm))
             found.append(_Table(curve, table.output, way, 0, False, settings.decimals))
     for p in comp.products:
         for part, limit in ((p.angle, limits), (p.lever, LEVERS)):
             check_positions(part.position_mm, limit, f"{WHAT}, {p.name}")
             check_size(part.position_mm, part.value, limit, f"{WHAT}, {p.name}")
-        angle = AxisCurve(p.angle.axis, p.angle.position_mm, to_file("siemens-cec", p.angle.value, p.angle.position_mm))
+        angle = AxisCurve(p.angle.axis, p.angle.position_mm, SIGN.to_file(p.angle.value, p.angle.position_mm))
         found.append(_Table(angle, p.output, 0, len(found) + 2, False, settings.decimals + ANGLE_DECIMALS))
         found.append(_Table(p.lever, p.output, 0, 0, True, settings.decimals))
     lines = ["%_N_NC_CEC_INI", HEAD]
@@ -104,9 +105,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
             if other is None:
                 line = found.line[("AN_CEC_MULT_BY_TABLE", (str(t),))]
                 raise found.file.wrong(line, f"table {t} is multiplied by table number {table.times}, which is not there")
-            angle = AxisCurve(
-                table.curve.axis, table.curve.position_mm, from_file("siemens-cec", table.curve.value, table.curve.position_mm)
-            )
+            angle = AxisCurve(table.curve.axis, table.curve.position_mm, SIGN.from_file(table.curve.value, table.curve.position_mm))
             products.append(ProductTable(table.output, angle, other.curve))
         elif not table.factor:
             key = (table.curve.axis, table.output, table.curve.position_mm.tobytes())
@@ -119,7 +118,7 @@ def _both(axis: str, output: str, parts: list[tuple[int, AxisCurve]]) -> AxisTab
     position = parts[0][1].position_mm
     there, back = np.zeros(position.size), np.zeros(position.size)
     for way, curve in parts:
-        value = from_file("siemens-cec", curve.value, position)
+        value = SIGN.from_file(curve.value, position)
         there = there + (value if way >= 0 else 0.0)
         back = back + (value if way <= 0 else 0.0)
     return AxisTable(axis, output, position, there, back)

@@ -9,10 +9,11 @@ from __future__ import annotations
 from abbe.models.machine import AXES
 from abbe.service.formats.files import FormatSettings, TextFile, short
 from abbe.service.formats.model import AxisTable, Compensation
-from abbe.service.formats.rules import FormatLimits, check_kinds, check_table, from_file, to_file
+from abbe.service.formats.rules import FormatLimits, SignRule, check_kinds, check_table
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, grid, parse, step_of
 
 LIMITS = FormatLimits(points=5000, equidistant=True, directional=False)
+SIGN = SignRule(1, False, "by manual", True, "corrects the ACTUAL value; a positive number moves the axis in −: +e")
 WHAT = "Siemens ENC_COMP"
 NAME = "AX_EEC.INI"
 
@@ -31,7 +32,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     for table in comp.tables:
         check_table(table, limits, WHAT, settings.reference_mm, settings.step_mm)
         axis = settings.axis_names[AXES.index(table.axis)]
-        numbers = to_file("siemens-eec", table.forward_mm, table.position_mm)
+        numbers = SIGN.to_file(table.forward_mm, table.position_mm)
         lines += [f"$AA_ENC_COMP[0,{k},{axis}]={short(v, settings.decimals)}" for k, v in enumerate(numbers)]
         lines += [
             f"$AA_ENC_COMP_STEP[0,{axis}]={short(step_of(table.position_mm, f'{WHAT}, {table.name}'), POSITION_DECIMALS)}",
@@ -60,7 +61,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
             raise found.file.wrong(found.line[("AA_ENC_COMP_IS_MODULO", ("0", name))], "modulo is for rotary axes")
         step, first, last = (found.number(f"AA_ENC_COMP_{w}", "0", name) for w in ("STEP", "MIN", "MAX"))
         position = grid(found, numbers.size, step, first, last, ("AA_ENC_COMP_MAX", f"0,{name}"))
-        value = from_file("siemens-eec", numbers, position)
+        value = SIGN.from_file(numbers, position)
         tables.append(AxisTable(axis, axis, position, value, value))
     if not tables:
         raise found.file.wrong(1, f"no table for {', '.join(settings.axis_names)}", "give the control's axis names")

@@ -75,7 +75,7 @@ class Activity:
 class LiveEvent(Activity):
     """One event of ``/api/v1/live``. ``revision`` grows when anything but the progress of a check changes."""
 
-    event: Literal["moment"] = "moment"
+    event: Literal["snapshot"] = "snapshot"
     revision: int
     mqtt_connected: bool
 

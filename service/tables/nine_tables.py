@@ -47,7 +47,7 @@ def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
     return TableImage(KIND_NINE, table_id, lsb_nm, (sx, sy, sz), (px, py, pz), (nx, ny, nz), tuple(values))
 
 
-def check_limits(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
+def check_test_step(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
     """Refuse, never clamp, the tables of a test step: size, change against the active table, steps, zero at the reference
     (reliability.md 3.3). Their curvature is not limited.
 

@@ -10,7 +10,7 @@ from abbe.models.compensation.tables import NineTables, quantise
 from abbe.service.errors import TableRefused
 from abbe.service.push.execute import semantic_digest_of_image, semantic_digest_of_tables
 from abbe.service.push.limits import PushLimits
-from abbe.service.tables.nine_tables import added, check_limits, table_image
+from abbe.service.tables.nine_tables import added, check_test_step, table_image
 
 
 def tables(scale: float = 1.0) -> NineTables:
@@ -80,28 +80,28 @@ def test_an_honest_encoder_means_what_was_computed_once_it_is_quantised():
     ],
 )
 def test_limits_refuse_and_say_which_key_to_look_at(limits, what):
-    check_limits(tables(), None, PushLimits())
+    check_test_step(tables(), None, PushLimits())
     with pytest.raises(TableRefused, match=what) as caught:
-        check_limits(tables(), None, limits)
+        check_test_step(tables(), None, limits)
     assert "Nothing was written" in caught.value.remedy
 
 
 def test_change_is_measured_against_the_active_table():
     limits = PushLimits(change_mm=0.005)
-    check_limits(tables(1.1), tables(1.0), limits)
+    check_test_step(tables(1.1), tables(1.0), limits)
     with pytest.raises(TableRefused, match="CHANGE"):
-        check_limits(tables(-1.0), tables(1.0), limits)
+        check_test_step(tables(-1.0), tables(1.0), limits)
 
 
 def test_a_table_with_nan_or_off_zero_is_refused():
     bad = tables()
     bad.correction_mm[1][1, 2] = np.nan
     with pytest.raises(TableRefused, match="table of Z over Y: holds values that are not numbers"):
-        check_limits(bad, None, PushLimits())
+        check_test_step(bad, None, PushLimits())
     shifted = tables()
     shifted.correction_mm[0][:, 0] += 0.01
     with pytest.raises(TableRefused, match="not zero at its reference"):
-        check_limits(shifted, None, PushLimits())
+        check_test_step(shifted, None, PushLimits())
 
 
 def test_a_change_adds_to_what_is_active_on_its_own_grid():
@@ -118,6 +118,6 @@ def test_a_change_adds_to_what_is_active_on_its_own_grid():
 
 
 def test_the_three_tables_of_an_axis_are_limited_together():
-    check_limits(tables(), None, PushLimits(value_mm=0.06))
+    check_test_step(tables(), None, PushLimits(value_mm=0.06))
     with pytest.raises(TableRefused, match="together"):
-        check_limits(tables(), None, PushLimits(value_mm=0.05))  # each alone stays below 0.04
+        check_test_step(tables(), None, PushLimits(value_mm=0.05))  # each alone stays below 0.04
