@@ -27,7 +27,10 @@ class DeviceInfo:
 
 
 class BarSample(NamedTuple):
-    """One ball-bar sample as the box sent it (docs/protocols/ballbar.md). A plain tuple: thousands are made every second."""
+    """One ball-bar sample (docs/protocols/ballbar.md). A plain tuple: thousands are made every second.
+
+    ``status``: bits of `abbe.drivers.flags.BarFlag`; the driver of another box translates its own.
+    """
 
     seq: int
     device_us: int
@@ -63,7 +66,10 @@ class BarTap(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LaserReading:
-    """One coherent output sample of the laser (docs/protocols/laser.md)."""
+    """One coherent output sample of the laser (docs/protocols/laser.md).
+
+    ``status``: bits of `abbe.drivers.flags.LaserFlag`; the driver of another instrument translates its own.
+    """
 
     host_s: float
     sample_count: int
