@@ -13,6 +13,7 @@ from sqlalchemy import Engine, inspect
 from abbe.service.errors import StoreError
 from abbe.service.storage.engine import make_engine
 from abbe.service.storage.migrate import current_revision, downgrade, head_revision, upgrade
+from abbe.service.storage.migrations.versions import r0100_first as first
 from abbe.service.storage.store import Store
 from abbe.service.storage.tables import metadata
 from tests.migration import next_revision
@@ -35,6 +36,12 @@ def test_up_gives_the_tables_of_the_program(engine: Engine) -> None:
     assert current_revision(engine) == head_revision()
     with engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), metadata) == []
+
+
+def test_the_first_schema_states_its_tables_itself_once_there_is_a_second() -> None:
+    """Before the first release it is the program's tables as they are: a new column is then written once."""
+    versions = sorted(Path(first.__file__).parent.glob("r*.py"))
+    assert len(versions) == 1 or "metadata" not in versions[0].read_text()
 
 
 def test_down_and_up_again(engine: Engine) -> None:
