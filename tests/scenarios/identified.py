@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from abbe.models.machine import AXES
 from abbe.service.campaigns.measure import measure
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.sequences.interlocks import Watching
-from abbe.service.sequences.recipes.campaigns import identification, verification
+from abbe.service.sequences.recipes.campaigns import identification, quick_check
+from abbe.service.sequences.recipes.recipe import Linear
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
@@ -25,6 +27,8 @@ from tests.scenarios.conftest import simulated
 MACHINE = ("--seed", "2", "--boot-id", "20260601")
 """The simulated machine; its controller counts as switched on all the time."""
 RATE_HZ = 50
+POSITIONS = 13
+"""Of a line: every move costs a dozen questions over the wire, and half of the usual positions tell the same smooth errors."""
 
 
 def copy_identified(factory: pytest.TempPathFactory, folder: Path) -> None:
@@ -42,9 +46,14 @@ def _identify(folder: Path) -> None:
 
 async def _measure(site: Site, store: Store) -> None:
     full = identification(site.machine, rate_hz=RATE_HZ, name="june")
-    tests = tuple(t for t in full.tests if not t.label.endswith(("ZYX", "helix4", "helix5")))
+    tests = [t for t in full.tests if not t.label.startswith("line") and not t.label.endswith(("ZYX", "helix4", "helix5"))]
+    tests += [
+        Linear(f"line{AXES[a]}{k}", f"L{AXES[a]}{k}", "identify", a, at_share=(at, at), positions=POSITIONS).plan(site.machine)
+        for a in range(3)
+        for k, at in ((1, 0.15), (2, 0.85))
+    ]
     site = replace(site, watching=Watching(unknown_s=5.0))
     async with open_session(site.urls) as session:
         await as_if_commissioned(session.controller, store, site)
-        await measure(session, store, site, CampaignPlan("june", tests), progress=ignore_progress)
-        await measure(session, store, site, verification(site.machine, rate_hz=RATE_HZ, name="start"), progress=ignore_progress)
+        await measure(session, store, site, CampaignPlan("june", tuple(tests)), progress=ignore_progress)
+        await measure(session, store, site, quick_check(site.machine, rate_hz=RATE_HZ, name="start"), progress=ignore_progress)

@@ -20,7 +20,7 @@ from abbe.drivers.registry import open_controller
 from abbe.service.storage.store import Store
 from tests.scenarios.conftest import ABBE, Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
-from tests.scenarios.world import one_line, position_and_counters, registers, runs_of, wait_for
+from tests.scenarios.world import position_and_counters, refused, registers, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 
@@ -47,13 +47,13 @@ def verifying(sims: Sims) -> bool:
     return bool(entries) and entries[-1].state == "PROBED" and runs_of(sims.machine_file.parent)[-1].campaign.startswith("verify-after")
 
 
-def test_a_table_over_its_limit_is_refused_and_nothing_is_written(abbe, identified):
+def test_a_table_over_its_limit_is_refused_and_nothing_is_written(command, identified):
     """A real identification, a real solution, and a limit that no real machine keeps."""
     limited = identified.machine_file.with_name("limited.toml")
     limited.write_text(identified.machine_file.read_text() + "[limits]\ntable_value_um = 1\n")
     before = registers(identified, 7, 2), registers(identified, 208, 8)
-    process = abbe("correct", str(limited), "june", "--before", "start")
-    one_line(process, "CMP-001", "limit", "1.0 µm", "table_value_um", "othing was written")
+    ended = command("correct", limited, "june", "--before", "start")
+    refused(ended, "CMP-001", "limit", "1.0 µm", "table_value_um", "othing was written")
     assert (registers(identified, 7, 2), registers(identified, 208, 8)) == before  # generation; active bank, CRC and state of both banks
 
 
@@ -111,69 +111,68 @@ def killed(identified, tmp_path_factory) -> Killed:
     return Killed(identified, before, table(identified), left)
 
 
-def test_after_a_kill_during_the_verification_measuring_takes_the_table_back_first_and_says_so(abbe, identified, killed):
+def done(ended: tuple[int, str, str]) -> tuple[str, str]:
+    """What a command that ended well has said: stdout, stderr."""
+    assert ended[0] == 0, ended[2]
+    return ended[1:]
+
+
+HELIX = ("--helix", "300,250,100,60")
+
+
+def test_after_a_kill_during_the_verification_measuring_takes_the_table_back_first_and_says_so(command, identified, killed):
     before = killed.before
     assert table(identified) == killed.after != before
-    again = abbe("measure", str(identified.machine_file), "--helix", "300,250,100,60")
-    _, err = again.communicate(timeout=120)
-    assert again.returncode == 0, err
+    _, err = done(command("measure", identified.machine_file, *HELIX))
     assert re.search(r"(^|; )push \d+ was not verified .*; the old table was made active again(; |$)", err, re.MULTILINE), err
     assert table(identified) == before
     doc = runs_of(identified.machine_file.parent)[-1].start_doc
     assert doc["table"]["crc"] == before[1] << 16 | before[2]  # measured after the way back, not before
 
 
-def test_another_database_says_before_it_moves_that_it_did_not_push_the_table(abbe, killed, tmp_path):
+def test_another_database_says_before_it_moves_that_it_did_not_push_the_table(command, killed, tmp_path):
     """It goes on where a person vouches for the table, remembers who did, and says so in every report."""
     machine = killed.machine(tmp_path, "elsewhere", tmp_path / "other.sqlite3")
-    helix = ("measure", machine, "--helix", "300,250,100,60", "--name", "h")
+    helix = ("measure", machine, *HELIX, "--name", "h")
     still = position_and_counters(killed.sims)
-    for refused in (helix, ("comp", "commission", machine)):
-        one_line(abbe(*refused), "CMP-002", f"a table that this database did not push (CRC {killed.crc})", "--accept-table")
+    for words in (helix, ("comp", "commission", machine)):
+        refused(command(*words), "CMP-002", f"a table that this database did not push (CRC {killed.crc})", "--accept-table")
     assert (position_and_counters(killed.sims), table(killed.sims)) == (still, killed.after)
-    _, err = (process := abbe(*helix, "--accept-table")).communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert f"(CRC {killed.crc}) is accepted by " in err
-    _, err = (process := abbe("measure", machine, "--helix", "300,250,100,60", "--name", "again")).communicate(timeout=120)
-    assert process.returncode == 0, err  # it is remembered
-    page = tmp_path / "r.html"
-    _, err = (process := abbe("report", "h", "--machine", machine, "--out", str(page))).communicate(timeout=120)
-    assert process.returncode == 0, err
-    assert f"a table that this database did not push (CRC {killed.crc}): accepted by " in page.read_text()
+    assert f"(CRC {killed.crc}) is accepted by " in done(command(*helix, "--accept-table"))[1]
+    done(command("measure", machine, *HELIX, "--name", "again"))  # it is remembered
+    done(command("report", "h", "--machine", machine, "--out", "r.html"))
+    page = (tmp_path / "r.html").read_text()
+    assert f"a table that this database did not push (CRC {killed.crc}): accepted by " in page
     assert table(killed.sims) == killed.after
 
 
-def test_a_rehearsal_says_from_the_journal_what_stands_open_under_the_old_name(abbe, killed, tmp_path):
-    process = abbe("measure", killed.machine(tmp_path, "mill-A"), "--dry-run")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 0
+def test_a_rehearsal_says_from_the_journal_what_stands_open_under_the_old_name(command, killed, tmp_path):
+    _, err = done(command("measure", killed.machine(tmp_path, "mill-A"), "--dry-run"))
     assert re.search(
         r"warning: push 1 is in state PROBED: an unverified table may be in force; it is rolled back before anything else", err
     )
     assert table(killed.sims) == killed.after
 
 
-def test_a_report_of_runs_on_an_unverified_table_says_so_and_does_not_pass(abbe, killed, tmp_path):
+def test_a_report_of_runs_on_an_unverified_table_says_so_and_does_not_pass(command, killed, tmp_path):
     machine = killed.machine(tmp_path, "mill-A")
     run = runs_of(tmp_path)[-1]
-    out, err = (process := abbe("report", f"{run.campaign}/{run.label}", "--machine", machine, "--out", "r.csv")).communicate(timeout=120)
-    assert process.returncode == 0, err
+    out, _ = done(command("report", f"{run.campaign}/{run.label}", "--machine", machine, "--out", "r.csv"))
     assert f"Unverified table. Measured with the table of push 1 of machine 'sim' (CRC {killed.crc}), which was never verified" in out
 
 
-def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_until_a_person_accepts_it(abbe, killed, tmp_path):
+def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_until_a_person_accepts_it(command, killed, tmp_path):
     machine = killed.machine(tmp_path, "mill-A", host="localhost")
     still = position_and_counters(killed.sims)
-    for words in (("measure", machine, "--helix", "300,250,100,60"), ("correct", machine, "june")):
-        one_line(abbe(*words), "CMP-002", f"(CRC {killed.crc}) is that of push 1 of machine 'sim'", "never verified", "accept-table")
+    for words in (("measure", machine, *HELIX), ("correct", machine, "june")):
+        refused(command(*words), "CMP-002", f"(CRC {killed.crc}) is that of push 1 of machine 'sim'", "never verified", "accept-table")
     assert (position_and_counters(killed.sims), table(killed.sims)) == (still, killed.after)
-    out, err = (process := abbe("accept-table", machine, "--yes")).communicate(timeout=120)
-    assert process.returncode == 0, err
+    out, _ = done(command("accept-table", machine, "--yes"))
     assert "it is that of push 1 of machine 'sim', which no measurement has verified" in out
     old = tmp_path / "old.toml"  # under the old name it is closed, too: an accepted table is not taken back
     old.write_text(Path(machine).read_text().replace("mill-A", "sim").replace("localhost", "127.0.0.1"))
-    _, err = (process := abbe("measure", str(old), "--helix", "300,250,100,60")).communicate(timeout=120)
-    assert (process.returncode, table(killed.sims)) == (0, killed.after), err
+    done(command("measure", old, *HELIX))
+    assert table(killed.sims) == killed.after
 
 
 SCHEDULE = """[[schedule]]
@@ -189,7 +188,7 @@ body_diagonal_um = 500
 
 
 RENAMED = {
-    "measure": (("measure", "MACHINE", "--helix", "300,250,100,60"), (0,)),
+    "measure": (("measure", "MACHINE", *HELIX), (0,)),
     "push": (("comp", "push", "MACHINE", "1"), (1,)),
     "serve": (("serve", "MACHINE", "--once"), (0,)),
 }
@@ -205,10 +204,10 @@ every run plays three of them."""
 
 
 @pytest.mark.parametrize(("words", "codes"), RENAMED.values(), ids=RENAMED)
-def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_command(abbe, killed, tmp_path, words, codes):
+def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_command(command, killed, tmp_path, words, codes):
     machine = killed.machine(tmp_path, "mill-A", more=SCHEDULE)
-    out, err = (process := abbe(*(machine if word == "MACHINE" else word for word in words))).communicate(timeout=90)
-    assert process.returncode in codes, (out, err)
+    code, out, err = command(*(machine if word == "MACHINE" else word for word in words))
+    assert code in codes, (out, err)
     assert table(killed.sims) == killed.before
     if words[0] != "serve":
         assert "push 1 was not verified (interrupted before it was verified); the old table was made active again" in err
@@ -219,22 +218,17 @@ def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_comman
     assert all(r.start_doc["table"]["crc"] == killed.before[1] << 16 | killed.before[2] for r in later)
 
 
-def test_commissioning_proves_what_the_control_does_with_a_correction_and_leaves_the_table(abbe, identified):
+def test_commissioning_proves_what_the_control_does_with_a_correction_and_leaves_the_table(command, identified):
     before = table(identified)
-    process = abbe("comp", "commission", str(identified.machine_file))
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    out, _ = done(command("comp", "commission", identified.machine_file))
     assert "proved: a positive correction moves its own axis in its positive sense" in out
     assert "the controller has level L3: unattended pushes" in out
     assert table(identified) == before
 
 
-def test_levels_only_says_what_was_proved_and_how_and_mounts_nothing(abbe, identified):
+def test_levels_only_says_what_was_proved_and_how_and_mounts_nothing(command, identified):
     before = table(identified)
-    process = abbe("comp", "commission", str(identified.machine_file), "--levels-only", "--json")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    doc = json.loads(out)
+    doc = json.loads(done(command("comp", "commission", identified.machine_file, "--levels-only", "--json"))[0])
     assert doc["levels"]["level"] == 3
     assert all(flag["proved"] and flag["how"] for flag in doc["levels"]["flags"].values())
     assert set(doc["levels"]["flags"]) == {"two_banks", "swap_compares", "generation", "boot_id", "interlocks", "lease"}

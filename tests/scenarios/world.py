@@ -118,8 +118,14 @@ def _count(folder: Path, query: str) -> int:
 def one_line(process: subprocess.Popen[str], code: str, *words: str) -> str:
     """The process ended with 2 and one line that holds code and words."""
     _, err = process.communicate(timeout=90)
+    return refused((process.returncode, "", err), code, *words)
+
+
+def refused(ended: tuple[int, str, str], code: str, *words: str) -> str:
+    """A command (exit code, stdout, stderr) ended with 2 and one line that holds code and words."""
+    err = ended[2]
     lines = [line for line in err.strip().splitlines() if not re.match(r"^[\w-]+( [\d-]+ [\d:]+)?: ", line) or line.startswith("error")]
-    assert process.returncode == 2, err
+    assert ended[0] == 2, err
     assert len(lines) == 1, err
     assert lines[0].startswith(f"error {code}: ")
     for word in words:
