@@ -1,14 +1,13 @@
 """Whatever is wrong: one line with cause and remedy, exit code 2, nothing half-done."""
 
 import json
-import re
 import threading
 from contextlib import contextmanager
 
 import pytest
 
 from tests.scenarios.conftest import simulated
-from tests.scenarios.world import bar_chunks, laser_chunks, position_and_counters, runs_of, wait_for
+from tests.scenarios.world import bar_chunks, laser_chunks, position_and_counters, refused, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(180)]
 
@@ -18,17 +17,6 @@ def still(tmp_path_factory):
     """One simulated machine that no test may move."""
     with simulated(tmp_path_factory.mktemp("still"), "--speed", "60") as sims:
         yield sims
-
-
-def one_line(ended, code, *words):
-    """It ended with 2 and one line that holds code and words; lines of progress do not count."""
-    status, _, err = ended
-    lines = [line for line in err.strip().splitlines() if not re.match(r"^[\w-]+( [\d-]+ [\d:]+)?: ", line) or line.startswith("error")]
-    assert status == 2, err
-    assert len(lines) == 1, err
-    assert lines[0].startswith(f"error {code}: ")
-    for word in words:
-        assert word in lines[0]
 
 
 @contextmanager
@@ -48,23 +36,23 @@ def meanwhile(condition, what, do):
 
 
 def test_missing_machine_file(command):
-    one_line(command("measure", "nowhere.toml"), "CFG-001", "nowhere.toml")
+    refused(command("measure", "nowhere.toml"), "CFG-001", "nowhere.toml")
 
 
 def test_unknown_key_names_the_nearest_valid_one(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text() + "[limits]\ntable_valu_um = 5\n")
-    one_line(command("measure", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
+    refused(command("measure", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
 
 
 def test_port_refused(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text().replace(still.ready["cnc"], "modbus+tcp://127.0.0.1:9?unit=1"))
-    one_line(command("measure", "machine.toml"), "DRV-002", "127.0.0.1:9")
+    refused(command("measure", "machine.toml"), "DRV-002", "127.0.0.1:9")
 
 
 def test_a_path_beyond_the_stroke_moves_nothing(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text())
     before = position_and_counters(still)
-    one_line(command("measure", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
+    refused(command("measure", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
     assert position_and_counters(still) == before
     assert not (tmp_path / "abbe.sqlite3").exists() or runs_of(tmp_path) == []
 
@@ -73,7 +61,7 @@ def test_ball_bar_unplugged_in_mid_run(command, start_sims):
     sims = start_sims("--speed", "10")
     with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask("unplug_ballbar")):
         ended = command("measure", str(sims.machine_file), "--helix", "300,250,100,150")
-    one_line(ended, "DRV-002", "unplugged")
+    refused(ended, "DRV-002", "unplugged")
     run = runs_of(sims.machine_file.parent)[-1]
     assert run.status == "failed"
     assert "DRV-002" in run.reason
@@ -86,7 +74,7 @@ def test_laser_beam_lost(command, start_sims):
     first = (lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, "the first readings of a laser line")
     with meanwhile(*first, lambda: sims.ask("beam", blocked=True)):
         ended = command("measure", str(sims.machine_file), "--recipe", "verification")
-    one_line(ended, "ILK-007", "beam")
+    refused(ended, "ILK-007", "beam")
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")
     assert "ILK-007" in run.reason
@@ -112,6 +100,6 @@ def test_nan_in_a_run_file_imports_nothing(command, shared, tmp_path):
     run = json.loads((folder / "r02.json").read_text())
     run["columns"]["deviation_mm"][3] = float("nan")
     (folder / "r02.json").write_text(json.dumps(run))
-    one_line(command("import", str(folder)), "FMT-001", "r02.json", "deviation_mm")
+    refused(command("import", str(folder)), "FMT-001", "r02.json", "deviation_mm")
     code, out, err = command("runs", "--json")
     assert code == 2 or json.loads(out) == [], err

@@ -22,7 +22,6 @@ setup = "L1"
 axis = "X"
 at_share = [0.4, 0.4]
 positions = 5
-cycles = 2
 overrun_mm = 2.0
 offset_share = 0.3
 [[test]]

@@ -40,8 +40,8 @@ Runs = list[Run]
 
 def plan_of(site: Site, name: str, *, diagonals: tuple[str, ...] = DIAGONALS, helix: bool = True) -> CampaignPlan:
     """A short verification: what a decision needs and no more."""
-    tests = [Helix("check-helix", "VB", "holdout", (300.0, 250.0, 100.0), 100.0, turns=3, rate_hz=100).plan(site.machine)] if helix else []
-    tests += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 6, "").plan(site.machine) for d in diagonals]
+    tests = [Helix("check-helix", "VB", "holdout", (300.0, 250.0, 100.0), 100.0, turns=3, rate_hz=50).plan(site.machine)] if helix else []
+    tests += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 4, "").plan(site.machine) for d in diagonals]
     return CampaignPlan(name, tuple(tests))
 
 

@@ -115,12 +115,6 @@ def _count(folder: Path, query: str) -> int:
         return 0
 
 
-def one_line(process: subprocess.Popen[str], code: str, *words: str) -> str:
-    """The process ended with 2 and one line that holds code and words."""
-    _, err = process.communicate(timeout=90)
-    return refused((process.returncode, "", err), code, *words)
-
-
 def refused(ended: tuple[int, str, str], code: str, *words: str) -> str:
     """A command (exit code, stdout, stderr) ended with 2 and one line that holds code and words."""
     err = ended[2]
