@@ -92,7 +92,7 @@ def test_stopping_the_demo_leaves_no_simulator_and_says_which_run_was_cut(abbe, 
 def test_sigkill_loses_the_last_instant_only_and_damages_nothing_else(abbe, command, tmp_path):
     folder = tmp_path / "kept"
     process = abbe("demo", "--speed", "1", "--keep", str(folder))
-    label = wait_for(lambda: bar_run_under_way(folder, chunks=40), 90, "a ball-bar run of the identification at speed 1")
+    label = wait_for(lambda: bar_run_under_way(folder, chunks=20), 90, "a ball-bar run of the identification at speed 1")
     killed_at = time.monotonic()
     process.kill()
     process.communicate()
