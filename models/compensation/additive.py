@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import Term, legendre_values
@@ -104,10 +105,11 @@ def _towards_diagonals(field: Field, stroke_mm: F2, nodes: int, order: int) -> n
     columns = [np.ones((len(points), 1))]
     for a in range(3):
         coordinates, back = np.unique(points[:, a], return_inverse=True)
-        left = left - _mean_over_others(field, stroke_mm, a, coordinates, nodes)[back]
+        left -= _mean_over_others(field, stroke_mm, a, coordinates, nodes)[back]
         columns.append(legendre_values(points[:, a], stroke_mm[a], order)[:, 1:])
     basis: F2 = np.concatenate(columns, axis=1)
-    beta = np.linalg.lstsq(basis * weight[:, None], (left * weight[:, None, None]).reshape(len(points), -1), rcond=None)[0]
+    q, r = np.linalg.qr(basis * weight[:, None])
+    beta = scipy.linalg.solve_triangular(r, (q * weight[:, None]).T @ left.reshape(len(points), -1))
     return np.asarray(beta[1:].reshape(3, order, 3, -1))
 
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.effects.effect import Form, Signal, Values
-from abbe.models.effects.path import FAR_MM, Path, Places, run_in, since_reversal
+from abbe.models.effects.path import FAR_MM, Path, Places, read_together
 from abbe.models.functions.legendre import legendre_values
-from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import AXES
 
 UM, PPM = 1e-3, 1e-6
@@ -60,7 +59,8 @@ def third_axis(key: str) -> int:
 def along(direction: int, *values: F1) -> F3:
     """Deviation in one direction, shape (n, 3, k), from k columns of shape (n,)."""
     out = np.zeros((len(values[0]), 3, len(values)))
-    out[:, direction, :] = np.stack(values, axis=1)
+    for k, value in enumerate(values):
+        out[:, direction, k] = value
     return out
 
 
@@ -71,6 +71,11 @@ def of_machine(deviation: Deviation) -> Signal:
         return [path.read(lambda at: deviation(at, key, values)) for path in paths]
 
     return signal
+
+
+def of_places(deviation: Deviation) -> Signal:
+    """`of_machine`, faster, for a deviation that depends on every row of `Places` alone and on no temperature: all runs at once."""
+    return lambda paths, key, values: read_together(paths, lambda at: deviation(at, key, values))
 
 
 def of_path(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
@@ -130,16 +135,9 @@ def order_of(names: Iterable[str]) -> dict[str, int]:
 
 
 def commanded_turns(at: Places, axis: int) -> tuple[F1, F1]:
-    """Direction of the last motion and travel since the last turn, shape (n,) each, where an axis turns at a commanded position.
-
-    A machine that dwells turns where `Places` says: it may have gone beyond a place and come back.
-    """
-    if len(at.t_s) < 2 or not at.v_mm_s.any():
-        return at.sign[:, axis], at.since_mm[:, axis]
-    came_mm = run_in(at.q_mm) if len(at.t_s) > 2 else at.q_mm
-    sign = travel_sign(came_mm)
-    since = since_reversal(came_mm, sign)
-    return sign[-len(at.t_s) :, axis], since[-len(at.t_s) :, axis]
+    """`Places.commanded_turns` of one axis, shape (n,) each."""
+    sign, since = at.commanded_turns
+    return sign[:, axis], since[:, axis]
 
 
 def wind_up(at: Places, axis: int, *over_mm: float) -> list[F1]:

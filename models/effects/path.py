@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -45,6 +46,19 @@ class Places:
     a_mm_s2: F2
     t_s: F1
     temp_c: Mapping[str, F1]
+
+    @cached_property
+    def commanded_turns(self) -> tuple[F2, F2]:
+        """Direction of the last motion and travel since the last turn, shape (n, 3) each, where axes turn at a commanded position.
+
+        A machine that dwells turns where ``sign`` and ``since_mm`` say: it may have gone beyond a place and come back.
+        """
+        n = len(self.t_s)
+        if n < 2 or not self.v_mm_s.any():
+            return self.sign, self.since_mm
+        came_mm = run_in(self.q_mm) if n > 2 else self.q_mm
+        sign = travel_sign(came_mm)
+        return sign[-n:], since_reversal(came_mm, sign)[-n:]
 
 
 @dataclass(frozen=True)
@@ -112,6 +126,24 @@ class Path:
             Reading, mm: ``look . (deviation at the place - deviation at the reference)``.
         """
         return np.asarray(np.einsum("ni,nik->nk", self.look, deviation(self.at) - deviation(self.reference)))
+
+
+def read_together(paths: Sequence[Path], deviation: Callable[[Places], F3]) -> list[F2]:
+    """`Path.read` of all runs at once, for a deviation that depends on every row of `Places` alone and on no temperature."""
+    if not paths:
+        return []
+    found = deviation(_joined([*(p.at for p in paths), *(p.reference for p in paths)]))
+    n = [p.n for p in paths]
+    zero = np.repeat(found[sum(n) :], n, axis=0)
+    reading = np.einsum("ni,nik->nk", np.concatenate([p.look for p in paths]), found[: sum(n)] - zero)
+    return np.split(reading, np.cumsum(n)[:-1])
+
+
+def _joined(parts: Sequence[Places]) -> Places:
+    """One after the other, without temperatures."""
+    columns = [[p.q_mm, p.sign, p.since_mm, p.v_mm_s, p.a_mm_s2] for p in parts]
+    q, sign, since, v, a = (np.concatenate(c) for c in zip(*columns, strict=True))
+    return Places(q, sign, since, v, a, np.concatenate([p.t_s for p in parts]), {})
 
 
 RUN_IN = 2

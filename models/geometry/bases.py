@@ -7,15 +7,16 @@ Legendre polynomials of order 2 and more are orthogonal to 1 and x over the stro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from abbe.models.arrays import F2
-from abbe.models.functions.legendre import legendre_values
+from abbe.models.arrays import F1, F2
+from abbe.models.functions.legendre import legendre_polynomials, legendre_values
 from abbe.models.functions.motions import ROTATIONS, motion_names
 from abbe.models.machine import AXES as DIRECTIONS
 
-__all__ = ["DIRECTIONS", "ROTATIONS", "Term", "legendre_values", "motion_names", "smooth_terms", "term_values"]
+__all__ = ["DIRECTIONS", "ROTATIONS", "Term", "layout_of", "legendre_values", "motion_names", "smooth_terms", "term_values"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,7 @@ class Term:
         return f"{self.motion}.{self.order}" if self.order else self.motion
 
 
+@lru_cache(maxsize=64)
 def smooth_terms(order: int) -> tuple[Term, ...]:
     """All terms of the 21 error motions up to a Legendre order: 18 order - 3 columns (math.md 4.6)."""
     if order < 1:
@@ -63,15 +65,58 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
     array, shape (n, len(terms)): Legendre value (zero at stroke start for positioning and angles), or, for squareness, the travel of the
     axis from its stroke start with the sign of docs/explanation/conventions.md.
     """
-    order = max((t.order for t in terms), default=0)
-    start = legendre_values(np.zeros(1), np.array([0.0, 1.0]), order)[0]  # P_k(-1)
-    tables = [legendre_values(axes_mm[:, a], stroke_mm[a], order) for a in range(3)]
-    out = np.empty((axes_mm.shape[0], len(terms)))
-    for i, t in enumerate(terms):
-        if t.order == 0:
-            travel = axes_mm[:, t.axis] - stroke_mm[t.axis, 0]
-            out[:, i] = travel if t.motion == "B0Z" else -travel
-        else:
-            straight = t.component < 3 and t.component != t.axis
-            out[:, i] = tables[t.axis][:, t.order] - (0.0 if straight else start[t.order])
-    return out
+    layout = layout_of(terms)
+    start, travel_mm = stroke_mm[:, :1], np.asarray(axes_mm).T - stroke_mm[:, :1]
+    u = np.minimum(np.maximum(2.0 * travel_mm / (stroke_mm[:, 1:] - start) - 1.0, -1.0), 1.0)
+    out = legendre_polynomials(u, layout.highest).reshape(-1, u.shape[1])[layout.row]
+    out -= layout.at_start[:, None]
+    for i, axis, sign in layout.squareness:
+        out[i] = sign * travel_mm[axis]
+    return np.ascontiguousarray(out.T)
+
+
+@dataclass(frozen=True)
+class TermLayout:
+    """Where the terms of a model stand, shape (terms,) each.
+
+    ``motion``: which of the 18 motions (axis x 6 + component). ``row``: of the Legendre tables, 3 x order + axis. ``at_start``: what is
+    taken off, the value at the start of the stroke of positioning and angles. ``highest``: order. ``squareness``: (index, axis, sign) of
+    each squareness.
+    """
+
+    motion: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    row: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    at_start: F1
+    highest: int
+    squareness: tuple[tuple[int, int, float], ...]
+
+
+class _Same:
+    """A tuple of terms that is compared by what it is: hashing hundreds of terms takes longer than using them."""
+
+    def __init__(self, terms: tuple[Term, ...]) -> None:
+        self.terms = terms
+
+    def __hash__(self) -> int:
+        return id(self.terms)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.terms is other.terms
+
+
+def layout_of(terms: tuple[Term, ...]) -> TermLayout:
+    """The layout of these terms, made once."""
+    return _layout(_Same(terms))
+
+
+@lru_cache(maxsize=64)
+def _layout(same: _Same) -> TermLayout:
+    terms = same.terms
+    straight = np.array([t.component < 3 and t.component != t.axis for t in terms], dtype=bool)
+    return TermLayout(
+        np.array([6 * t.axis + t.component for t in terms], dtype=np.intp),
+        np.array([3 * t.order + t.axis for t in terms], dtype=np.intp),
+        np.where(straight, 0.0, [(-1.0) ** t.order for t in terms]),
+        max((t.order for t in terms), default=0),
+        tuple((i, t.axis, 1.0 if t.motion == "B0Z" else -1.0) for i, t in enumerate(terms) if t.order == 0),
+    )

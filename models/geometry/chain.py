@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from abbe.models.arrays import F1, F2, F3, F4
-from abbe.models.geometry.bases import Term, smooth_terms, term_values
+from abbe.models.geometry.bases import Term, layout_of, smooth_terms, term_values
 from abbe.models.geometry.rotation import RotationForm, cross, cross_matrix, rotation_matrix, turn_vector, turn_vector_slope, turned_by
 from abbe.models.machine import AXES, Machine, levers_mm, split_chain
 
@@ -108,15 +108,9 @@ def design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2) -> F3:
 
     Coefficients are mm for translations, rad for rotations and squareness. Rule G is linear, so ``design @ coefficients`` is the deviation.
     """
-    values = term_values(terms, axes_mm, machine.stroke_mm)
-    r = levers_mm(machine, axes_mm)
-    out = np.zeros((axes_mm.shape[0], 3, len(terms)))
-    unit = np.eye(3)
-    for i, t in enumerate(terms):
-        if t.component < 3:
-            out[:, t.component, i] = values[:, i]
-        else:
-            out[:, :, i] = values[:, i, None] * np.cross(unit[t.component - 3], r[:, t.axis])
+    per_motion = motion_jacobian(machine, axes_mm).reshape(-1, 3, 18)
+    out: F3 = per_motion[:, :, layout_of(terms).motion]
+    out *= term_values(terms, axes_mm, machine.stroke_mm)[:, None]
     return out
 
 

@@ -28,16 +28,23 @@ def cross(a: F2, b: F2) -> F2:
 def rotation_factors(angle_squared: F1) -> tuple[F1, F1]:
     """Rodrigues' two factors sin|E|/|E| and (1 − cos|E|)/|E|² from |E|² (rad²), both smooth through |E| = 0."""
     angle = np.sqrt(angle_squared)
-    half = np.sinc(angle / (2.0 * np.pi))
-    return np.asarray(np.sinc(angle / np.pi)), np.asarray(0.5 * half * half)
+    angle = np.where(angle == 0.0, 1e-20, angle)  # its sine is itself
+    half = np.sin(0.5 * angle) / angle
+    return np.asarray(np.sin(angle) / angle), np.asarray(2.0 * half * half)
+
+
+S_SERIES = tuple((-1.0) ** n * 2 * n / factorial(2 * n + 1) for n in range(10, 0, -1))
+C_SERIES = tuple((-1.0) ** n * 2 * n / factorial(2 * n + 2) for n in range(10, 0, -1))
+"""Slopes of Rodrigues' two factors, divided by the angle, as series in its square, highest power first."""
 
 
 def factor_slopes(angle_squared: F1) -> tuple[F1, F1]:
     """Derivative of Rodrigues' two factors with respect to |E|, divided by |E|: a power series below 1 rad, where the formulas cancel."""
     q = np.asarray(angle_squared, dtype=np.float64)
     near = np.minimum(q, 1.0)
-    s_series = sum((-1.0) ** n * 2 * n * near ** (n - 1) / factorial(2 * n + 1) for n in range(1, 11))
-    c_series = sum((-1.0) ** n * 2 * n * near ** (n - 1) / factorial(2 * n + 2) for n in range(1, 11))
+    s_series, c_series = np.polyval(S_SERIES, near), np.polyval(C_SERIES, near)
+    if q.size and q.max() < 1.0:
+        return s_series, c_series
     s, c = rotation_factors(q)
     far = np.maximum(q, 1.0)
     return np.where(q < 1.0, s_series, (np.cos(np.sqrt(q)) - s) / far), np.where(q < 1.0, c_series, (s - 2.0 * c) / far)

@@ -124,22 +124,34 @@ class Search:
 
     def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...], thrift: float = 1.0) -> list[Measurement]:
         """Affordable tests of the pool, and what fits to the cups that stand, by gain / minutes^thrift, the best first."""
+        costs = self._affordable(chosen, budget_min, pool)
+        if not costs:
+            return []
         lower = scipy.linalg.cholesky(self.information(chosen), lower=True)
-        half = scipy.linalg.solve_triangular(lower, self._rows.T, lower=True)
-        start = (half**2).sum(axis=0)
+        factors = [self._gain_factor(chosen.get(test.mounting, ()), test) for test in costs]
+        ends = np.cumsum([len(f) for f in factors])
+        known = scipy.linalg.solve_triangular(lower, np.concatenate([self._rows, *factors]).T, lower=True)  # all tests at once
+        half, told = known[:, : len(self._rows)], known[:, len(self._rows) :].T
+        start, seen = (half**2).sum(axis=0), told @ half
         now, rates = self._judge(start), dict[Measurement, float]()
+        for (test, cost), end, f in zip(costs.items(), ends, factors, strict=True):
+            at = slice(end - len(f), end)
+            s = scipy.linalg.cholesky(np.eye(len(f)) + told[at] @ told[at].T, lower=True, check_finite=False)
+            reduction = scipy.linalg.solve_triangular(s, seen[at], lower=True, check_finite=False)
+            rates[test] = (now - self._judge(start - (reduction**2).sum(axis=0))) / cost**thrift
+        return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
+
+    def _affordable(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...]) -> dict[Measurement, float]:
+        """Minutes of each test of the pool, and of what fits to the cups that stand, that can come next within the budget."""
+        costs = {}
         for test in (*pool, *self._at_cups(chosen)):
             before = chosen.get(test.mounting, ())
             if test in before or (before and isinstance(test, HelixTest) and not _follows(test, before)):
                 continue
             cost = self.cost_min(test, before)
-            if cost > budget_min:
-                continue
-            b = scipy.linalg.solve_triangular(lower, self._gain_factor(before, test).T, lower=True).T
-            s = scipy.linalg.cholesky(np.eye(len(b)) + b @ b.T, lower=True)
-            reduction = scipy.linalg.solve_triangular(s, b @ half, lower=True)
-            rates[test] = (now - self._judge(start - (reduction**2).sum(axis=0))) / cost**thrift
-        return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
+            if cost <= budget_min:
+                costs[test] = cost
+        return costs
 
     def _at_cups(self, chosen: Chosen) -> list[Measurement]:
         """Other bars, and the way back with the same bar, at the cups that stand already."""

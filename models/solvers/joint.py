@@ -7,8 +7,11 @@ The noise of the instruments and the size of the errors of each class are estima
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from functools import wraps
+from typing import Concatenate, Literal, ParamSpec, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -41,9 +44,9 @@ class RunFit:
     expected_mm: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Error motions of the machine from all runs together.
+    """Error motions of the machine from all runs together. Never changed, so what follows from it is kept with it (`kept`).
 
     Attributes
     ----------
@@ -116,6 +119,27 @@ class JointSolution:
     def backlash_mm(self) -> dict[str, tuple[float, float]]:
         """Lost motion of each axis and its standard uncertainty, mm."""
         return {a: (self.estimate.value(f"backlash_{a}"), self.estimate.u(f"backlash_{a}")) for a in DIRECTIONS}
+
+
+Q = ParamSpec("Q")
+T = TypeVar("T")
+
+
+def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatenate[JointSolution, Q], T]:
+    """A function of a solution and of hashable values that is worked out once for each of them, as long as the solution lives.
+
+    What it returns must not hold the solution, which would then live for ever.
+    """
+    answers: WeakKeyDictionary[JointSolution, dict[tuple[object, ...], T]] = WeakKeyDictionary()
+
+    @wraps(make)
+    def asked(solution: JointSolution, /, *args: Q.args, **named: Q.kwargs) -> T:
+        mine, key = answers.setdefault(solution, {}), (*args, *named.items())
+        if key not in mine:
+            mine[key] = make(solution, *args, **named)
+        return mine[key]
+
+    return asked
 
 
 def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:

@@ -27,8 +27,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3, F4
-from abbe.models.geometry.bases import Term, term_values
-from abbe.models.geometry.chain import exact_deviation_mm, exact_jacobian
+from abbe.models.geometry.bases import Term, layout_of, term_values
+from abbe.models.geometry.chain import exact_deviation_mm, exact_jacobian, motion_jacobian
 from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors, bar_length_sd
@@ -221,8 +221,7 @@ class AxisPlaces:
     @classmethod
     def of(cls, machine: Machine, terms: tuple[Term, ...], axes_mm: F2, sign: F2) -> AxisPlaces:
         """Evaluate the terms' functions at commanded positions (n, 3)."""
-        column = np.array([6 * t.axis + t.component for t in terms], dtype=np.intp)
-        return cls(machine, axes_mm, sign, term_values(terms, axes_mm, machine.stroke_mm), column)
+        return cls(machine, axes_mm, sign, term_values(terms, axes_mm, machine.stroke_mm), layout_of(terms).motion)
 
     def motions(self, theta: F1) -> F3:
         """Error motions, squareness and lost motion included, shape (n, 3 axes, 6), for unknowns that begin with terms and lost motion."""
@@ -236,10 +235,14 @@ class AxisPlaces:
 
     def deviation_mm(self, motions: F3) -> F2:
         """Exact deviation of the tool, finite rotations, shape (n, 3), mm."""
+        if not motions.any():
+            return np.zeros_like(self.axes_mm)
         return exact_deviation_mm(self.machine, self.axes_mm, motions)
 
     def slope(self, motions: F3) -> F4:
-        """Derivative of the exact deviation with respect to the error motions, shape (n, 3, 3 axes, 6)."""
+        """Derivative of the exact deviation with respect to the error motions, shape (n, 3, 3 axes, 6); rule G where there are none."""
+        if not motions.any():
+            return motion_jacobian(self.machine, self.axes_mm)
         return exact_jacobian(self.machine, self.axes_mm, motions)
 
     def rows(self, direction: F2, slope: F4) -> F2:

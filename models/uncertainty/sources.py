@@ -8,6 +8,7 @@ unknown (the bar's calibrated length, the set-ups, the typical size of errors). 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term, smooth_terms
 from abbe.models.machine import AXES
-from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.joint import JointSolution, kept
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import run_design
 from abbe.models.solvers.priors import Priors, term_prior_sd
@@ -120,10 +121,15 @@ class Response:
 
         Each reading contributes one minus its leverage.
         """
-        leverage = self.weight * np.einsum("np,pq,nq->n", self.design, self.covariance, self.design, optimize=True)
-        left = np.where(self.weight > 0, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
+        left = self._left
         total = float(left.sum())
         return max(1.0, self.dof * float(left[self.kind == kind].sum()) / total) if total > 0 else 1.0
+
+    @cached_property
+    def _left(self) -> F1:
+        """One minus the leverage of each reading, 0 for a rejected one, shape (n,)."""
+        leverage = self.weight * np.einsum("np,np->n", self.design @ self.covariance, self.design)
+        return np.where(self.weight > 0, np.clip(1.0 - leverage, 0.0, 1.0), 0.0)
 
     @property
     def gain(self) -> F2:
@@ -131,6 +137,7 @@ class Response:
         return np.asarray(self.covariance @ (self.design * self.weight[:, None]).T)
 
 
+@kept
 def response(solution: JointSolution) -> Response:
     """Design, weights and covariance of a solution, from its own runs, set-up, weights and prior."""
     design = np.concatenate([run_design(solution.machine, solution.terms, run, solution.setup) for run in solution.data])
@@ -138,8 +145,9 @@ def response(solution: JointSolution) -> Response:
     root = prior_factor(solution.prior_root)
     normal = root.T @ solution.information @ root
     np.fill_diagonal(normal, normal.diagonal() + 1.0)
-    inner = scipy.linalg.solve_triangular(scipy.linalg.cholesky(normal, lower=True), root.T, lower=True)
-    pull = scipy.linalg.cho_solve((scipy.linalg.cholesky(normal, lower=True), True), root.T).T  # C R^-T
+    low = scipy.linalg.cholesky(normal, lower=True)
+    inner = scipy.linalg.solve_triangular(low, root.T, lower=True)
+    pull = scipy.linalg.cho_solve((low, True), root.T).T  # C R^-T
     covariance = inner.T @ inner
     widening = solution.estimate.covariance - covariance
     return Response(design, solution.weight_per_mm2, kind, covariance, pull, widening, solution.estimate.dof)
@@ -159,7 +167,8 @@ def prior_factor(root: F2) -> F2:
 # its covariance is (S^-1 + B^T (W - W A C A^T W) B)^-1 about the value the residuals ask for, not S.
 
 
-def order_source(solution: JointSolution, r: Response, orders_above: int) -> tuple[tuple[Term, ...], F2]:
+@kept
+def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term, ...], F2]:
     """Terms of the solution and of the orders above it, and the factor of what the latter do to all of them, shape (P, q).
 
     The prediction stays that of the chosen order, so what the residuals ask of the higher orders is not a correction: it counts as one more
@@ -169,7 +178,7 @@ def order_source(solution: JointSolution, r: Response, orders_above: int) -> tup
     terms = (*solution.terms, *above)
     if not above:
         return terms, np.zeros((len(terms), 0))
-    n = len(solution.terms)
+    n, r = len(solution.terms), response(solution)
     omitted = _design(solution, above)
     weighted = omitted * r.weight[:, None]
     carried = r.covariance @ (r.design.T @ weighted)  # K B
@@ -307,19 +316,26 @@ def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -
         Without the stated inputs (`StatedInputs.without_stated_inputs`) the sources add up to ``solution.term_covariance``.
     """
     inputs = inputs or StatedInputs()
+    terms, sources = _sources(solution, inputs)
+    coefficients = np.concatenate([solution.coefficients, np.zeros(len(terms) - len(solution.terms))])
+    return ErrorSources(solution, inputs, terms, coefficients, sources)
+
+
+@kept
+def _sources(solution: JointSolution, inputs: StatedInputs) -> tuple[tuple[Term, ...], tuple[Source, ...]]:
+    """All terms, and the sources as factors of theirs."""
     r = response(solution)
     n = len(solution.terms)
     found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
     if inputs.single_approach:
         found.append(Source("repeatability", np.zeros((n, 0)), inputs.repeatability_dof, inputs.repeatability_mm))
-    terms, extra = order_source(solution, r, inputs.orders_above)
+    terms, extra = order_source(solution, inputs.orders_above)
     above = len(terms) - n
     parts = [replace(s, factor=_padded(s.factor[:n], above)) for s in found]
     parts.append(Source("model_order", extra))
     plus, subtracted = _widening(r, n)
     wider = Source("estimated_sizes", _padded(plus, above), subtracted=_padded(subtracted, above))
-    coefficients = np.concatenate([solution.coefficients, np.zeros(above)])
-    return ErrorSources(solution, inputs, terms, coefficients, (*_merged(parts), wider))
+    return terms, (*_merged(parts), wider)
 
 
 def _padded(factor: F2, above: int) -> F2:

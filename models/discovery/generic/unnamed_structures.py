@@ -16,8 +16,9 @@ from abbe.models.discovery.case import Case
 from abbe.models.discovery.generic.scan import PERIODS_S, PITCHES_MM, ScanResult, bumps, bursts, periods, pitches, step_instants
 from abbe.models.discovery.localization import localize_signal
 from abbe.models.effects.effect import Effect, Form, Parameter, Signal, Values
-from abbe.models.effects.path import Path, Places
+from abbe.models.effects.path import Path, Places, read_together
 from abbe.models.functions.legendre import legendre_values
+from abbe.models.geometry.rotation import cross_matrix
 from abbe.models.machine import AXES
 
 UM = 1e-3
@@ -63,32 +64,31 @@ def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 def wave(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """``"EYX"``: a wave of ``pitch_mm`` along X in direction Y."""
     axis = AXES.index(key[2])
-    return [p.read(lambda at: _along(key[1], _turns(at.q_mm[:, axis] / values["pitch_mm"]))) for p in paths]
+    return read_together(paths, lambda at: _along(key[1], _turns(at.q_mm[:, axis] / values["pitch_mm"])))
 
 
 def surge(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """A wave of ``period_s`` on the clock: of an axis (``"X"``), or of the reading itself of ``"bar"`` or ``"laser"``."""
     period = values["period_s"]
     if key in AXES:
-        return [p.read(lambda at: _along(key, _turns(at.t_s / period))) for p in paths]
+        return read_together(paths, lambda at: _along(key, _turns(at.t_s / period)))
     return [UM * (_turns(p.at.t_s / period) - _turns(p.reference.t_s / period)) if p.kind == key else np.zeros((p.n, 2)) for p in paths]
 
 
 def step(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """A constant offset of one axis from ``t0_s`` on."""
-    return [p.read(lambda at: _along(key, (at.t_s >= values["t0_s"]).astype(np.float64)[:, None])) for p in paths]
+    return read_together(paths, lambda at: _along(key, (at.t_s >= values["t0_s"]).astype(np.float64)[:, None]))
 
 
 def slip(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """The work moves and turns at ``t0_s`` (a clamp gave way): three translations, three rotations about the middle of the strokes."""
 
-    def deviation(p: Path, at: Places) -> F3:
-        arm = (at.q_mm - p.machine.centre_mm) / ARM_MM
-        turned = np.stack([np.cross(axis, arm) for axis in np.eye(3)], axis=2)
+    def deviation(at: Places) -> F3:
+        turned = -cross_matrix((at.q_mm - paths[0].machine.centre_mm) / ARM_MM)
         moved = np.broadcast_to(np.eye(3), turned.shape)
         return np.asarray(UM * np.concatenate([moved, turned], axis=2) * (at.t_s >= values["t0_s"])[:, None, None])
 
-    return [p.read(lambda at, p=p: deviation(p, at)) for p in paths]  # type: ignore[misc]
+    return read_together(paths, deviation)
 
 
 def settling(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
@@ -97,7 +97,7 @@ def settling(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     def gone(t_s: F1) -> F2:
         return np.asarray(-np.expm1(-np.maximum(t_s - values["t0_s"], 0.0) / values["tau_s"]))[:, None]
 
-    return [p.read(lambda at: _along(key, gone(at.t_s))) for p in paths]
+    return read_together(paths, lambda at: _along(key, gone(at.t_s)))
 
 
 def bump(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
@@ -108,7 +108,7 @@ def bump(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
         height = np.exp(-0.5 * np.sum((at.q_mm - centre) ** 2, axis=1) / values["width_mm"] ** 2)
         return np.asarray(UM * height[:, None, None] * np.eye(3))
 
-    return [p.read(deviation) for p in paths]
+    return read_together(paths, deviation)
 
 
 def place_at(paths: tuple[Path, ...], at_s: float) -> F1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1, F3
-from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_machine, of_path, share_of_stroke
+from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_path, of_places, share_of_stroke
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
@@ -56,10 +56,10 @@ EFFECT = Effect(
     per_unit=1.0,
     typical=(0.5, 5.0),
     shape=(Parameter("pitch_mm", "mm", LOW_MM, HIGH_MM, 10.0, "effects.md 1: screw lead 5...25 mm", STARTS),),
-    signal=of_machine(wave),
+    signal=of_places(wave),
     strength=amplitude,
     forms=(
-        Form("second harmonic", of_machine(_second)),
+        Form("second harmonic", of_places(_second)),
         Form("modulated", of_path(_modulated)),
         Form("modulated twice", of_path(_modulated_twice)),
     ),

@@ -24,6 +24,8 @@ INSIDE = 1e-9
 """A set of motions holds a hidden combination if its share of the null space misses 1 by less than this (squared leak)."""
 ENTRY = 1e-6
 """Entries of a unit vector below this are rounding."""
+NEW = 1e-4
+"""A unit vector is independent of what is reported if more than this of it lies beside."""
 LISTED = 6
 _TURNS = {"AX": "roll", "BX": "pitch", "CX": "yaw", "AY": "pitch", "BY": "roll", "CY": "yaw", "CZ": "roll"}
 _PAIRS = {"C0Y": "X and Y", "B0Z": "X and Z", "A0Z": "Y and Z"}
@@ -144,7 +146,11 @@ def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, reported: F2, 
             known = sum(v.shape[1] for motions, v in out if set(motions) <= set(chosen))
             if reported.shape[1] == count or count_inside <= known:
                 continue
-            new, reported = _independent(_inside(shadow, [i for m in chosen for i in active[m]]), reported)
+            at = [i for m in chosen for i in active[m]]
+            own = _inside(shadow, at)
+            if np.linalg.norm(_beside(own, reported)) <= NEW:
+                continue
+            new, reported = _independent(_sparse(own, at), reported)
             if new.shape[1]:
                 out.append((chosen, new))
     return out, reported
@@ -166,19 +172,26 @@ def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tu
         return []
     indices = [[i for m in chosen for i in rows[m]] for chosen in sets]
     width = max(len(i) for i in indices)
-    blocks = np.zeros((len(sets), width, width))
-    for block, at in zip(blocks, indices, strict=True):
-        block[: len(at), : len(at)] = shadow[np.ix_(at, at)]
+    at = np.array([i + [-1] * (width - len(i)) for i in indices])  # -1: a row and a column of zeros
+    padded = np.pad(shadow, (0, 1))
+    blocks = padded[at[:, :, None], at[:, None, :]]
     count = (np.linalg.eigvalsh(blocks) > 1.0 - INSIDE).sum(axis=1)
     return [(sets[i], int(count[i])) for i in np.flatnonzero(count)]
 
 
 def _inside(shadow: F2, at: list[int]) -> F2:
-    """Hidden combinations that only these terms make, as sparse as elimination gives, unit length, shape (p, count)."""
+    """Hidden combinations that only these terms make, orthonormal, shape (p, count)."""
     values, vectors = np.linalg.eigh(shadow[np.ix_(at, at)])
     own = vectors[:, values > 1.0 - INSIDE]
     out = np.zeros((shadow.shape[0], own.shape[1]))
-    out[at] = sparse_rows(own.T).T
+    out[at] = own
+    return out
+
+
+def _sparse(own: F2, at: list[int]) -> F2:
+    """The same space as sparse as elimination gives, unit length."""
+    out = np.zeros_like(own)
+    out[at] = sparse_rows(own[at].T).T
     return _unit_length(out)
 
 
@@ -192,7 +205,7 @@ def _independent(vectors: F2, reported: F2) -> tuple[F2, F2]:
     for v in vectors.T:
         rest = _beside(v[:, None], reported)
         size = float(np.linalg.norm(rest))
-        if size > 1e-4:
+        if size > NEW:
             new.append(v)
             reported = np.concatenate([reported, rest / size], axis=1)
     return (np.stack(new, axis=1) if new else vectors[:, :0]), reported

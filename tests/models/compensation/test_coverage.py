@@ -12,19 +12,18 @@ from abbe.models.compensation.additive import additive, mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import remove_rigid, rigid_design, volume_grid
-from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
-from tests.models.solvers.truth import MACHINE, SIGMA, Truth, linear_parameters
+from tests.models.solvers.truth import MACHINE, SolvedTruth, Truth, linear_parameters
 
 SEEDS = range(1, 11) if os.environ.get("ABBE_TEST_LONG") == "1" else range(1, 5)
 NODES = 9
 
 
 @pytest.fixture(scope="module")
-def solved() -> list[tuple[Truth, JointSolution]]:
-    truths = [Truth(seed) for seed in SEEDS]
-    return [(t, solve_joint(MACHINE, t.campaign(), sigma_mm=SIGMA)) for t in truths]
+def solved(solved_truth: SolvedTruth) -> list[tuple[Truth, JointSolution]]:
+    return [solved_truth(seed) for seed in SEEDS]
 
 
 def test_the_stated_model_uncertainty_is_the_true_error(solved):

@@ -7,8 +7,7 @@ import abbe.models.compensation.additive as additive
 from abbe.models.compensation.tables import nine_tables
 from abbe.models.geometry.volume import field_statistics, volume_grid
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends
-from abbe.models.solvers.joint import solve_joint
-from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
+from tests.models.solvers.truth import MACHINE
 
 
 def largest_range_mm(field, tables=None):
@@ -23,12 +22,11 @@ def largest_range_mm(field, tables=None):
 
 
 @pytest.fixture(scope="module")
-def figures():
+def figures(solved_truth):
     """Per machine: diagonal range and volumetric rms, with the main effects alone and with the diagonals counted, as shares of before."""
     grid, out = volume_grid(MACHINE.stroke_mm, 7), []
     for seed in range(1, 5):
-        truth = Truth(seed)
-        solution = solve_joint(MACHINE, truth.campaign(), order=7, sigma_mm=SIGMA, floor_mm=FLOOR)
+        truth, solution = solved_truth(seed)
         row = []
         for weight in (0.0, additive.DIAGONAL_WEIGHT):
             with pytest.MonkeyPatch.context() as patch:

@@ -34,9 +34,8 @@ PAIRS = random_pairs(inner_box_mm(MACHINE), 3000, seed=5)
 
 
 @pytest.fixture(scope="module")
-def solved():
-    truth = Truth(2)
-    return truth, solve_joint(MACHINE, truth.campaign())
+def solved(solved_truth):
+    return solved_truth(2)
 
 
 @pytest.fixture(scope="module")

@@ -158,9 +158,8 @@ def test_what_a_campaign_in_one_corner_does_not_know_is_marked_and_machines_toge
     assert without.max() > 1.2  # the same campaigns do harm without the mask; seen: 1.37
 
 
-def test_a_good_campaign_leaves_almost_nothing_uncompensated_and_loses_nothing_by_the_mask():
-    truth = Truth(2)
-    s = solve_joint(MACHINE, truth.campaign())
+def test_a_good_campaign_leaves_almost_nothing_uncompensated_and_loses_nothing_by_the_mask(solved_truth):
+    truth, s = solved_truth(2)
     mask = compensable_nodes(s, (9, 9, 9))
     assert mask.mean() > 0.9
     masked, full = (true_rms(truth, grid_table(s, (9, 9, 9), compensable=m).correction_at) for m in (mask, None))

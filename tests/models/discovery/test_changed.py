@@ -3,25 +3,30 @@
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
 from abbe.models.discovery.changed_since import LINEAR, Changed, changed_since
-from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.known_field import KnownField
-from tests.models.solvers.truth import MACHINE, Truth
+from tests.models.solvers.truth import MACHINE, SolvedTruth, Truth
 
 SEEDS = range(40) if os.environ.get("ABBE_TEST_LONG") == "1" else range(1)
 Hide = Callable[[Truth, np.random.Generator], dict[str, float]]
 
 
-@cache
-def known(seed: int) -> KnownField:
-    """The machine as it was solved."""
-    old = solve_joint(MACHINE, Truth(seed).campaign())
-    return KnownField(MACHINE, old.terms, old.coefficients, old.term_covariance)
+Known = Callable[[int], KnownField]
+
+
+@pytest.fixture(scope="module")
+def known(solved_truth: SolvedTruth) -> Known:
+    """By seed: the machine as it was solved."""
+
+    def of(seed: int) -> KnownField:
+        old = solved_truth(seed)[1]
+        return KnownField(MACHINE, old.terms, old.coefficients, old.term_covariance)
+
+    return of
 
 
 def linear(truth: Truth, name: str, size: float) -> None:
@@ -65,7 +70,7 @@ def pitch(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
     return {"EBX shape": end / np.sqrt(3.0)}
 
 
-def changed(seed: int, hide: Hide) -> tuple[dict[str, float], Changed]:
+def changed(known: Known, seed: int, hide: Hide) -> tuple[dict[str, float], Changed]:
     """What was hidden in machine ``seed``, and what was found; measured anew with other cups, mirrors and noise."""
     truth = Truth(seed)
     truth.rng = np.random.default_rng([seed, 1])
@@ -73,8 +78,8 @@ def changed(seed: int, hide: Hide) -> tuple[dict[str, float], Changed]:
     return hidden, changed_since(known(seed), truth.campaign())
 
 
-def test_where_nothing_has_changed_nothing_is_named() -> None:
-    found = [changed(seed, nothing)[1] for seed in SEEDS]
+def test_where_nothing_has_changed_nothing_is_named(known: Known) -> None:
+    found = [changed(known, seed, nothing)[1] for seed in SEEDS]
     named = sum(bool(f.changes) for f in found)
     print(f"nothing: {named} of {len(found)} named something")  # noqa: T201 - the figure of the test
     assert named <= 0.05 * len(found)
@@ -86,10 +91,10 @@ def test_where_nothing_has_changed_nothing_is_named() -> None:
 
 
 @pytest.mark.parametrize("hide", [one, two, heat, pitch])
-def test_what_has_changed_is_named_with_a_size_that_its_uncertainty_holds(hide: Hide) -> None:
+def test_what_has_changed_is_named_with_a_size_that_its_uncertainty_holds(known: Known, hide: Hide) -> None:
     inside, names, proved, gaps = [], [], [], []
     for seed in SEEDS:
-        hidden, found = changed(seed, hide)
+        hidden, found = changed(known, seed, hide)
         told = {c.name: c for c in found.changes}
         names.append(told.keys() == hidden.keys() and all(c.halves == 2 and not c.rivals for c in told.values()))
         proved.append((found.judged or 0.0) > 3.0)
@@ -106,7 +111,7 @@ def test_what_has_changed_is_named_with_a_size_that_its_uncertainty_holds(hide: 
         assert np.median(gaps) < 0.05, "of the gap, on runs that did not choose"
 
 
-def test_a_motion_that_another_explains_as_well_is_told_as_its_rival() -> None:
+def test_a_motion_that_another_explains_as_well_is_told_as_its_rival(known: Known) -> None:
     """On one body diagonal alone scales and squareness change the reading alike."""
     truth = Truth(0)
     truth.rng = np.random.default_rng([0, 3])
@@ -122,6 +127,6 @@ def test_a_motion_that_another_explains_as_well_is_told_as_its_rival() -> None:
     assert found.changes[0].rivals
 
 
-def test_no_runs_are_refused() -> None:
+def test_no_runs_are_refused(known: Known) -> None:
     with pytest.raises(ValueError, match="no runs"):
         changed_since(known(0), ())

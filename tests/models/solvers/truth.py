@@ -1,11 +1,14 @@
 """Machines that the solvers cannot represent, and the runs that a ball-bar and a laser would record on them."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from abbe.models.geometry.chain import exact_deviation_mm, travel_sign
 from abbe.models.machine import Machine, with_tool
 from abbe.models.paths.helix import helix_points
 from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.models.solvers.observe import perpendicular
 
@@ -83,6 +86,8 @@ class Truth:
         return tuple(runs)
 
 
+SolvedTruth = Callable[[int], tuple[Truth, JointSolution]]
+"""The fixture ``solved_truth``: a machine by its seed, and the solution of its campaign."""
 SIGMA = {"bar": 4e-4, "laser": 3e-4}
 FLOOR = {"bar": 3e-4, "laser": 3e-4}
 
