@@ -81,17 +81,25 @@ def evidence_of(gram: F2, rhs: F1, base: F2, asked: Sequence[AskedChange]) -> li
     list of Evidence
         In the same order. Gain: log of the ratio of marginal likelihoods with and without the candidate.
     """
+    own, gradient = without(gram, rhs, base)
+    return [_one(a, own, gradient) for a in asked]
+
+
+def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
+    """Normal equations (p, p) and (p,) with everything along ``base`` (p, k) integrated out; one base after another is both at once."""
+    if not base.shape[1]:
+        return gram, rhs
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
     low = scipy.linalg.cholesky(inside, lower=True)
     half = scipy.linalg.solve_triangular(low, base.T @ np.column_stack([gram, rhs]), lower=True)
-    own = gram - half[:, :-1].T @ half[:, :-1]
-    gradient = rhs - half[:, :-1].T @ half[:, -1]
-    return [_one(a, own, gradient) for a in asked]
+    return gram - half[:, :-1].T @ half[:, :-1], rhs - half[:, :-1].T @ half[:, -1]
 
 
 def log_evidence(gram: F2, rhs: F1, base: F2) -> float:
     """Log marginal likelihood with everything along ``base`` unknown, less constants common to all bases."""
+    if not base.shape[1]:
+        return 0.0
     inside = base.T @ gram @ base
     inside[np.diag_indices_from(inside)] += 1.0
     low = scipy.linalg.cholesky(inside, lower=True)
@@ -123,11 +131,16 @@ class TakenChange:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Changes chosen from some runs, and the runs' normal equations relative to the old solution: (p, p) and (p,)."""
+    """Changes chosen from some runs, and the runs' normal equations relative to the old solution: (p, p) and (p,).
+
+    ``own``, ``gradient``: the same with everything integrated out that is unknown without any change.
+    """
 
     taken: tuple[TakenChange, ...]
     gram: F2
     rhs: F1
+    own: F2
+    gradient: F1
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,19 +195,20 @@ class ChangeContext:
         gram, rhs = np.tensordot(weight, sums.gram, 1), weight @ sums.rhs
         start = np.zeros(len(rhs))
         start[: self._n] = self.known.coefficients / self.problem.sizes.typical[: self._n]
-        none = Chosen((), gram, rhs - gram @ start)
+        rhs = rhs - gram @ start
+        none = Chosen((), gram, rhs, *without(gram, rhs, self._open))
         linear = tuple(a for a in self.candidates if not a.several)
         every = self._needed(replace(none, taken=tuple(TakenChange(a, max(LINEAR_SIZES), 0.0, ()) for a in linear)))
         grown = [self._grown(start, self.candidates) for start in (none, self._grown(none, linear), every)]
-        best = max([none, *grown], key=lambda c: log_evidence(gram, c.rhs, self._beside(c.taken)) - self._price * len(c.taken))
+        best = max([none, *grown], key=lambda c: log_evidence(c.own, c.gradient, self._changed(c.taken)) - self._price * len(c.taken))
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
     def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
         """Candidates that explain nearly as much in place of a chosen one, beside all the others."""
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
-        others = self._beside([t for t in chosen.taken if t is not taken])
-        own, *found = evidence_of(chosen.gram, chosen.rhs, others, [taken.asked, *left])
+        others = self._changed([t for t in chosen.taken if t is not taken])
+        own, *found = evidence_of(chosen.own, chosen.gradient, others, [taken.asked, *left])
         near = [(e.name, own.gain - e.gain) for e in found if own.gain - e.gain < NEAR]
         return tuple(sorted(near, key=lambda item: item[1]))
 
@@ -211,7 +225,7 @@ class ChangeContext:
         left = [a for a in candidates if a.name not in names]
         if not left:
             return None
-        found = evidence_of(chosen.gram, chosen.rhs, self._beside(chosen.taken), left)
+        found = evidence_of(chosen.own, chosen.gradient, self._changed(chosen.taken), left)
         k = int(np.argmax([e.gain for e in found]))
         gain = found[k].gain - self._price
         if gain < ENOUGH:
@@ -223,7 +237,8 @@ class ChangeContext:
         taken = list(chosen.taken)
         while taken:
             for k, one in enumerate(taken):
-                found = evidence_of(chosen.gram, chosen.rhs, self._beside([o for o in taken if o is not one]), [one.asked])[0]
+                others = self._changed([o for o in taken if o is not one])
+                found = evidence_of(chosen.own, chosen.gradient, others, [one.asked])[0]
                 taken[k] = replace(one, gain=found.gain - self._price, size=found.size)
             least = min(taken, key=lambda t: t.gain)
             if least.gain >= ENOUGH:
@@ -235,9 +250,13 @@ class ChangeContext:
     def _price(self) -> float:
         return float(np.log(len(self.candidates)))
 
+    def _changed(self, taken: Sequence[TakenChange]) -> F2:
+        """Factor of the covariance of these changes alone, shape (p, k)."""
+        return np.column_stack([self._open[:, :0], *(t.asked.directions * t.size for t in taken)])
+
     def _beside(self, taken: Sequence[TakenChange]) -> F2:
         """Factor of the covariance when these have changed, shape (p, k)."""
-        return np.column_stack([self._open, *(t.asked.directions * t.size for t in taken)])
+        return np.column_stack([self._open, self._changed(taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:
         """As `_beside`, with all scales and squareness free except candidate ``but``."""

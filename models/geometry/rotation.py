@@ -42,7 +42,7 @@ def factor_slopes(angle_squared: F1) -> tuple[F1, F1]:
     """Derivative of Rodrigues' two factors with respect to |E|, divided by |E|: a power series below 1 rad, where the formulas cancel."""
     q = np.asarray(angle_squared, dtype=np.float64)
     near = np.minimum(q, 1.0)
-    s_series, c_series = np.polyval(S_SERIES, near), np.polyval(C_SERIES, near)
+    s_series, c_series = (np.polyval(series, near).astype(np.float64, copy=False) for series in (S_SERIES, C_SERIES))
     if q.size and q.max() < 1.0:
         return s_series, c_series
     s, c = rotation_factors(q)

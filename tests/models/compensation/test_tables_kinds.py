@@ -18,7 +18,7 @@ from abbe.models.compensation.achievable import (
 from abbe.models.compensation.additive import SQUARENESS_SLOPES, mean_linear
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import quantisation_mm
-from abbe.models.compensation.tables import NineTables, nine_tables, quantise
+from abbe.models.compensation.tables import NineTables, grid_positions, nine_tables, quantise, table_design
 from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.inputs import StatedInputs
@@ -98,13 +98,15 @@ def test_squareness_parameters_carry_the_uncertainty_of_the_very_slopes_they_are
     counts = (9, 8, 7)
     found = squareness_tables(s, counts, sources=data).parameters
     root = np.linalg.cholesky(s.term_covariance + 1e-32 * np.eye(len(s.terms)))
-    rng, drawn = np.random.default_rng(5), []
-    for _ in range(60 if LONG else 30):
-        coefficients = {t.name.replace(".", "_"): v for t, v in zip(s.terms, root @ rng.standard_normal(len(root)), strict=True)}
-        nine = nine_tables(only(s, **coefficients), counts, sources=replace(data, coefficients=np.array(list(coefficients.values()))))
-        slope = [np.polyfit(nine.position_mm[a], nine.correction_mm[a], 1)[0] for a in range(3)]
-        drawn.append([-sign * (slope[a][b] + slope[b][a]) for _, a, b, sign in SQUARENESS_SLOPES])
-    assert [p.u for p in found] == pytest.approx(np.std(drawn, axis=0), rel=0.3)  # 60 draws (of the long run) know it to 9 %, 30 to 13 %
+    drawn = root @ np.random.default_rng(5).standard_normal((len(root), 1000))
+    grids = grid_positions(MACHINE, counts)
+    entries = [-effect @ drawn for effect in table_design(s, grids, 9)]  # tables of all drawn machines, shape (positions, 3, draws)
+    one = nine_tables(s, counts, sources=replace(data, coefficients=drawn[:, 0]))
+    for mine, tables in zip(one.correction_mm, entries, strict=True):
+        assert mine == pytest.approx(tables[:, :, 0], abs=1e-12)
+    slope = [np.polyfit(p, t.reshape(p.size, -1), 1)[0].reshape(3, -1) for p, t in zip(grids, entries, strict=True)]
+    slopes = [-sign * (slope[a][b] + slope[b][a]) for _, a, b, sign in SQUARENESS_SLOPES]
+    assert [p.u for p in found] == pytest.approx(np.std(slopes, axis=1), rel=0.1)  # 1000 draws know it to 2 %
     mean = [p.value for p in mean_linear(s)[3:]]
     assert max(abs(p.value - m) / p.u for p, m in zip(found, mean, strict=True)) > 3.0
 
