@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
@@ -87,13 +88,19 @@ def campaign_digest(digests: dict[str, str], model: str, machine: str) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Abbe, NumPy and SciPy, and Abbe's revision if known."""
-    out = {"abbe": version("abbe"), "numpy": version("numpy"), "scipy": version("scipy")}
+    out = {name: _version(name) for name in ("abbe", "numpy", "scipy")}
     found = revision()
     return out if found is None else out | {"revision": found}
 
 
+@cache
+def _version(package: str) -> str:
+    return version(package)
+
+
+@cache
 def revision() -> str | None:
-    """Commit of the sources, installed from a repository or in a work tree; None for a plain package.
+    """Commit of the sources, installed from a repository or in a work tree; None for a plain package. Git is asked once per process.
 
     The suffix ``+changes`` marks a work tree whose program differs from its commit.
     """

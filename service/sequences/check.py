@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
+
 from abbe.models.machine import AXES, Machine
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.recipes.approach import LOW_SHARE, as_point, cup_of
@@ -86,17 +88,15 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
                 f"test {plan.label}: the path has {len(step.points_mm)} points, the controller holds {MAX_PATH_POINTS}",
                 "use a longer chord, fewer turns or a smaller radius; nothing has moved",
             )
-    lo, hi = [math.inf] * 3, [-math.inf] * 3
-    for p in positions(plan.steps):
-        for a in range(3):
-            low, high = machine.stroke_mm[a]
-            if not low - 1e-9 <= p[a] <= high + 1e-9:
-                over = low - p[a] if p[a] < low else p[a] - high
-                raise StrokeError(
-                    f"test {plan.label}: {AXES[a]} would go to {p[a]:.3f} mm, {over:.3f} mm beyond its stroke {low:g}..{high:g}",
-                    "move the centre, shorten the radius or correct stroke_mm in the machine file; nothing has moved",
-                )
-            lo[a], hi[a] = min(lo[a], p[a]), max(hi[a], p[a])
+    at = np.array(list(positions(plan.steps)), dtype=np.float64).reshape(-1, 3)
+    low, high = machine.stroke_mm.T
+    for n, a in np.argwhere(~((low - 1e-9 <= at) & (at <= high + 1e-9)))[:1]:
+        over = low[a] - at[n, a] if at[n, a] < low[a] else at[n, a] - high[a]
+        raise StrokeError(
+            f"test {plan.label}: {AXES[a]} would go to {at[n, a]:.3f} mm, {over:.3f} mm beyond its stroke {low[a]:g}..{high[a]:g}",
+            "move the centre, shorten the radius or correct stroke_mm in the machine file; nothing has moved",
+        )
+    lo, hi = at.min(axis=0, initial=math.inf).tolist(), at.max(axis=0, initial=-math.inf).tolist()
     return (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2])
 
 

@@ -151,8 +151,13 @@ class CupTest(TestRecipe):
 
 def as_point(v: Array) -> Point:
     """Three floats on the controller's 10 nm grid."""
-    x, y, z = (round(float(c), 5) for c in v)
-    return (x, y, z)
+    x, y, z = v.tolist()
+    return (round(x, 5), round(y, 5), round(z, 5))
+
+
+def as_points(rows: Array) -> tuple[Point, ...]:
+    """Every row as such a point."""
+    return tuple((round(x, 5), round(y, 5), round(z, 5)) for x, y, z in rows.tolist())
 
 
 def before(path: tuple[Point, ...], machine: Machine) -> Point:
@@ -186,7 +191,7 @@ def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -
     if math.dist(start_mm, end_mm) <= SAME_PLACE_MM:
         return []
     way = way_on_sphere(cup.centre, np.array(start_mm), np.array(end_mm), cup.up, LINK_CHORD_MM)
-    return [FollowPath(tuple(as_point(p) for p in way), feed_mm_min)]
+    return [FollowPath(as_points(way), feed_mm_min)]
 
 
 def cup_of(setup: dict[str, Any]) -> Cup:

@@ -32,6 +32,7 @@ from abbe.service.sequences.recipes.approach import (
     Share,
     TestRecipe,
     as_point,
+    as_points,
     inner,
     one_of,
     pole_of,
@@ -69,7 +70,7 @@ def joined(arcs: tuple[Array, Array, Array]) -> Path:
     points = np.concatenate([lead[:-1], middle, tail[1:]])
     first = max(len(lead) - 1, 0)
     whole = len(lead) <= 1 and len(tail) <= 1
-    return tuple(as_point(p) for p in points), None if whole else (first, first + len(middle) - 1)
+    return as_points(points), None if whole else (first, first + len(middle) - 1)
 
 
 def reversed_path(path: Path) -> Path:
@@ -161,7 +162,7 @@ class HelixPoints(CupTest):
         curve = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=self.points, law=self.law, axis=self.axis)
         if self.opens < 0:
             curve[:, self.axis] = 2.0 * self.centre_mm[self.axis] - curve[:, self.axis]
-        return tuple(as_point(p) for p in curve[:: self.direction]), None
+        return as_points(curve[:: self.direction]), None
 
     def plan(self, machine: Machine) -> TestPlan:
         """Steps: to the centre, mount, out to the first position; read, move along the sphere, read; clear away. Raises as `Helix`."""
