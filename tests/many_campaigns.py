@@ -13,15 +13,15 @@ from typing import Any
 
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
-from tests.scenarios.campaign_files import measured, write_folder
+from tests.scenarios.campaign_files import measured, thinned, write_folder
 
 
-def fill(store: Store, place: Path, seeds: Iterable[int]) -> None:
-    """Campaigns ``june-1``, ``june-2`` and so on, by their seeds."""
+def fill(store: Store, place: Path, seeds: Iterable[int], every: int = 1) -> None:
+    """Campaigns ``june-1``, ``june-2`` and so on, by their seeds; of a ball-bar's readings ``every`` so manieth."""
     for seed in seeds:
         site, runs = measured(seed, "one_tool")
         name = f"june-{seed}"
-        folder = write_folder(place / name, site.doc, [one | {"campaign": name} for one in runs])
+        folder = write_folder(place / name, site.doc, [one | {"campaign": name} for one in thinned(runs, every)])
         head = json.loads((folder / "campaign.json").read_text()) | {"campaign": name}
         (folder / "campaign.json").write_text(json.dumps(head))
         import_folder(store, folder)

@@ -11,6 +11,7 @@ from abbe.drivers.tables import NO_CORRECTION, TableImage, encode
 from abbe.models.compensation.tables import NineTables
 
 
+@cache
 def tables(scale: int, sign: int = 1) -> NineTables:
     """A small set of nine tables whose columns all differ, values in whole LSB of 100 nm."""
     position = tuple(np.array([0.0, 100.0 + 50.0 * a]) for a in range(3))

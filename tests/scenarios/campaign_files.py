@@ -34,6 +34,14 @@ def measured(seed: int, kind: population.Kind = "joint") -> tuple[Site, list[Doc
     return site, json.loads(text)
 
 
+def thinned(runs: list[Doc], every: int) -> list[Doc]:
+    """The same runs with every so manieth reading of a ball-bar: for what does not depend on how many there are."""
+    for run in runs:
+        if run["test"].startswith("ballbar"):
+            run["columns"] = {name: values[::every] for name, values in run["columns"].items()}
+    return runs
+
+
 def machine_of(seed: int, kind: population.Kind = "joint") -> Site:
     """Machine number ``seed`` alone."""
     return _measured(seed, kind)[0]

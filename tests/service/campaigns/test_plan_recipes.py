@@ -86,7 +86,7 @@ def site() -> Site:
 
 @pytest.fixture(scope="module")
 def planned():
-    return plan_for(site(), minutes=15.0)
+    return plan_for(site(), minutes=12.0, tools=ONE_BAR)
 
 
 def test_a_plan_written_and_read_is_the_same_campaign(planned, tmp_path):
@@ -166,7 +166,7 @@ def test_a_bar_is_as_well_known_as_the_instruments_file_says(tmp_path):
 
 
 def test_a_slow_machine_gets_a_plan_that_it_may_run():
-    found = plan_for(replace(site(), max_feed_mm_min=1000.0), minutes=12.0, tools=ONE_BAR)
+    found = plan_for(replace(site(), max_feed_mm_min=1000.0), minutes=7.0, tools=ONE_BAR)
     feeds = {s.feed_mm_min for t in found.campaign.tests for s in t.steps if isinstance(s, MoveTo | RecordPath)}
     assert feeds == {1000.0}
     assert {r.feed_mm_min for r in parse_recipe(found.text, "f")[1]} == {1000.0}
@@ -177,7 +177,7 @@ def test_a_slow_machine_gets_a_plan_that_it_may_run():
     ("named", "kinds", "says"), [("ballbar", {Helix}, "without laser"), ("laser", {Diagonal, Linear}, "without ball-bar")]
 )
 def test_only_what_the_machine_file_names_is_planned(named, kinds, says):
-    found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=14.0, tools=ONE_BAR)
+    found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=7.0, tools=ONE_BAR)
     assert {type(r) for r in found.recipes} <= kinds
     assert says in found.notes[0]
     assert len(found.notes) == 1 + (named == "ballbar")  # helices of a machine without tool_mm: where is the spindle?

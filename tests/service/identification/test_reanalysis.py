@@ -23,6 +23,7 @@ from tests.conftest import Require
 from tests.many_campaigns import dask_cluster, fill
 
 SEEDS = (7, 8)
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     place = tmp_path_factory.mktemp("many")
     found = f"sqlite:///{place / 'abbe.sqlite3'}"
     with Store.open(found) as store:
-        fill(store, place, SEEDS)
+        fill(store, place, SEEDS, every=1 if LONG else 8)
         store.campaigns.add(1, "june-empty", {})
     return found
 
@@ -62,7 +63,7 @@ def test_each_is_solved_as_abbe_solve_does_and_one_that_cannot_be_stops_no_other
     assert {key: doc[key] for key in here[0].doc} == json.loads(json.dumps(here[0].doc))
 
 
-@pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="beside Dask, which starts processes too: ABBE_TEST_LONG=1 runs it")
+@pytest.mark.skipif(not LONG, reason="beside Dask, which starts processes too: ABBE_TEST_LONG=1 runs it")
 def test_processes_give_the_same_numbers(url: str, here: list[ReanalysisResult]) -> None:
     assert text(answers(url, ProcessExecutor(2))) == text(here)
 
@@ -73,7 +74,7 @@ def test_dask_gives_the_same_numbers(url: str, here: list[ReanalysisResult], req
     except ModuleNotFoundError:
         require("dask", False, "distributed is not installed (pip install 'abbe[fleet]')")
         return
-    with dask_cluster(2) as address:
+    with dask_cluster(2 if LONG else 1) as address:  # each worker is a process that imports all of Abbe
         assert text(answers(url, DaskExecutor(address))) == text(here), distributed.__version__
 
 
