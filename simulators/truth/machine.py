@@ -33,7 +33,8 @@ class Machine:
 
     def motions(self, axis: int, position_mm: F) -> tuple[F, F]:
         """Translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""
-        values = self.draws.motions[axis](position_mm)
+        new = np.diff(position_mm, prepend=np.nan) != 0.0  # an axis that stands, sample for sample, is worked out once
+        values = self.draws.motions[axis](position_mm[new])[np.cumsum(new) - 1]
         shift = values[:, :3].copy()
         shift[:, axis] += self.extra_scale[axis] * (position_mm - self.geometry.low_mm[axis])
         c0y, b0z, a0z = self.draws.squareness
