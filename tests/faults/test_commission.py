@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +21,13 @@ from abbe.simulators.cnc import bank
 from tests.faults.sequencer_world import bench
 
 SPEED = 50.0
+PLACES = 24 if os.environ.get("ABBE_TEST_LONG") else 8
+"""Eight are enough for the same limits."""
 
 
 @pytest.fixture
-async def place(tmp_path: Path):
+async def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("abbe.service.compensation.commission.PLACES", PLACES)
     async with bench(tmp_path, seed=3) as b:
         b.sim.pace(SPEED)
         with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, Route
+from playwright.sync_api import Browser, Page, Route
 
 from abbe.service.web.page import HERE
 from tests.system.test_serve_page import browser
@@ -28,10 +28,10 @@ def content(inside: str) -> str:
 
 
 @pytest.fixture
-def screen() -> Iterator[Page]:
+def screen(chromium: Browser) -> Iterator[Page]:
     """The home page with prompt 1 of job a, its second over; time stands still."""
     HELD.clear()
-    with browser() as seen:
+    with browser(chromium) as seen:
         page: Any = seen.page
         page.route(
             f"{BASE}/",

@@ -6,7 +6,7 @@ import html
 import json
 
 import pytest
-from playwright.sync_api import Page, Route
+from playwright.sync_api import Browser, Page, Route
 
 from abbe.service.web.language import SPAN_KEYS, catalogue
 from abbe.service.web.page import HERE
@@ -43,9 +43,9 @@ def answered(page: Page, base: str, pages: list[str], asked: list[str]) -> None:
     page.route(f"{base}/**", answer)
 
 
-def test_a_silent_screen_comes_back_as_itself_and_ages_stand_still() -> None:
+def test_a_silent_screen_comes_back_as_itself_and_ages_stand_still(chromium: Browser) -> None:
     base, asked = f"http://127.0.0.1:{free_port()}", list[str]()
-    with browser() as seen:
+    with browser(chromium) as seen:
         page = seen.page
         page.clock.install()
         shown = screen(f'<h1>Schedule</h1><span id="age" data-since="2020-01-01T00:00:00+00:00">{OLD}</span>')
@@ -62,9 +62,9 @@ def test_a_silent_screen_comes_back_as_itself_and_ages_stand_still() -> None:
         assert (page.inner_text("#age"), "/" in asked, page.url) == (OLD, False, f"{base}/schedule")
 
 
-def test_a_refused_live_connection_is_told() -> None:
+def test_a_refused_live_connection_is_told(chromium: Browser) -> None:
     base = f"http://127.0.0.1:{free_port()}"
-    with browser() as seen:
+    with browser(chromium) as seen:
         root = '<p id="live-lost" hidden>lost</p><section id="live" data-words="{}"></section>'
         answered(seen.page, base, [screen(root, script="live")], [])
         seen.page.goto(f"{base}/live")

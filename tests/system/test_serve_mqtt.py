@@ -62,7 +62,7 @@ def test_broker_killed_and_restarted_nothing_lost_nothing_out_of_order(tmp_path:
     assert not any("Traceback" in line for line in running.lines)
 
 
-def test_messages_wait_for_a_broker_that_comes_later_and_for_the_next_start(tmp_path: Path, ending: ExitStack) -> None:
+def test_messages_wait_for_the_next_start_and_the_broker_says_offline_when_the_service_is_killed(tmp_path: Path, ending: ExitStack) -> None:
     broker = Broker(tmp_path)
     ending.callback(lambda: broker.process.close())
     receiver = ending.enter_context(closing(broker.subscriber()))
@@ -73,26 +73,17 @@ def test_messages_wait_for_a_broker_that_comes_later_and_for_the_next_start(tmp_
     first.terminate()
 
     broker.start()
-    second = ending.enter_context(
-        closing(service(tmp_path, schedules=[["yearly", "0 0 1 1 *", "quick"]], mqtt=broker.url, port=free_port()))
-    )
-    for _ in range(2):
+    endless = ["x", "* * * * * *", "endless"]
+    second = ending.enter_context(closing(service(tmp_path, schedules=[endless], mqtt=broker.url, port=free_port())))
+    assert payload(receiver.expect('"state":"measuring"'))["schedule"] == "x"
+    while not received(receiver)[1:]:
         receiver.expect("mill-7/verification")
-    second.terminate()
-    assert received(receiver) == [1, 2]
-
-
-def test_the_broker_says_offline_when_the_service_is_killed(tmp_path: Path, ending: ExitStack) -> None:
-    broker = Broker(tmp_path)
-    ending.callback(lambda: broker.process.close())
-    receiver = ending.enter_context(closing(broker.subscriber()))
-    running = ending.enter_context(
-        closing(service(tmp_path, schedules=[["x", "* * * * * *", "endless"]], mqtt=broker.url, port=free_port()))
-    )
-    state = payload(receiver.expect('"state":"measuring"'))
-    assert state["schedule"] == "x"
-    running.kill()
+    second.kill()
     assert payload(receiver.expect('"state":"offline"'))["machine"] == "mill-7"
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        kept = sorted(check.id for check in store.verifications.of_machine("mill-7"))
+    assert received(receiver) == kept
+    assert kept[:2] == [1, 2]
 
 
 @pytest.mark.parametrize("lost", [False, True] if os.environ.get("ABBE_TEST_LONG") else [True])

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from abbe.drivers.errors import LinkDown
+from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from tests.pages_world import Filled, Served, served
 from tests.system.serve_bench import free_port, require, service
 from tests.system.serve_check import Result
 from tests.system.test_serve_users import PHRASE, add_user
@@ -47,18 +49,26 @@ class Seen:
 
 
 @contextmanager
-def browser(**context: Any) -> Iterator[Seen]:
+def launched(*more: str) -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=require("chromium"), args=QUIET)
+        chromium = playwright.chromium.launch(executable_path=require("chromium"), args=[*QUIET, *more])
         try:
-            page = chromium.new_page(viewport={"width": 1280, "height": 768}, **context)
-            seen = Seen(page)
-            page.on("request", lambda request: seen.requests.append(request.url))
-            page.on("console", lambda message: seen.errors.append(message.text) if message.type == "error" else None)
-            page.on("pageerror", lambda error: seen.errors.append(str(error)))
-            yield seen
+            yield chromium
         finally:
             chromium.close()
+
+
+@contextmanager
+def browser(chromium: Browser | None = None, **context: Any) -> Iterator[Seen]:
+    """A page in a browser that runs, or in one of its own."""
+    with ExitStack() as stack:
+        running = chromium or stack.enter_context(launched())
+        page = stack.enter_context(closing(running.new_page(viewport={"width": 1280, "height": 768}, **context)))
+        seen = Seen(page)
+        page.on("request", lambda request: seen.requests.append(request.url))
+        page.on("console", lambda message: seen.errors.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: seen.errors.append(str(error)))
+        yield seen
 
 
 def fill(folder: Path, weeks: int) -> None:
@@ -95,8 +105,9 @@ def shot(page: Page, name: str, *, full: bool = False) -> None:
     page.screenshot(path=ARTIFACTS / name, full_page=full)
 
 
-def open_page(seen: Seen, port: int) -> None:
-    seen.page.goto(f"http://127.0.0.1:{port}/")
+def open_page(seen: Seen, where: int | str) -> None:
+    """``where``: a port, or an address."""
+    seen.page.goto(f"http://127.0.0.1:{where}/" if isinstance(where, int) else f"{where}/")
     seen.page.wait_for_selector("html[data-ready=yes]")
 
 
@@ -104,12 +115,18 @@ def only_us(seen: Seen) -> bool:
     return bool(seen.requests) and all(url.startswith("http://127.0.0.1:") for url in seen.requests)
 
 
-def test_history_in_the_browser(tmp_path: Path) -> None:
-    port = free_port()
-    fill(tmp_path, 24)
-    with closing(service(tmp_path, schedules=TIMETABLE, port=port)) as running, browser() as seen:
-        running.expect("planned")
-        open_page(seen, port)
+@contextmanager
+def serving(folder: Path, weeks: int = 0) -> Iterator[Served]:
+    """The page over so many weeks of checks, without a process of its own."""
+    if weeks:
+        fill(folder, weeks)
+    with served(Filled(f"sqlite:///{folder / 'abbe.sqlite3'}", "mill-7", [WEEKLY], {}, "", 0, [], 0), users=False) as one:
+        yield one
+
+
+def test_history_in_the_browser(tmp_path: Path, chromium: Browser) -> None:
+    with serving(tmp_path, 24) as one, browser(chromium) as seen:
+        open_page(seen, one.base)
         assert seen.page.locator("tr[data-id]").count() == 20
         assert seen.page.locator(".verdict").inner_text() == "✖ fail"
         assert seen.page.locator("svg.trend").count() == 2
@@ -120,9 +137,9 @@ def test_history_in_the_browser(tmp_path: Path) -> None:
         assert only_us(seen)
 
 
-def test_it_refreshes_itself_and_says_when_the_service_is_gone(tmp_path: Path) -> None:
+def test_it_refreshes_itself_and_says_when_the_service_is_gone(tmp_path: Path, chromium: Browser) -> None:
     port = free_port()
-    with closing(service(tmp_path, schedules=[["fast", "*/3 * * * * *", "quick"]], port=port)) as running, browser() as seen:
+    with closing(service(tmp_path, schedules=[["fast", "*/3 * * * * *", "quick"]], port=port)) as running, browser(chromium) as seen:
         running.expect("planned")
         open_page(seen, port)
         seen.page.locator("tr[data-id]").nth(1).wait_for(timeout=20_000)
@@ -136,15 +153,11 @@ def test_it_refreshes_itself_and_says_when_the_service_is_gone(tmp_path: Path) -
         assert only_us(seen)
 
 
-def test_a_running_check_in_dark_colours(tmp_path: Path) -> None:
-    port = free_port()
-    fill(tmp_path, 9)
-    with (
-        closing(service(tmp_path, schedules=[["endless", "* * * * * *", "endless"]], port=port)) as running,
-        browser(color_scheme="dark") as seen,
-    ):
-        running.expect("skipped")
-        open_page(seen, port)
+def test_a_running_check_in_dark_colours(tmp_path: Path, chromium: Browser) -> None:
+    with serving(tmp_path, 9) as one, browser(chromium, color_scheme="dark") as seen:
+        one.board.job_started(WEEKLY, datetime.now(UTC))
+        one.board.job_progress(Progress("helix", 1, 2, 0.1, "revolution 1 of 2"))
+        open_page(seen, one.base)
         assert seen.page.locator(".state").inner_text() == "measuring"
         assert seen.page.locator("#job-stage").inner_text() == "helix"
         assert float(seen.page.locator("#job-bar").get_attribute("value") or "nan") == 1.0
@@ -152,18 +165,16 @@ def test_a_running_check_in_dark_colours(tmp_path: Path) -> None:
         assert seen.errors == []
 
 
-def test_empty_page(tmp_path: Path) -> None:
-    port = free_port()
-    with closing(service(tmp_path, schedules=[["yearly", "0 0 1 1 *", "quick"]], port=port)) as running, browser() as seen:
-        running.expect("planned")
-        open_page(seen, port)
+def test_empty_page(tmp_path: Path, chromium: Browser) -> None:
+    with serving(tmp_path) as one, browser(chromium) as seen:
+        open_page(seen, one.base)
         assert "No check has been made yet" in seen.page.locator("main").inner_text()
         shot(seen.page, "serve-empty.png")
         assert seen.errors == []
 
 
 @pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="two services and a browser: ABBE_TEST_LONG=1 runs it")
-def test_logged_in_to_two_services_and_out_of_one(tmp_path: Path) -> None:
+def test_logged_in_to_two_services_and_out_of_one(tmp_path: Path, chromium: Browser) -> None:
     """By the form and the button, in one browser: its cookies go to every port of a host."""
     ports = free_port(), free_port()
     folders = [tmp_path / "a", tmp_path / "b"]
@@ -174,7 +185,7 @@ def test_logged_in_to_two_services_and_out_of_one(tmp_path: Path) -> None:
         for folder, port in zip(folders, ports, strict=True):
             running = stack.enter_context(closing(service(folder, schedules=TIMETABLE, port=port)))
             running.expect("planned")
-        seen = stack.enter_context(browser())
+        seen = stack.enter_context(browser(chromium))
         for port in ports:
             seen.page.goto(f"http://127.0.0.1:{port}/")
             seen.page.fill("#name", "ana")

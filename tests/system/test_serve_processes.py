@@ -151,38 +151,6 @@ def test_the_page_is_killed_during_a_check_and_no_sample_is_missing(tmp_path: Pa
     print(f"page back after {back_s:.2f} s")  # noqa: T201 - a figure for whoever runs it by hand
 
 
-def test_the_core_is_killed_and_the_page_ends_too(tmp_path: Path) -> None:
-    with bench(tmp_path, YEARLY) as made:
-        page = made.web
-        made.process.kill()
-        assert ended(page, 10.0)
-
-
-def test_the_core_is_frozen_and_the_page_says_so(tmp_path: Path) -> None:
-    with bench(tmp_path, YEARLY) as made:
-        viewer = made.who["viewer"]
-        assert made.http.get("/readyz").status_code == 200
-        with connect(f"ws://127.0.0.1:{made.port}/api/v1/live", additional_headers=viewer) as live:
-            os.kill(made.process.pid, signal.SIGSTOP)
-            with pytest.raises(TimeoutError):
-                listen(live, 6)  # nothing is told any more; longer than the page believes what it heard last
-        answers = [made.http.get(path, headers=viewer) for path in ("/readyz", "/api/v1/status", "/api/v1/jobs", "/")]
-        assert [answer.status_code for answer in answers] == [503] * 4
-        assert {answer.json()["code"] for answer in answers[:3]} == {"SRV-002"}
-        assert "The core does not answer" in answers[3].text
-        assert made.start("quick").status_code == 503
-        assert "abbe_core_up 0.0" in made.http.get("/metrics", headers=viewer).text
-        assert made.http.get("/healthz").status_code == 200
-        assert made.http.get("/api/v1/verifications", headers=viewer).status_code == 200  # the past is known
-        os.kill(made.process.pid, signal.SIGCONT)
-        with connect(f"ws://127.0.0.1:{made.port}/api/v1/live", additional_headers=viewer) as live:
-            live.recv(timeout=10)
-            live.recv(timeout=10)
-        assert made.http.get("/readyz").status_code == 200
-        code, took_s = made.process.terminate()
-        assert (code, took_s < 5.0) == (0, True)
-
-
 @pytest.mark.skipif(not os.environ.get("ABBE_TEST_LONG"), reason="one of nine starts of the whole service: ABBE_TEST_LONG=1 runs it")
 def test_a_frozen_page_does_not_hold_up_the_end(tmp_path: Path) -> None:
     with bench(tmp_path, YEARLY) as made:
@@ -237,7 +205,7 @@ def test_jobs_by_everybody(tmp_path: Path) -> None:
         assert all("recipe quick" in record.target for record in records if record.outcome == "done 202")
 
 
-def test_a_job_is_started_once_steered_and_refused_where_it_has_to_be(tmp_path: Path) -> None:
+def test_a_job_is_started_once_steered_and_refused_and_the_page_ends_when_the_core_is_killed(tmp_path: Path) -> None:
     with bench(tmp_path, YEARLY, ENDLESS) as made:
         first = made.start("endless", **{"Idempotency-Key": "k1"})
         number = first.json()["id"]
@@ -263,9 +231,35 @@ def test_a_job_is_started_once_steered_and_refused_where_it_has_to_be(tmp_path: 
         with Store.open(url_of(tmp_path)) as store:  # whoever is shut out meanwhile: the next word of his is refused
             People(store, SystemClock()).disable("a-operator")
         assert made.start("quick").status_code == 401
+        page = made.web
+        made.process.kill()
+        assert ended(page, 10.0)
 
 
-def test_live_events_are_for_those_who_may_look(tmp_path: Path) -> None:
+def frozen_and_thawed(made: Running) -> None:
+    """The core stands still: the page says so, still knows the past, and goes on when the core does."""
+    viewer = made.who["viewer"]
+    assert made.http.get("/readyz").status_code == 200
+    with connect(f"ws://127.0.0.1:{made.port}/api/v1/live", additional_headers=viewer) as live:
+        os.kill(made.process.pid, signal.SIGSTOP)
+        with pytest.raises(TimeoutError):
+            listen(live, 6)  # nothing is told any more; longer than the page believes what it heard last
+    answers = [made.http.get(path, headers=viewer) for path in ("/readyz", "/api/v1/status", "/api/v1/jobs", "/")]
+    assert [answer.status_code for answer in answers] == [503] * 4
+    assert {answer.json()["code"] for answer in answers[:3]} == {"SRV-002"}
+    assert "The core does not answer" in answers[3].text
+    assert made.start("quick").status_code == 503
+    assert "abbe_core_up 0.0" in made.http.get("/metrics", headers=viewer).text
+    assert made.http.get("/healthz").status_code == 200
+    assert made.http.get("/api/v1/verifications", headers=viewer).status_code == 200  # the past is known
+    os.kill(made.process.pid, signal.SIGCONT)
+    with connect(f"ws://127.0.0.1:{made.port}/api/v1/live", additional_headers=viewer) as live:
+        live.recv(timeout=10)
+        live.recv(timeout=10)
+    assert made.http.get("/readyz").status_code == 200
+
+
+def test_live_events_are_for_those_who_may_look_and_a_frozen_core_is_told(tmp_path: Path) -> None:
     with bench(tmp_path, YEARLY) as made:
         address, viewer = f"ws://127.0.0.1:{made.port}/api/v1/live", made.who["viewer"]
         for headers in ({}, {**viewer, "Origin": "http://evil.example"}, {"Authorization": "Bearer abbe_000000000000_" + "A" * 43}):
@@ -285,5 +279,6 @@ def test_live_events_are_for_those_who_may_look(tmp_path: Path) -> None:
                 listen(live, 10)
             assert closed.value.rcvd is not None
             assert closed.value.rcvd.code == 1008
+        frozen_and_thawed(made)
         code, took_s = made.process.terminate()
         assert (code, took_s < 5.0) == (0, True)

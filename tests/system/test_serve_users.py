@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ssl
-import sys
+from collections.abc import Callable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
@@ -19,14 +19,11 @@ from cryptography.x509.oid import NameOID
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store
 from abbe.service.users.people import People
-from tests.system.serve_bench import Process, free_port
+from tests.system.serve_bench import abbe, free_port
 
+Refused = Callable[..., list[str]]
 PHRASE = "correct horse battery staple"
 MACHINE = 'name = "mill-7"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY = [0, 400]\nZ = [-300, 0]\n[web]\n'
-
-
-def abbe(*words: str | Path) -> Process:
-    return Process(sys.executable, "-c", "from abbe.service.cli import main; main()", *words)
 
 
 def add_user(folder: Path) -> None:
@@ -47,15 +44,13 @@ def certificate(folder: Path) -> None:
     (folder / "abbe.key").write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
 
 
-def test_open_to_everybody_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_open_to_everybody_is_refused_in_one_line(tmp_path: Path, refused: Refused) -> None:
     file = tmp_path / "m.toml"
 
     def refusal(web: str) -> str:
         file.write_text(MACHINE + web)
-        with closing(abbe("serve", file)) as process:
-            assert process.wait() == 2
-        assert len(process.lines) == 1
-        return process.lines[0]
+        (line,) = refused(file)
+        return line
 
     assert "there is no user who is admin" in refusal('host = "0.0.0.0"\n')
     assert not (tmp_path / "abbe.sqlite3").exists()  # the question has left no database behind
@@ -65,13 +60,12 @@ def test_open_to_everybody_is_refused_in_one_line(tmp_path: Path) -> None:
     assert "error CFG-001: [web] certificate" in refusal('certificate = "abbe.crt"\nkey = "abbe.key"\n')
 
 
-def test_an_audit_that_cannot_be_written_is_said_when_the_service_starts(tmp_path: Path) -> None:
+def test_an_audit_that_cannot_be_written_is_said_when_the_service_starts(tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "m.toml").write_text(MACHINE + "port = 0\n")
     (tmp_path / "abbe.sqlite3.audit-key").mkdir()
-    with closing(abbe("serve", tmp_path / "m.toml")) as process:
-        assert process.wait() == 2
-    assert process.lines[-1].startswith(f"error AUD-001: the audit cannot be used: {tmp_path}/abbe.sqlite3.audit-key: ")
-    assert not any("Traceback" in line for line in process.lines)
+    lines = refused(tmp_path / "m.toml")
+    assert lines[-1].startswith(f"error AUD-001: the audit cannot be used: {tmp_path}/abbe.sqlite3.audit-key: ")
+    assert not any("Traceback" in line for line in lines)
 
 
 def test_a_login_over_tls(tmp_path: Path) -> None:
