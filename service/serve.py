@@ -343,12 +343,13 @@ def leave_now(code: int) -> None:
 
 
 def notify(state: str) -> None:
-    """Notify systemd (``sd_notify``). Does nothing without systemd."""
+    """Notify systemd (``sd_notify``). Does nothing without systemd; one that does not listen holds nothing up."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
     if address.startswith("@"):
         address = "\0" + address[1:]
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+        channel.settimeout(0.2)  # its queue may be full
         channel.connect(address)
         channel.send(state.encode())

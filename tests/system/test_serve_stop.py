@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import signal
 import socket
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 
+from abbe.service.serve import notify
 from abbe.service.storage.store import Store
 from tests.system.serve_bench import Process, free_port, service
 
@@ -53,6 +54,26 @@ def told_to_systemd(folder: Path, systemd: socket.socket, port: int) -> Process:
         return service(folder, schedules=[YEARLY], port=port)
 
 
+def test_a_systemd_that_does_not_listen_holds_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    address = str(tmp_path / "notify")
+    monkeypatch.setenv("NOTIFY_SOCKET", address)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(address)
+        most = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text())
+        for _ in range(most + 3):  # and it comes back from each
+            notify("WATCHDOG=1")
+        emptied(systemd)
+
+
+def emptied(systemd: socket.socket) -> None:
+    """Take what has come meanwhile; all of it is the watchdog's."""
+    systemd.setblocking(False)
+    with suppress(BlockingIOError):
+        while True:
+            assert systemd.recv(100) == b"WATCHDOG=1"
+    systemd.settimeout(20)
+
+
 def test_readiness_and_watchdog_reach_systemd_a_second_is_refused_and_a_page_held_open_does_not_hold_us_up(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "second").mkdir()
@@ -62,6 +83,7 @@ def test_readiness_and_watchdog_reach_systemd_a_second_is_refused_and_a_page_hel
         second = service(tmp_path / "second", schedules=[YEARLY], port=port)
         second.expect("ConfigError")
         assert second.wait() != 0
+        emptied(systemd)  # what is full would not take the last word
         with socket.create_connection(("127.0.0.1", port)) as idle:
             idle.sendall(b"GET /api/v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\n")  # and never the rest
             code, took_s = first.terminate(signal.SIGINT)
