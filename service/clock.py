@@ -1,4 +1,4 @@
-"""The service's clocks: monotonic for waiting and for durations, UTC for people and for slots."""
+"""The service's clocks: monotonic for waiting and for durations, UTC for people and for slots; and the format of stored times."""
 
 from __future__ import annotations
 
@@ -6,6 +6,21 @@ import asyncio
 import time
 from datetime import UTC, datetime
 from typing import Protocol
+
+from abbe.service.errors import StoreError
+
+
+def utc_text(time: datetime) -> str:
+    """Write a time in UTC, ISO 8601 with microseconds (``2026-11-21T03:34:03.000000Z``): text order is time order.
+
+    Raises
+    ------
+    StoreError
+        The time has no time zone.
+    """
+    if time.tzinfo is None:
+        raise StoreError(f"time {time.isoformat()} has no time zone", "give one")
+    return time.astimezone(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 class Clock(Protocol):

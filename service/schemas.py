@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.discovery_file import DiscoveryFile
-from abbe.service.domain.machine_object import MachineObject
+from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.run_file import CampaignFile, ErrorsFile, RunFile
 from abbe.service.domain.solution_file import SolutionFile
 

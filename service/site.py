@@ -11,9 +11,9 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.service.capture.settings import MIB, CaptureSettings
 from abbe.service.config_schema import Limits, MachineFile
-from abbe.service.devices.urls import DeviceUrls, control_of
+from abbe.service.domain.machine import DeviceUrls, control_of
 from abbe.service.push.limits import PushLimits
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.sequences.nc.write import NcSettings
 
 
@@ -22,7 +22,8 @@ class Site:
     """What a workflow needs to know about a machine. ``doc`` is the machine object of run-format.md 1.
 
     ``calibrated_until``: last days of the certificates of ``ballbar`` and ``laser``; an instrument without certificate is absent.
-    ``two_people``: a proposed table is only pushed after approval by a person other than its proposer.
+    ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``control``: identity of the control
+    (`control_of`); empty without a control.
     """
 
     name: str
@@ -37,11 +38,10 @@ class Site:
     nc: NcSettings = field(default_factory=NcSettings)
     calibrated_until: dict[str, date] = field(default_factory=dict)
     two_people: bool = False
+    control: str = field(init=False)
 
-    @property
-    def control(self) -> str:
-        """Identity of the control (`control_of`); empty without a control."""
-        return control_of(self.urls.cnc)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "control", control_of(self.urls.cnc))
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:

@@ -68,13 +68,13 @@ def _schema_built_once() -> Iterator[None]:
 def _copying() -> Callable[[Any, str], None]:
     from alembic import command
 
-    from abbe.service.storage.migrate import head_revision
+    from abbe.service.storage.engine import head_revision
 
     migrate = command.upgrade
 
     @cache
     def statements(_head: str) -> tuple[str, ...]:
-        from abbe.service.storage.migrate import _config
+        from abbe.service.storage.engine import _config
 
         engine = create_engine("sqlite://")
         with engine.begin() as connection:

@@ -24,7 +24,7 @@ from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_folder
-from abbe.service.clock import SystemClock
+from abbe.service.clock import SystemClock, utc_text
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.compensation.proposals import Promise, candidate_of
 from abbe.service.core.board import Board
@@ -32,7 +32,6 @@ from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.utc import utc_text
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc

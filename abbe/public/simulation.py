@@ -17,7 +17,7 @@ from abbe.models.functions.motions import ErrorMotions
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import Machine
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls
 from abbe.service.domain.run import Columns, Run, parsed_setup
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT
 from abbe.service.effects.effect_catalogue import catalogue, checked

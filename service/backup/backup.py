@@ -16,8 +16,7 @@ from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 
-from abbe.service.audit.book import AuditBook, heads_in, this_account
-from abbe.service.audit.chain import faults
+from abbe.service.audit.book import AuditBook, faults, heads_in, this_account
 from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import document, record

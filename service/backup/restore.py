@@ -16,7 +16,7 @@ from abbe.service.capture.settings import segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused
 from abbe.service.storage.copying import is_locked, processes_using, prove_copy, sync_file
-from abbe.service.storage.migrate import known_revisions
+from abbe.service.storage.engine import known_revisions
 from abbe.service.storage.store import Store
 
 SQLITE_SUFFIXES = ("", "-journal", "-wal", "-shm")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.campaign_data.provenance import machine_digest, run_digest
-from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import TableRemoval
 from abbe.service.errors import CampaignRefused

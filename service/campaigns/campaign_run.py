@@ -14,8 +14,7 @@ from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.columns import path_progress
 from abbe.service.runs.pieces import ReadProgress
-from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import Suspending, Watching, check_interlocks
+from abbe.service.sequences.control import Control, State, Suspending, Watching, check_interlocks
 from abbe.service.sequences.journal import DONE, WAITS, Journal, RunLine, lines_of
 from abbe.service.sequences.needed import BEFORE_S
 from abbe.service.sequences.resume_plan import Attempt, PathRemainder, ResumeTrail, anew, end_of, remounted, rest_of

@@ -28,8 +28,7 @@ from abbe.service.capture.live import LiveFeed
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session, notes_since
-from abbe.service.domain.measured import DISK_FULL
-from abbe.service.domain.owner import this_process
+from abbe.service.domain.measured import DISK_FULL, this_process
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds

@@ -27,7 +27,7 @@ from abbe.service.domain.measured import RUNNING, CampaignRecord, CheckpointReco
 from abbe.service.errors import PreconditionsChanged, UnsafeToMove
 from abbe.service.runs.codec import decode_json
 from abbe.service.runs.columns import LASER_CHANNEL
-from abbe.service.sequences.interlocks import check_interlocks, check_ours
+from abbe.service.sequences.control import check_interlocks, check_ours
 from abbe.service.sequences.journal import BEGUN, ENDED, BegunLine, HandLine, RunLine, lines_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import anew, remounted

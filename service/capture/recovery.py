@@ -33,8 +33,7 @@ from abbe.service.capture.settings import (
     segment_path,
     set_aside,
 )
-from abbe.service.domain.measured import INTERRUPTED, RUNNING, ChunkRecord, RunRecord
-from abbe.service.domain.owner import this_process
+from abbe.service.domain.measured import INTERRUPTED, RUNNING, ChunkRecord, RunRecord, this_process
 from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
 from abbe.service.runs.codec import decode_json
 from abbe.service.storage.store import Store

@@ -80,7 +80,7 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
 def reader_of(machine: Path) -> Iterator[Reader]:
     """Yield the read model of a machine file: its database and its control. A missing database is an error and is not created."""
     from abbe.service.config import load_machine
-    from abbe.service.devices.urls import control_of
+    from abbe.service.domain.machine import control_of
 
     loaded = load_machine(machine)
     with open_store(loaded.database_url) as store:

@@ -252,7 +252,7 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
     from abbe.service.cli.ask import person_at_console
     from abbe.service.compensation.proposals import by_whom
     from abbe.service.compensation.recover import recovered_session
-    from abbe.service.devices.machine_lock import lock_machine
+    from abbe.service.devices.session import lock_machine
 
     def report(text: str) -> None:
         typer.echo(text, err=True)

@@ -26,7 +26,7 @@ from abbe.service.devices.session import Session
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.push.operations import Verdict
-from abbe.service.sequences.interlocks import Suspending
+from abbe.service.sequences.control import Suspending
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, check_test_step, read_base

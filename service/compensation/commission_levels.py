@@ -26,7 +26,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.limits import Capabilities
-from abbe.service.sequences.interlocks import tripped
+from abbe.service.sequences.control import tripped
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, read_base

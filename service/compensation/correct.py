@@ -35,7 +35,7 @@ from abbe.service.identification.table_removal import removed_table, subtract_ta
 from abbe.service.push.operations import Verdict
 from abbe.service.push.validate import drift_reason
 from abbe.service.sequences.check import paced
-from abbe.service.sequences.interlocks import Suspending
+from abbe.service.sequences.control import Suspending
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.verification.verify import VerificationDecision, VerificationFigures, check_before, decide, figure_rows, figures
 

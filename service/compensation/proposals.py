@@ -23,12 +23,11 @@ from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from abbe.models.machine import AXES
 from abbe.service.campaign_data.campaign_folder import from_store
-from abbe.service.clock import Clock, SystemClock
+from abbe.service.clock import Clock, SystemClock, utc_text
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, solve_runs

@@ -18,7 +18,7 @@ from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recover import finish_when_safe, recovered_session, with_notes
-from abbe.service.devices.machine_lock import lock_machine
+from abbe.service.devices.session import lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.run import Run

@@ -20,18 +20,18 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import level_status
 from abbe.service.domain.document import Doc
-from abbe.service.domain.owner import this_process
+from abbe.service.domain.measured import this_process
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push import execute
 from abbe.service.push.execute import ControllerPort, Ended, PushActors, semantic_digest_of_tables
-from abbe.service.push.journal import Journal, OperationOrder, StoreBook, facts
+from abbe.service.push.journal import Journal, OperationOrder, StoreBook, facts, push_log
 from abbe.service.push.operations import Approval, Verdict
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
-from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed, push_log
+from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command rolls it back before anything else"
 UNTRUSTED_CONTROL = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"

@@ -19,7 +19,7 @@ from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.pushing import pushes_here
 from abbe.service.devices.session import Ask, DeviceUrls, Session, no_console, open_session
-from abbe.service.domain.owner import Owner, this_process
+from abbe.service.domain.measured import Owner, this_process
 from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch
 from abbe.service.push import execute
@@ -29,8 +29,7 @@ from abbe.service.push.operations import Done, Doubt, Operation, OperationKind, 
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import operator_needed
-from abbe.service.tables.table_gate import accept_strange, acceptance_doc, check_in_force, vouch
-from abbe.service.tables.unverified import KnownTables, known_tables
+from abbe.service.tables.table_gate import KnownTables, accept_strange, acceptance_doc, check_in_force, known_tables, vouch
 
 READY = "make the machine ready (interlocks, link), then start again"
 

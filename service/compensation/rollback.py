@@ -19,8 +19,7 @@ from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposals import by_whom
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, RestoredTable
 from abbe.service.compensation.recover import LIMIT_S, finish_when_safe, recover, with_notes
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
@@ -31,7 +30,7 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, read_base
 from abbe.service.tables.push_journal import KIND, STOPPED, JournalView, ended_as
-from abbe.service.tables.unverified import unverified_crcs
+from abbe.service.tables.table_gate import unverified_crcs
 
 
 @dataclass(frozen=True, slots=True)

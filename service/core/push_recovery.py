@@ -15,8 +15,7 @@ from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.core.jobs import MachineClaim
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls
+from abbe.service.devices.session import DeviceUrls, lock_machine
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse
 from abbe.service.scheduler import record

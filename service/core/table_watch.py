@@ -15,8 +15,7 @@ import structlog
 from abbe.drivers.api import TableController
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
 from abbe.service.errors import AbbeError, TableMismatch
 from abbe.service.scheduler.loop import AlarmSink
 from abbe.service.site import Site
@@ -24,8 +23,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables import table_gate
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.tables.table_gate import STRANGE as STRANGE_TABLE
-from abbe.service.tables.table_gate import InForceNow
-from abbe.service.tables.unverified import KnownTables, known_tables
+from abbe.service.tables.table_gate import InForceNow, KnownTables, known_tables
 from abbe.service.verification.verified_by import STRANGE_TABLE as STRANGE_TABLE_CODE
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from abbe.service.domain.machine_object import FileObject
+from abbe.service.domain.machine import FileObject
 
 Adds = Literal[
     "second_feed",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
-from abbe.service.domain.machine_object import FileObject, Interval, MachineObject, Point
+from abbe.service.domain.machine import FileObject, Interval, MachineObject, Point
 
 RUN_FORMAT = "abbe-run/1"
 CAMPAIGN_FORMAT = "abbe-campaign/1"

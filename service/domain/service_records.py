@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from abbe.service.domain.document import Doc, HistoryRow, Row
-from abbe.service.domain.owner import Owner
+from abbe.service.domain.measured import Owner
 
 
 class AlarmKind(StrEnum):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, ValidationError
 
-from abbe.service.domain.machine_object import FileObject, MachineObject, Point
+from abbe.service.domain.machine import FileObject, MachineObject, Point
 from abbe.service.errors import Unusable
 
 Status = Literal["observed", "weak", "not observable"]

@@ -27,7 +27,7 @@ from abbe.models.uncertainty.prediction import (
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, versions
 from abbe.service.domain.document import Doc
-from abbe.service.domain.machine_object import Point
+from abbe.service.domain.machine import Point
 from abbe.service.domain.solution_file import (
     BudgetLineValue,
     CorrelationValue,

@@ -12,7 +12,7 @@ from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.config_schema import MachineFile
-from abbe.service.devices.machine_lock import lock_machine
+from abbe.service.devices.session import lock_machine
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.domain.verification import CheckResult

@@ -14,8 +14,7 @@ from abbe.service.campaigns.plausibility import certificates
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
 from abbe.service.compensation.recover import recovered_session
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import Session
+from abbe.service.devices.session import Session, lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, make_proposal, promise_text

@@ -21,8 +21,7 @@ from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposal_diff import compare, largest
 from abbe.service.compensation.proposals import StoredProposal, check_temperature, gather, make
 from abbe.service.compensation.recover import recovered_session
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls
+from abbe.service.devices.session import DeviceUrls, lock_machine
 from abbe.service.discovery.changed_since import reference_solution
 from abbe.service.discovery.changed_text import changed_text
 from abbe.service.discovery.discover import discover, prepare

@@ -9,8 +9,20 @@ from abbe.drivers.api import BankState
 from abbe.service.domain.document import Doc
 from abbe.service.domain.push_entry import PushState
 from abbe.service.push.journal import PushFacts
-from abbe.service.push.operations import BACK, Knowledge, Operation, OperationKind, Refused, Truth
-from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
+from abbe.service.push.operations import (
+    BACK,
+    BRACKETS,
+    Coherent,
+    Failed,
+    Image,
+    Knowledge,
+    Operation,
+    OperationKind,
+    Refused,
+    Truth,
+    bracket,
+    stage,
+)
 
 MAX_UNANSWERED = 3
 BACKS = 3

@@ -23,7 +23,7 @@ from abbe.service.push import operations as o
 from abbe.service.push.journal import Journal, OperationOrder, facts
 from abbe.service.push.machine import next_operation
 from abbe.service.push.operations import Knowledge, Operation, OperationKind, Outcome, Truth, after_record, learn
-from abbe.service.sequences.interlocks import tripped
+from abbe.service.sequences.control import tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0
 """Length of a lease, and interval of its renewal while the machine is measured."""

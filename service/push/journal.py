@@ -12,10 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from abbe.service.clock import Clock
+from abbe.service.clock import Clock, utc_text
 from abbe.service.domain.document import GENESIS, Doc, canonical
 from abbe.service.domain.push_entry import FOLLOWS, TERMINAL, PushEntry, PushState
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import UnsafeToMove
 from abbe.service.storage.store import Store
 
@@ -45,9 +44,9 @@ class OperationOrder:
     table : int
         Id of the table in the store; 0 if it is not stored.
     control : str
-        Identity of the control (`abbe.service.devices.urls.control_of`); empty: unknown.
+        Identity of the control (`abbe.service.domain.machine.control_of`); empty: unknown.
     process : dict
-        The pushing process (`abbe.service.domain.owner.Owner`): while it lives, no other process recovers.
+        The pushing process (`abbe.service.domain.measured.Owner`): while it lives, no other process recovers.
     """
 
     machine: str
@@ -345,3 +344,15 @@ class StoreBook:
         await self._store.write(self._store.pushes.append, entry)
         self._head, self._journal = entry.digest, (*journal, entry)
         return entry
+
+
+def push_log(journal: Journal) -> tuple[str, ...]:
+    """Every transition of a push as a line for people."""
+    lines = []
+    for entry in journal:
+        known = facts((entry,))
+        parts = [known.why, known.pending, known.again, known.approved_by, known.probe, known.verify]
+        if entry.state is PushState.SNAPSHOT:
+            parts = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; to come: CRC {known.crc:08X}"]
+        lines.append(": ".join([str(entry.state), *filter(None, parts)]) + f" ({entry.utc})")
+    return tuple(lines)

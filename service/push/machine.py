@@ -14,8 +14,23 @@ from abbe.service.domain.push_entry import BEFORE_ACTIVATION, GOING_BACK, TERMIN
 from abbe.service.push.back import MAX_UNANSWERED, OWNERS, go_back, in_force, mismatch_doc, record
 from abbe.service.push.journal import Journal, OperationOrder, PushFacts, facts_to_act_on
 from abbe.service.push.limits import objection
-from abbe.service.push.operations import FORGET, Approval, Done, Knowledge, Operation, OperationKind, Refused, Truth, Verdict
-from abbe.service.push.staging import BRACKETS, Coherent, Failed, Image, bracket, stage
+from abbe.service.push.operations import (
+    BRACKETS,
+    FORGET,
+    Approval,
+    Coherent,
+    Done,
+    Failed,
+    Image,
+    Knowledge,
+    Operation,
+    OperationKind,
+    Refused,
+    Truth,
+    Verdict,
+    bracket,
+    stage,
+)
 
 STILL_S = 1.0
 """The axes must have stood for this long before anything is staged."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 
 from abbe.drivers.api import BarSample
 from abbe.service.domain.document import Doc
-from abbe.service.domain.machine_object import MachineObject
+from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord, RunFacts, RunRecord
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.queries.reader import Reader, as_stored, finite, of_row, read_as, storable

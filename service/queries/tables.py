@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
+from abbe.service.clock import utc_text
 from abbe.service.compensation.proposal_decisions import ProposalStatus, proposal_status
 from abbe.service.compensation.proposal_diff import ACTIVE, TableDifference, compare
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.push_entry import PushEntry, PushState, PushTransition
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
 from abbe.service.tables.push_journal import JournalView, TableHistory

@@ -13,7 +13,7 @@ from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
-from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts
+from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts, push_log
 from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
@@ -24,7 +24,7 @@ from abbe.service.report.report_parts import Doc, Rules
 from abbe.service.report.report_table import table_remarks
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import tables_from_image
-from abbe.service.tables.push_journal import JournalView, push_log
+from abbe.service.tables.push_journal import JournalView
 from abbe.service.verification.iso_report import Evaluated, evaluate
 from abbe.service.verification.verify import COVERAGE
 

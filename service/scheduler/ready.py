@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.slots import covering
-from abbe.service.sequences.interlocks import person_may_be_inside, tripped
+from abbe.service.sequences.control import person_may_be_inside, tripped
 
 LOOK_S = 60.0
 """Time between two looks at the controller if a schedule needs a warm machine, s."""

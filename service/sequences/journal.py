@@ -15,8 +15,7 @@ from typing import Any, Protocol, TypeVar
 from abbe.service.capture.ingest import may_pass
 from abbe.service.capture.recorder import CATCH_UP_S
 from abbe.service.domain.document import Doc, record
-from abbe.service.domain.measured import CheckpointRecord
-from abbe.service.domain.owner import Owner
+from abbe.service.domain.measured import CheckpointRecord, Owner
 from abbe.service.errors import StoreError
 from abbe.service.storage.store import Store
 

@@ -16,8 +16,7 @@ from abbe.drivers.links.shielded import run_to_end
 from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, BarOutOfRange, MeasurementFault, RunInterrupted
 from abbe.service.runs.recorder import Recorder
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import check_interlocks
+from abbe.service.sequences.control import Control, check_interlocks
 from abbe.service.sequences.resume_plan import PathProgress, PathRemainder, StretchComparison
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of

@@ -14,8 +14,7 @@ from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.check import step_seconds
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import AT_WORK, PAUSED, Watching, check_interlocks, check_ours
+from abbe.service.sequences.control import AT_WORK, PAUSED, Control, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back

@@ -14,9 +14,10 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.flags import signal_is_there
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, DoorOpen, Interlock, PreconditionsChanged
-from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import (
+from abbe.service.sequences.control import (
     CAN_CLEAR,
+    Control,
+    State,
     Suspending,
     Watching,
     air_trouble,

@@ -27,8 +27,7 @@ from abbe.drivers.links.shielded import run_to_end
 from abbe.service.clock import Clock
 from abbe.service.devices.session import Session, latest_status
 from abbe.service.errors import Interlock, MeasurementFault, StatusUnknown
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import Watching, air_trouble, beam_trouble, tripped
+from abbe.service.sequences.control import Control, Watching, air_trouble, beam_trouble, tripped
 from abbe.service.sequences.journal import INCIDENT, OUTCOME, Journal
 
 AIR_PERIOD_S = 1.0

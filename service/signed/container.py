@@ -12,8 +12,8 @@ from typing import Any
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+from abbe.service.clock import utc_text
 from abbe.service.domain.document import canonical
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import SignatureRefused
 from abbe.service.signed.keys import public_of
 

@@ -1,21 +1,35 @@
-"""The open database: one writer thread, reader connections, and the bridge from asyncio."""
+"""The open database (one writer thread, reader connections, the bridge from asyncio), the mapping of its rows to records, and the base of
+the repositories.
+
+A field of a record is the column of the same name, unless its mapping names another column or a nested record. A field of a text enum is
+read as its member.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
-from typing import ParamSpec, Self, TypeVar
+from enum import StrEnum
+from typing import Any, Generic, ParamSpec, Self, TypeVar, get_type_hints
 
-from sqlalchemy import Connection, Engine, text
+from sqlalchemy import Column, ColumnElement, Connection, Engine, FromClause, Row, Select, Table, func, insert, null, select, text
+from sqlalchemy.dialects.postgresql import Insert as PostgresInsert
+from sqlalchemy.dialects.postgresql import insert as postgres_insert
+from sqlalchemy.dialects.sqlite import Insert as SqliteInsert
+from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
-from abbe.service.domain.utc import utc_text
-from abbe.service.errors import StoreError
+from abbe.service.clock import utc_text
+from abbe.service.domain import decisions, measured, people, push_entry, results, service_records
+from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.measured import Owner
+from abbe.service.errors import NotStored, StoreError
 from abbe.service.secrets import mask_secrets
-from abbe.service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, translated
-from abbe.service.storage.migrate import upgrade
+from abbe.service.storage import tables as t
+from abbe.service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, translated, upgrade
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -132,3 +146,164 @@ class Database:
                 raise StoreError(f"database {self.url} takes no writes", "use the server that does")
 
         self.commit(work)
+
+
+R = TypeVar("R")
+
+
+class RecordMapping(Generic[R]):
+    """A frozen record and the columns that it is read from and written to.
+
+    SQLAlchemy's own mapper writes its state into the object and refuses frozen ones (decision 0037).
+
+    ``source``: the FROM clause to read, if it is more than the table. ``**other``: fields that are not the column of their name, given as
+    another expression or as the mapping of a nested record.
+    """
+
+    def __init__(
+        self, record: type[R], table: Table, source: FromClause | None = None, **other: ColumnElement[Any] | RecordMapping[Any]
+    ) -> None:
+        assert is_dataclass(record)
+        self.table, self._source = table, table if source is None else source
+        self._make: Callable[..., R] = record
+        self._prefix = f"{table.name}_{record.__name__}_"
+        names = [one.name for one in fields(record)]
+        if missing := [name for name in names if name not in other and name not in table.c]:
+            raise TypeError(f"{record.__name__}: table {table.name} has no column {', '.join(missing)}")
+        self._fields = {name: other[name] if name in other else table.c[name] for name in names}
+        kinds = get_type_hints(record)
+        self._enums = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, StrEnum)}
+
+    @property
+    def columns(self) -> list[ColumnElement[Any]]:
+        """The columns to select for `read`."""
+        found: list[ColumnElement[Any]] = []
+        for name, column in self._fields.items():
+            found += column.columns if isinstance(column, RecordMapping) else [column.label(self._prefix + name)]
+        return found
+
+    def select(self) -> Select[Any]:
+        """All rows, in no order."""
+        return select(*self.columns).select_from(self._source)
+
+    def read(self, row: Row[*tuple[Any, ...]]) -> R:
+        """The record of a row that holds `columns` and possibly others."""
+        return self.from_values(row._mapping)  # noqa: SLF001 - SQLAlchemy's public name
+
+    def from_values(self, values: Mapping[Any, Any]) -> R:
+        """The record of values by names of `columns`."""
+        found = {
+            name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
+            for name, column in self._fields.items()
+        }
+        for name, kind in self._enums.items():
+            found[name] = kind(found[name])
+        return self._make(**found)
+
+    def values(self, record: R, *without: str) -> dict[str, Any]:
+        """The columns of a record that its table stores, by name, except the fields ``without``."""
+        found: dict[str, Any] = {}
+        for name, column in self._fields.items():
+            if isinstance(column, RecordMapping):
+                found |= column.values(getattr(record, name))
+            elif isinstance(column, Column) and column.table is self.table and name not in without:
+                value = getattr(record, name)
+                found[column.name] = value.value if name in self._enums else value
+        return found
+
+
+def owner_of(table: Table) -> RecordMapping[Owner]:
+    """Mapping of the process that owns a row."""
+    return RecordMapping(Owner, table, host=table.c.owner_host, pid=table.c.owner_pid, start=table.c.owner_start)
+
+
+MACHINE = RecordMapping(measured.MachineRecord, t.machines)
+CAMPAIGN = RecordMapping(measured.CampaignRecord, t.campaigns)
+RUN = RecordMapping(
+    measured.RunRecord,
+    t.runs,
+    t.runs.join(t.campaigns, t.campaigns.c.id == t.runs.c.campaign_id),
+    campaign=t.campaigns.c.name,
+    owner=owner_of(t.runs),
+)
+CHUNK = RecordMapping(measured.ChunkRecord, t.chunks)
+CHECKPOINT = RecordMapping(measured.CheckpointRecord, t.checkpoints)
+
+SOLUTION = RecordMapping(results.SolutionRecord, t.solutions)
+TABLE = RecordMapping(results.TableRecord, t.comp_tables)
+VERIFICATION = RecordMapping(results.VerificationRecord, t.verifications)
+DISCOVERY = RecordMapping(results.DiscoveryRecord, t.discoveries)
+STEP = RecordMapping(results.StepRecord, t.discovery_steps)
+MODEL = RecordMapping(results.ModelRecord, t.machine_models)
+
+PROPOSAL = RecordMapping(decisions.ProposalRecord, t.proposals)
+APPROVAL = RecordMapping(decisions.ProposalApproval, t.approvals)
+REJECTION = RecordMapping(decisions.ProposalRejection, t.rejections)
+PUSH_ENTRY = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id)
+PUSH_MARK = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id, doc=null())
+"""Without the document, which holds the images of tables."""
+
+ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries)
+SLOT = RecordMapping(service_records.SlotRecord, t.slots, reason=func.coalesce(t.slots.c.reason, ""))
+HEARTBEAT = RecordMapping(service_records.HeartbeatRecord, t.heartbeats, owner=owner_of(t.heartbeats))
+OUTBOX = RecordMapping(service_records.OutboxRecord, t.outbox)
+REPLY = RecordMapping(service_records.ReplyRecord, t.replies)
+
+USER = RecordMapping(people.UserRecord, t.users)
+SESSION = RecordMapping(people.SessionRecord, t.sessions)
+TOKEN = RecordMapping(people.TokenRecord, t.api_tokens)
+AUDIT = RecordMapping(AuditEvent, t.audit)
+
+Order = ColumnElement[Any]
+
+
+class Repository:
+    """Base of the repositories, one for each aggregate."""
+
+    def __init__(self, database: Database) -> None:
+        self._db = database
+
+    def _all(
+        self,
+        of: RecordMapping[R],
+        *conditions: ColumnElement[bool],
+        order: Order | None = None,
+        newest: bool = False,
+        limit: int | None = None,
+    ) -> list[R]:
+        """All records that match, by ``order`` (default: id); with ``newest`` in descending order."""
+        by = of.table.c.id if order is None else order
+        query = of.select().where(*conditions).order_by(by.desc() if newest else by).limit(limit)
+        return [of.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]
+
+    def _first(self, of: RecordMapping[R], *conditions: ColumnElement[bool]) -> R | None:
+        """The first record that matches, None if there is none."""
+        return next(iter(self._all(of, *conditions, limit=1)), None)
+
+    def _get(self, of: RecordMapping[R], number: int, what: str, remedy: str = "") -> R:
+        """The record of an id. Raises NotStored."""
+        found = self._first(of, of.table.c.id == number)
+        if found is None:
+            raise NotStored(f"no {what} {number} in {self._db.url}", remedy)
+        return found
+
+    def _add(self, table: Table, **values: object) -> int:
+        """Insert one row in a transaction of its own; return its id."""
+        return self._db.commit(lambda connection: insert_row(connection, table, **values))
+
+
+def insert_row(connection: Connection, table: Table, **values: object) -> int:
+    """Insert one row; return its id."""
+    key = connection.execute(insert(table).values(**values)).inserted_primary_key
+    assert key is not None
+    return int(key[0])
+
+
+def if_given(column: Column[Any], value: object) -> list[ColumnElement[bool]]:
+    """The condition that a column equals a value; no condition for None."""
+    return [] if value is None else [column == value]
+
+
+def dialect_insert(connection: Connection, table: Table) -> PostgresInsert | SqliteInsert:
+    """An insert with ON CONFLICT clauses, whose syntax differs between databases."""
+    return postgres_insert(table) if connection.dialect.name == "postgresql" else sqlite_insert(table)

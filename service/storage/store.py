@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Engine, func, select, text
 
 from abbe.service.domain.service_records import StoreHealth
 from abbe.service.storage.database import Database
-from abbe.service.storage.migrate import head_revision, revision_of
+from abbe.service.storage.engine import head_revision, revision_of
 from abbe.service.storage.repositories.decisions import Proposals, Pushes
 from abbe.service.storage.repositories.measured import Campaigns, Checkpoints, Chunks, Machines, Runs
 from abbe.service.storage.repositories.pages import Pages

@@ -16,7 +16,7 @@ from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushEntr
 from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
 from abbe.service.push.journal import NO_PUSH, NOT_YET, Journal, JournalBroken, PushFacts, check_chain, facts
 from abbe.service.storage.store import Store
-from abbe.service.tables.unverified import PushedTable, known_tables
+from abbe.service.tables.table_gate import PushedTable, known_tables
 
 KIND = "rollback"
 """Kind of a table that a person restored by an ordered rollback."""
@@ -327,18 +327,6 @@ def _other(push: PushedTable) -> str:
 def ended_as(journal: Journal) -> PushState:
     """Current or final state of a push, ignoring a later acceptance by a person."""
     return next((e.state for e in reversed(journal) if e.state is not PushState.ACCEPTED), PushState.ACCEPTED)
-
-
-def push_log(journal: Journal) -> tuple[str, ...]:
-    """Every transition of a push as a line for people."""
-    lines = []
-    for entry in journal:
-        known = facts((entry,))
-        parts = [known.why, known.pending, known.again, known.approved_by, known.probe, known.verify]
-        if entry.state is PushState.SNAPSHOT:
-            parts = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; to come: CRC {known.crc:08X}"]
-        lines.append(": ".join([str(entry.state), *filter(None, parts)]) + f" ({entry.utc})")
-    return tuple(lines)
 
 
 def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome:

@@ -19,9 +19,8 @@ from typing import TypeVar
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerifyMismatchError
 
-from abbe.service.clock import Clock
+from abbe.service.clock import Clock, utc_text
 from abbe.service.domain.people import TokenRecord, UserRecord
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.storage.store import Store
 from abbe.service.users.roles import ALLOWED, Permission, Role

@@ -17,7 +17,7 @@ from abbe.models.geometry.propagation import Points, deviation_covariance
 from abbe.models.machine import AXES, Machine
 from abbe.service.config import load_machine, read_toml
 from abbe.service.config_schema import MachineFile
-from abbe.service.domain.machine_object import MachineObject
+from abbe.service.domain.machine import MachineObject
 from abbe.service.errors import ConfigError, FileFormatError, nearest
 from abbe.service.runs.checks import check, read_json
 from abbe.service.runs.errors_file import KnownErrors, read_errors

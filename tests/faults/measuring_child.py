@@ -18,8 +18,7 @@ from abbe.service.campaigns.campaign_run import Confirm
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan

@@ -21,8 +21,7 @@ from abbe.drivers.api import BarBatch
 from abbe.models.machine import Machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.sequences.check import step_seconds
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.control import Control, Watching
 from abbe.service.sequences.recipes import recipe as recipes
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, TestPlan

@@ -19,8 +19,7 @@ from abbe.service.campaigns.resume import resume
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.errors import RunInterrupted, Stopped
 from abbe.service.runs.codec import decode_bar
-from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.journal import HAND, INCIDENT, NoJournal
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, RecordPath

@@ -15,7 +15,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import Interlock, StillActive, TableRefused
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc import bank
 from tests.faults.sequencer_world import bench

@@ -14,8 +14,7 @@ from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import DoorOpen, EstopPressed, Interlock, PreconditionsChanged, Stopped, TemperatureOutside, UnsafeToMove
-from abbe.service.sequences.control import State
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import State, Suspending, Watching
 from abbe.service.sequences.journal import HAND
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadLaser, RecordPath
 from abbe.service.storage.store import Store

@@ -20,8 +20,7 @@ from abbe.service.domain.run import Run
 from abbe.service.errors import Interlock
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import export_folder, import_folder
-from abbe.service.sequences.control import State
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import State, Suspending, Watching
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import CampaignPlan, RecordPath
 from abbe.service.storage.store import Store

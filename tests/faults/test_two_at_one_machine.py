@@ -12,7 +12,7 @@ import pytest
 from abbe.service.campaigns.campaign_run import items, mounted_anew, resumed_item
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
-from abbe.service.devices.machine_lock import lock_machine
+from abbe.service.devices.session import lock_machine
 from abbe.service.errors import (
     ProgramRuns,
     SpindleTurns,

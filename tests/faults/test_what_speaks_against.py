@@ -29,8 +29,7 @@ from abbe.service.errors import (
     StatusUnknown,
     Stopped,
 )
-from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.journal import StoreJournal
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, RecordPath
 from abbe.service.storage.store import Store

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.storage import migrate, migrations
+from abbe.service.storage import engine, migrations
 
 NEXT = "9000"
 SOURCE = """
@@ -35,14 +35,14 @@ def downgrade():
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """From now on this program is the next version; returns the revision that is the newest of today."""
-    newest, name = migrate.head_revision(), f"scripts_of_{folder.name.replace('-', '_')}"
+    newest, name = engine.head_revision(), f"scripts_of_{folder.name.replace('-', '_')}"
     scripts = folder / name
     shutil.copytree(Path(migrations.__path__[0]), scripts, ignore=shutil.ignore_patterns("__pycache__"))
     (scripts / "versions" / f"r{NEXT}_gauges.py").write_text(SOURCE.format(newest=newest))
     monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setattr(migrate, "_SCRIPTS", f"{name}:")
-    monkeypatch.setattr(migrate, "_VERSIONS", f"{name}.versions")
-    monkeypatch.setattr(migrate, "known_revisions", migrate.known_revisions.__wrapped__)
-    assert migrate.head_revision() == NEXT
+    monkeypatch.setattr(engine, "_SCRIPTS", f"{name}:")
+    monkeypatch.setattr(engine, "_VERSIONS", f"{name}.versions")
+    monkeypatch.setattr(engine, "known_revisions", engine.known_revisions.__wrapped__)
+    assert engine.head_revision() == NEXT
     sys.modules.pop(name, None)
     return newest

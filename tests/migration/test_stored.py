@@ -10,8 +10,7 @@ import pytest
 from sqlalchemy import BigInteger, Engine, Float, Integer, LargeBinary, MetaData, Table, insert, select
 from sqlalchemy.types import JSON
 
-from abbe.service.storage.engine import make_engine
-from abbe.service.storage.migrate import current_revision, downgrade, upgrade
+from abbe.service.storage.engine import current_revision, downgrade, make_engine, upgrade
 from abbe.service.storage.store import Store
 from tests.migration import next_revision
 

@@ -19,7 +19,7 @@ from abbe.service.audit.book import AuditBook, files_of, sqlite_base
 from abbe.service.backup.restore import SQLITE_SUFFIXES
 from abbe.service.capture.settings import CaptureSettings, segment_folder
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.storage.migrate import known_revisions
+from abbe.service.storage.engine import known_revisions
 from abbe.service.storage.store import Store
 
 ROOT = Path(__file__).resolve().parents[2]

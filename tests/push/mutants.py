@@ -9,16 +9,16 @@ LOOKS_SAFE = ("machine", 'return f"not safe now: {truth.unsafe}" if truth.unsafe
 
 MUTANTS: dict[str, Edits] = {
     "second read-back skipped": (
-        ("staging", "step = bracket(known, image.bank, words, again=True)", "step = bracket(known, image.bank, words, again=False)"),
-        ("staging", "known.image != image.data or known.decoded_digest != image.semantic_digest:", "known.image != image.data:"),
+        ("operations", "step = bracket(known, image.bank, words, again=True)", "step = bracket(known, image.bank, words, again=False)"),
+        ("operations", "known.image != image.data or known.decoded_digest != image.semantic_digest:", "known.image != image.data:"),
     ),
     "full read-back skipped": (
         (
-            "staging",
+            "operations",
             "step = bracket(known, image.bank, words, again=True)",
             "step = Operation(OperationKind.LOOK) if known.truth is None else Coherent(known.truth)",
         ),
-        ("staging", "if known.image != image.data or known.decoded_digest != image.semantic_digest:", "if False:"),
+        ("operations", "if known.image != image.data or known.decoded_digest != image.semantic_digest:", "if False:"),
     ),
     "journal after the action": (
         (
@@ -64,7 +64,7 @@ MUTANTS: dict[str, Edits] = {
     "way back against an e-stop": (("back", "if truth.unsafe:\n        return _pending(state, f\"not safe now: {truth.unsafe}\")\n    if truth.states", "if False:\n        return _pending(state, \"\")\n    if truth.states"), ("back", "    if truth.unsafe:\n        return _pending(state, f\"not safe now: {truth.unsafe}\")\n    return", "    return")),
     "armed against an e-stop": (LOOKS_SAFE,),
     "new table written in place": (("machine", '"target": 1 - active}', '"target": active}'),),
-    "a person's words overwritten": (("staging", "if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):", "if False:"),),
+    "a person's words overwritten": (("operations", "if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):", "if False:"),),
     "a person's table switched away": (("back", 'if which == "neither":', "if False:"),),
     "journal not chained": (("journal", "str(state), doc, utc, prev]", 'str(state), doc, utc, ""]'),),
     "level not asked": (("machine", "    if no:\n", "    if False:\n"),),

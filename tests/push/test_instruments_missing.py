@@ -20,7 +20,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation import pushing
 from abbe.service.compensation.push_approved import PushOrder, push_approved
 from abbe.service.config import load_machine
-from abbe.service.domain.owner import this_process
+from abbe.service.domain.measured import this_process
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.jobs.check import run_check
 from abbe.service.jobs.guided_campaign import run_guided_campaign

@@ -17,7 +17,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.core.table_watch import look_at_table
-from abbe.service.devices.urls import DeviceUrls, address_of, control_of
+from abbe.service.domain.machine import DeviceUrls, address_of, control_of
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.journal import NO_PUSH, StoreBook, check_chain
@@ -28,7 +28,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT
 from abbe.service.tables.nine_tables import read_base
 from abbe.service.tables.push_journal import JournalView, open_pushes
-from abbe.service.tables.unverified import known_tables
+from abbe.service.tables.table_gate import known_tables
 from abbe.service.verification.verified_by import verified_by
 from tests.faults.sequencer_world import Bench, bench
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed

@@ -38,8 +38,7 @@ from abbe.service.scheduler.job import CheckJobs, Job, carry_out
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.control import Control, Watching
 from abbe.service.sequences.recipes.campaigns import identification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of

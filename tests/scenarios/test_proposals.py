@@ -28,8 +28,7 @@ from abbe.service.domain.decisions import ProposalApproval
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.service_records import AlarmKind
 from abbe.service.errors import StoreError, TableRefused
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.control import Control, Watching
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView

@@ -171,7 +171,7 @@ def approve(
 def _control(machine: Path | None, name: str) -> str:
     """Return the identity of a machine's control; empty without its machine file."""
     from abbe.service.config import load_machine
-    from abbe.service.devices.urls import control_of
+    from abbe.service.domain.machine import control_of
 
     found = None if machine is None else load_machine(machine).machine
     return control_of(found.devices.cnc) if found is not None and found.name == name else ""

@@ -1,1 +1,1 @@
-"""Schema changes of the database, one revision a file, applied by abbe.service.storage.migrate when the store opens."""
+"""Schema changes of the database, one revision a file, applied by abbe.service.storage.engine when the store opens."""

@@ -14,7 +14,7 @@ from abbe.service.domain.decisions import ProposalApproval, ProposalRecord, Prop
 from abbe.service.domain.document import Doc
 from abbe.service.domain.push_entry import PushEntry
 from abbe.service.errors import StoreError
-from abbe.service.storage.repository import APPROVAL, PROPOSAL, PUSH_ENTRY, PUSH_MARK, REJECTION, Repository, if_given, insert_row
+from abbe.service.storage.database import APPROVAL, PROPOSAL, PUSH_ENTRY, PUSH_MARK, REJECTION, Repository, if_given, insert_row
 from abbe.service.storage.tables import approvals, proposals, push_entries, rejections
 
 

@@ -25,10 +25,10 @@ from abbe.service.domain.measured import (
     ImportedRun,
     MachineRecord,
     RunRecord,
+    this_process,
 )
-from abbe.service.domain.owner import this_process
 from abbe.service.errors import CaptureConflict, NotStored, StoreError
-from abbe.service.storage.repository import CAMPAIGN, CHECKPOINT, CHUNK, MACHINE, RUN, Repository, if_given, insert_row, owner_of
+from abbe.service.storage.database import CAMPAIGN, CHECKPOINT, CHUNK, MACHINE, RUN, Repository, if_given, insert_row, owner_of
 from abbe.service.storage.tables import campaigns, checkpoints, chunks, heartbeats, machines, runs
 
 MOST_DIGITS = 10

@@ -10,8 +10,8 @@ from sqlalchemy import ColumnElement, FromClause, Select, select
 
 from abbe.service.domain import measured
 from abbe.service.domain.document import Doc
-from abbe.service.domain.owner import Owner
-from abbe.service.storage.repository import Repository
+from abbe.service.domain.measured import Owner
+from abbe.service.storage.database import Repository
 from abbe.service.storage.tables import (
     campaigns,
     comp_tables,

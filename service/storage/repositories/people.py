@@ -6,10 +6,10 @@ from datetime import timedelta
 
 from sqlalchemy import ColumnElement, Connection, Update, delete, func, select, update
 
+from abbe.service.clock import utc_text
 from abbe.service.domain.people import SessionRecord, TokenRecord, UserRecord
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
-from abbe.service.storage.repository import SESSION, TOKEN, USER, Repository, insert_row
+from abbe.service.storage.database import SESSION, TOKEN, USER, Repository, insert_row
 from abbe.service.storage.tables import api_tokens, sessions, users
 
 FORGOTTEN = timedelta(days=30)

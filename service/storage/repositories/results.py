@@ -20,8 +20,8 @@ from abbe.service.domain.results import (
     VerificationRecord,
 )
 from abbe.service.errors import ModelMovedOn, StoreError
+from abbe.service.storage.database import DISCOVERY, MODEL, SOLUTION, STEP, TABLE, VERIFICATION, Repository, if_given, insert_row
 from abbe.service.storage.repositories.service_records import queue_message
-from abbe.service.storage.repository import DISCOVERY, MODEL, SOLUTION, STEP, TABLE, VERIFICATION, Repository, if_given, insert_row
 from abbe.service.storage.tables import (
     campaigns,
     comp_tables,

@@ -14,13 +14,13 @@ from datetime import datetime, timedelta
 from sqlalchemy import ColumnElement, Connection, delete, func, or_, select, text, update
 from sqlalchemy.exc import IntegrityError
 
+from abbe.service.clock import utc_text
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import Doc
-from abbe.service.domain.owner import Owner, this_process
+from abbe.service.domain.measured import Owner, this_process
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind, HeartbeatRecord, OutboxRecord, ReplyRecord, SlotRecord
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
-from abbe.service.storage.repository import (
+from abbe.service.storage.database import (
     ALARM_ENTRY,
     AUDIT,
     HEARTBEAT,

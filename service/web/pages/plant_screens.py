@@ -14,11 +14,11 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, Response
 from pydantic import AfterValidator
 
+from abbe.service.clock import utc_text
 from abbe.service.compensation.proved_levels import KIND
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.measured import CampaignRecord
 from abbe.service.domain.progress import DeviceStatus
-from abbe.service.domain.utc import utc_text
 from abbe.service.queries.fleet import FleetFigure, MachineStatus, machine_statuses
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.journal import Trouble, troubles

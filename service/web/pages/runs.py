@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls
 from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError

@@ -8,8 +8,7 @@ import sys
 from dataclasses import replace
 
 from abbe.service.clock import SystemClock
-from abbe.service.devices.machine_lock import lock_machine
-from abbe.service.devices.session import DeviceUrls
+from abbe.service.devices.session import DeviceUrls, lock_machine
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.scheduler.ready import Ready, look_at
 

@@ -36,8 +36,7 @@ from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.errors import AbbeError, Interlock
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.runs.columns import load_run
-from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import Suspending, Watching
+from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.recipes.recipe_file import parse_recipe
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc

@@ -21,7 +21,7 @@ from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.push_recovery import push_is_open
-from abbe.service.devices.machine_lock import ENVIRONMENT
+from abbe.service.devices.session import ENVIRONMENT
 from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.push_entry import PushState as Push
@@ -257,7 +257,7 @@ async def test_work_that_ends_by_itself_is_not_touched_by_an_abort() -> None:
 
 HOLDER = """
 import sys
-from abbe.service.devices.machine_lock import lock_machine
+from abbe.service.devices.session import lock_machine
 with lock_machine(sys.argv[1]):
     print("has it", flush=True)
     sys.stdin.readline()

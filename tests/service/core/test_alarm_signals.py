@@ -14,12 +14,12 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
+from abbe.service.clock import utc_text
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmKind
-from abbe.service.domain.utc import utc_text
 from abbe.service.errors import StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.journal import GENESIS

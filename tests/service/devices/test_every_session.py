@@ -11,7 +11,7 @@ import abbe.service
 from abbe.drivers.errors import LinkDown
 from abbe.service.compensation import recover
 from abbe.service.devices import session
-from abbe.service.devices.urls import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls
 from abbe.service.errors import TableMismatch
 from abbe.service.site import Site
 from tests.faults.sequencer_world import MACHINE

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.devices import machine_lock as module
-from abbe.service.devices.machine_lock import lock_folder, lock_machine
+from abbe.service.devices import session as module
+from abbe.service.devices.session import lock_folder, lock_machine
 from abbe.service.errors import MachineInUse, UnsafeToMove
 from tests.patience import within
 
@@ -20,7 +20,7 @@ URL = "modbus+tcp://127.0.0.1:1"
 NOBODY = 65534
 HOLDER = """
 import os, sys
-from abbe.service.devices.machine_lock import lock_machine
+from abbe.service.devices.session import lock_machine
 uid, gid, url = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 if uid:  # after the imports: what this account may read of the installation is not what is tried here
     os.setgroups([gid] if gid else [])

@@ -20,8 +20,7 @@ from abbe.service.config import load_machine
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import ConfigError, DoorOpen
 from abbe.service.push.operations import Verdict
-from abbe.service.sequences.control import Control
-from abbe.service.sequences.interlocks import check_interlocks
+from abbe.service.sequences.control import Control, check_interlocks
 from abbe.service.sequences.paths import follow_path
 from abbe.service.sequences.steps import FollowPath
 from abbe.service.site import Site, site_of

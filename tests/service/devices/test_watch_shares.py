@@ -12,7 +12,7 @@ import pytest
 from abbe.drivers.api import Condition, ControllerStatus
 from abbe.service.devices.session import Session, noted
 from abbe.service.errors import DoorOpen
-from abbe.service.sequences.interlocks import AT_WORK, Watching
+from abbe.service.sequences.control import AT_WORK, Watching
 from abbe.service.sequences.watch import NOTHING, Watch
 from tests.pretended_status import READY, controller_status
 

@@ -27,7 +27,7 @@ from abbe.service import cli
 from abbe.service.campaign_data import campaign_checks
 from abbe.service.discovery import experiment_recipes
 from abbe.service.discovery.discover_live import addition_count
-from abbe.service.domain.owner import Owner
+from abbe.service.domain.measured import Owner
 from abbe.service.domain.results import NewVersion
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.codec import JSON_CODEC, encode_json

@@ -12,7 +12,7 @@ from abbe.models.discovery.answer import Localization
 from abbe.service.campaign_data.campaign_folder import Campaign, ensure_stored, from_folder
 from abbe.service.discovery.discover_live import Addition, find_addition
 from abbe.service.discovery.experiment_recipes import next_plan
-from abbe.service.domain.owner import Owner
+from abbe.service.domain.measured import Owner
 from abbe.service.runs.cases import case_of
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, RecordPath, TestPlan, Unmount

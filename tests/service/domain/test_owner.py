@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.domain import owner
-from abbe.service.domain.owner import UNKNOWN, Owner, process_start, this_process
+from abbe.service.domain import measured
+from abbe.service.domain.measured import UNKNOWN, Owner, process_start, this_process
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_a_process_of_another_account_that_is_hidden_is_not_gone(hidden: None, m
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can run a process as somebody else")
 def test_the_kernel_s_own_answer_to_another_account() -> None:
     """The first process is root's: who may not signal it still learns that it lives."""
-    words = "import os; from abbe.service.domain.owner import _without_proc; os.setuid(65534); print(repr(_without_proc(1)))"
+    words = "import os; from abbe.service.domain.measured import _without_proc; os.setuid(65534); print(repr(_without_proc(1)))"
     assert subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout.strip() == repr(UNKNOWN)
 
 
@@ -68,5 +68,5 @@ def test_a_killed_process_that_nobody_has_collected_is_gone() -> None:
 
 
 def test_windows_is_not_asked_by_a_signal_that_would_kill(hidden: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(owner.os, "name", "nt")
-    assert owner._without_proc(os.getpid()) == UNKNOWN
+    monkeypatch.setattr(measured.os, "name", "nt")
+    assert measured._without_proc(os.getpid()) == UNKNOWN

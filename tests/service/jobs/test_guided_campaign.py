@@ -24,8 +24,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
-from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.control import Control, State, Watching
 from abbe.service.sequences.recipes.campaigns import RecipeSource, campaign_source
 from abbe.service.sequences.recipes.recipe import Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import recipe_text

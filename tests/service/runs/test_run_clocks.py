@@ -10,8 +10,7 @@ import pytest
 from abbe.drivers.api import BarSample
 from abbe.service.campaign_data.campaign_checks import time_issues
 from abbe.service.devices.session import KEPT, noted, notes_since
-from abbe.service.domain.measured import ChunkRecord, RunRecord
-from abbe.service.domain.owner import Owner
+from abbe.service.domain.measured import ChunkRecord, Owner, RunRecord
 from abbe.service.domain.run import Run
 from abbe.service.runs.codec import BAR_CODEC, encode_bar
 from abbe.service.runs.columns import single_run

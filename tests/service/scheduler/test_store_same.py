@@ -11,15 +11,14 @@ from typing import Any
 
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
-from abbe.service.domain.measured import ChunkRecord, ImportedRun
-from abbe.service.domain.owner import Owner
+from abbe.service.domain.measured import ChunkRecord, ImportedRun, Owner
 from abbe.service.domain.people import TokenRecord
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import NewVersion
 from abbe.service.domain.service_records import AlarmKind, SlotRecord
 from abbe.service.errors import AbbeError
+from abbe.service.storage.database import Repository
 from abbe.service.storage.repositories.pages import LISTINGS
-from abbe.service.storage.repository import Repository
 from abbe.service.storage.store import Store
 
 START = datetime(2026, 11, 21, 3, 34, 5, 123456, tzinfo=UTC)

@@ -12,7 +12,7 @@ from abbe.drivers.api import LaserReading
 from abbe.drivers.errors import ReplyTimeout
 from abbe.service.devices.session import Session
 from abbe.service.errors import StatusUnknown
-from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.control import Watching
 from abbe.service.sequences.watch import Watch
 
 STEP_S = 0.5

@@ -16,8 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.domain.measured import ImportedRun
-from abbe.service.domain.owner import process_start, this_process
+from abbe.service.domain.measured import ImportedRun, process_start, this_process
 from abbe.service.errors import StoreError
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage.engine import resolve_url, wal_is_safe

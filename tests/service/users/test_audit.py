@@ -16,8 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import anchor_of, digest_of, faults, follow, mac_of
+from abbe.service.audit.book import AuditBook, anchor_of, digest_of, faults, follow, mac_of
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.push.journal import GENESIS

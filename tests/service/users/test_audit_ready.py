@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from abbe.service.audit.book import AuditBook
-from abbe.service.audit.chain import follow
+from abbe.service.audit.book import AuditBook, follow
 from abbe.service.cli import run
 from abbe.service.cli.administration.audit import record_all
 from abbe.service.cli.common import print_table

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.domain.measured import RunRecord
-from abbe.service.domain.owner import this_process
+from abbe.service.domain.measured import RunRecord, this_process
 from abbe.service.errors import MeasurementFault
 from abbe.service.report.report_measured import Measured, campaign_report
 from abbe.service.report.report_parts import Rules
