@@ -1,15 +1,18 @@
-"""Compensation banks: lease, write, read, seal, activate; each command is sent once, and the controller's status decides its outcome."""
+"""A controller as a push needs it: identity, coherent status, detection of a restart, and the compensation banks.
+
+Each command to the banks (lease, seal, activate) is sent once, and the controller's status decides its outcome.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import time
 
-from abbe.drivers.api import BankState, CompStatus
+from abbe.drivers.api import BankState, CompStatus, ControllerStatus, DeviceInfo, TableFormat
 from abbe.drivers.cnc import registers as reg
-from abbe.drivers.cnc.session import ControllerSession
-from abbe.drivers.errors import BadFrame, DeviceFault, Refused
-from abbe.drivers.links.modbus_link import ModbusOperation
-from abbe.drivers.links.words import bytes_of, next_number, run_numbered, words_of
+from abbe.drivers.errors import BadFrame, DeviceFault, Rebooted, Refused, WrongDevice
+from abbe.drivers.links.modbus_link import ModbusLink, ModbusOperation
+from abbe.drivers.links.words import bytes_of, check_clock, check_identity, next_number, run_numbered, words_of
 
 _WINDOW = 100  # even, and all 32-bit values of an image stand at even words: none is ever split
 _SEQLOCK_TRIES = 4
@@ -21,35 +24,163 @@ _SEALED = (BankState.SEALED, BankState.LAID_ASIDE)
 _LEASED = 7
 
 
-class Banks:
-    """The two compensation banks of one controller."""
+class ControllerSession:
+    """A link that verifies that its peer is the same run of the same controller."""
 
-    def __init__(self, session: ControllerSession) -> None:
-        self._session = session
-        self._name = session.name
-        self._commands = asyncio.Lock()
+    def __init__(self, link: ModbusLink) -> None:
+        self.link = link
+        self.name = link.name
+        self.incidents = link.incidents
+        """Incidents of the link: one entry for the detection, one for the outcome."""
+        self.fifo_size = 0
+        self._boot_id: int | None = None
+        self._map = ""
+        self._connection = link.connections
+        self._last_us = -1
 
-    async def status(self) -> CompStatus:
-        """See ``ModbusController.comp_status``."""
+    async def identify(self) -> DeviceInfo:
+        """Read the identity of the controller, and accept its boot id as the current one.
+
+        Raises
+        ------
+        WrongDevice
+            Canary registers or register map are not those of docs/protocols/cnc.md.
+        LinkDown, ReplyTimeout, BadFrame
+            The wire.
+        """
+        self._map = ""
+        counts = await self._identity()
+        status = reg.decode_status(await self.link.read_block(reg.STATUS), time.monotonic()).status
+        try:
+            check_clock(self.name, status.ctrl_us)
+        except WrongDevice as error:
+            self.incidents.note(error, latched=True)
+            raise
+        self._boot_id = counts["BOOT_ID"]
+        self._connection = self.link.connections
+        self._last_us = -1
+        self.incidents.accepted()
+        return DeviceInfo("cnc", f"{counts['N_AXES']}-axis controller", "", counts["BOOT_ID"], self._map)
+
+    async def check_boot(self) -> None:
+        """Raise ``Rebooted`` if the controller restarted since ``identify``."""
+        counts = await self._identity()
+        if self._boot_id is None:
+            self._boot_id = counts["BOOT_ID"]
+        if counts["BOOT_ID"] != self._boot_id:
+            detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
+            remedy = "the controller restarted: call identify, check its tables, measure again"
+            error = Rebooted(self.name, "check boot id", detail, remedy)
+            self.incidents.note(error, latched=True)
+            raise error
+        # Only now: until this succeeds, every status checks again, and an unverified device gets no command.
+        self._connection = self.link.connections
+
+    async def status(self) -> ControllerStatus:
+        """Read the controller's status; see `block`."""
+        return (await self.block()).status
+
+    async def block(self) -> reg.StatusBlock:
+        """Read the status block in one request.
+
+        Raises
+        ------
+        Rebooted
+            The controller restarted since ``identify``.
+        LinkDown, ReplyTimeout, BadFrame
+            The wire.
+        """
+        words = await self.link.read_block(reg.STATUS)
+        block = reg.decode_status(words, time.monotonic())
+        # This block has no boot id: check it after a new connection, or when the clock went back.
+        if self._boot_id is None or block.status.ctrl_us < self._last_us or self._connection != self.link.connections:
+            await self.check_boot()
+        self._last_us = block.status.ctrl_us
+        return block
+
+    async def table_format(self) -> TableFormat:
+        """Read the unit and the size of the controller's table banks."""
+        counts = await self._identity()
+        return TableFormat(counts["TABLE_LSB_NM"], counts["BANK_SIZE"])
+
+    async def close(self) -> None:
+        """Close the link. Closing twice does nothing."""
+        await self.link.close()
+
+    async def _identity(self) -> dict[str, int]:
+        counts = reg.IDENTITY.counts(await self.link.read_block(reg.IDENTITY))
+        try:
+            check_identity(self.name, counts, reg.MAP_VERSION)
+            self._check_map(counts)
+        except WrongDevice as error:
+            self.incidents.note(error, latched=True)
+            raise
+        self.fifo_size = counts["FIFO_SIZE"]
+        return counts
+
+    def _check_map(self, counts: dict[str, int]) -> None:
+        """Refuse a register map that this driver does not support, or that changed since ``identify``."""
+        found = reg.fingerprint(counts)
+        for name, expected in (("N_AXES", reg.AXES), ("BANK_SIZE", reg.BANK_REGISTERS)):
+            if counts[name] != expected:
+                detail = f"{name} is {counts[name]} instead of {expected} ({found})"
+                raise WrongDevice(self.name, "identify", detail, "install the matching firmware, or the matching version of this program")
+        if self._map and found != self._map:
+            detail = f"its register map changed: {found}, it was {self._map}"
+            raise WrongDevice(self.name, "identify", detail, "another firmware: identify it anew, check its tables")
+        self._map = found
+
+
+class Banks(ControllerSession):
+    """A controller with its two compensation banks."""
+
+    def __init__(self, link: ModbusLink) -> None:
+        super().__init__(link)
+        self._bank_commands = asyncio.Lock()
+
+    async def comp_status(self) -> CompStatus:
+        """Read the compensation status, with boot id and generation verified as unchanged around it.
+
+        Raises
+        ------
+        DeviceFault
+            Another program or the operator keeps changing banks.
+        """
         for _ in range(_SEQLOCK_TRIES):
             before = await self._seqlock()
-            words = await self._session.link.read_block(reg.COMP_STATUS)
+            words = await self.link.read_block(reg.COMP_STATUS)
             if await self._seqlock() == before:
                 boot_id, gen = before
                 return reg.decode_comp_status(words, boot_id=boot_id, gen=gen)
         detail = f"the generation changed during each of {_SEQLOCK_TRIES} reads"
-        raise DeviceFault(self._name, "read compensation status", detail, "is another program or the operator editing tables?")
+        raise DeviceFault(self.name, "read compensation status", detail, "is another program or the operator editing tables?")
 
-    async def write(self, bank: int, data: bytes, *, first: int = 0) -> None:
-        """See ``ModbusController.write_bank``."""
+    async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
+        """Write into the inactive bank from register ``first`` (even) on, in requests of up to 100 registers that never split a value.
+
+        Read the bank back before relying on it.
+
+        Raises
+        ------
+        Refused
+            The bank is active, or the data does not fit.
+        """
         base = self._base(bank, "write bank")
         self._within("write bank", first, len(data))
         words = words_of(data)
         for at in range(0, len(words), _WINDOW):
-            await self._session.link.write(base + first + at, words[at : at + _WINDOW], ModbusOperation.NUMBERED)
+            await self.link.write(base + first + at, words[at : at + _WINDOW], ModbusOperation.NUMBERED)
 
-    async def read(self, bank: int, n_bytes: int | None, *, first: int = 0) -> bytes:
-        """See ``ModbusController.read_bank``."""
+    async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
+        """Read a bank from register ``first`` (even) on: ``n_bytes``, or to the end of the image by its header.
+
+        Raises
+        ------
+        BadFrame
+            The bank holds no image and ``n_bytes`` is None.
+        Refused
+            The range exceeds the bank.
+        """
         base = self._base(bank, "read bank")
         if n_bytes is None:
             end = await self._length(bank, base)
@@ -58,53 +189,75 @@ class Banks:
             end = first + n_bytes // 2
         words: list[int] = []
         for at in range(first, end, _WINDOW):
-            words += await self._session.link.read(base + at, min(_WINDOW, end - at), lead=at)
+            words += await self.link.read(base + at, min(_WINDOW, end - at), lead=at)
         return bytes_of(words)
 
     async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
-        """See ``ModbusController.lease``."""
-        await self._command(reg.LEASE, "take the lease", anyway=anyway, owner=owner, lease_ms=lease_ms)
+        """Take (or extend) the lease for changing banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
+
+        If the status shows another owner, nothing is sent, unless ``anyway``, which tests whether the controller refuses.
+
+        Raises
+        ------
+        Refused
+            Another owner has the lease.
+        """
+        await self._bank_command(reg.LEASE, "take the lease", anyway=anyway, owner=owner, lease_ms=lease_ms)
 
     async def release(self, owner: int, *, anyway: bool = False) -> None:
-        """See ``ModbusController.release``."""
-        await self._command(reg.RELEASE, "release the lease", anyway=anyway, owner=owner)
+        """Release the lease; ``anyway`` and errors as for `lease`."""
+        await self._bank_command(reg.RELEASE, "release the lease", anyway=anyway, owner=owner)
 
     async def seal(self, bank: int, owner: int) -> None:
-        """See ``ModbusController.seal``."""
+        """Have the controller check the bank's image and compute its CRC.
+
+        Raises
+        ------
+        Refused
+            Not a valid image, bank active, or the lease is not ours.
+        """
         self._base(bank, "seal bank")
-        await self._command(reg.SEAL, f"seal bank {bank}", bank=bank, owner=owner)
+        await self._bank_command(reg.SEAL, f"seal bank {bank}", bank=bank, owner=owner)
 
     async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None:
-        """See ``ModbusController.activate``."""
+        """Make a sealed bank the active one, if CRC and generation are still the expected ones. Sent exactly once.
+
+        Raises
+        ------
+        Refused
+            Compare-and-swap, interlock or lease failed at the controller: nothing changed.
+        ReplyTimeout, LinkDown, BadFrame
+            The reply was lost, and the controller reports no execution or is unreachable: read ``comp_status`` before continuing.
+        """
         self._base(bank, "activate bank")
         operation = f"activate bank {bank}"
-        await self._command(reg.ACTIVATE, operation, bank=bank, expect_crc=expect_crc, expect_gen=expect_gen, owner=owner)
+        await self._bank_command(reg.ACTIVATE, operation, bank=bank, expect_crc=expect_crc, expect_gen=expect_gen, owner=owner)
         active = (await self._comp_counts())["ACTIVE_BANK"]
         if active != bank:
-            raise DeviceFault(self._name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
+            raise DeviceFault(self.name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
 
-    async def _command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
+    async def _bank_command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
         """Send a command and determine its outcome.
 
         Two programs can use the same number: the controller executes the first command and skips the second, and both see the same
         acknowledge. Therefore the acknowledge is compared with the owner of the lease. A skipped command never executes; it is sent again
         under another number, except ACTIVATE, where the caller decides.
         """
-        async with self._commands:
+        async with self._bank_commands:
             for _ in range(1 if command == reg.ACTIVATE else _TRIES):
                 result, counts = await self._once(command, operation, fields, anyway=anyway)
                 if not _passed_over(command, result, counts, fields):
                     break
             else:
                 detail = "another program's command took its number: it was not executed"
-                raise DeviceFault(self._name, operation, detail, "let one program at a time push; read the status again, then decide")
+                raise DeviceFault(self.name, operation, detail, "let one program at a time push; read the status again, then decide")
         if command == reg.RELEASE and result == _LEASED and counts["LEASE_OWNER"] == 0:
             return  # some controls refuse to release a free lease
         if result:
-            raise Refused(self._name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
+            raise Refused(self.name, operation, reg.COMP_RESULT.get(result, f"result {result}"), "read the status again, then decide")
 
     async def _once(self, command: int, operation: str, fields: dict[str, int], *, anyway: bool) -> tuple[int, dict[str, int]]:
-        await self._session.check_boot()
+        await self.check_boot()
         counts = await self._comp_counts()
         if not anyway and command in (reg.LEASE, reg.RELEASE) and counts["LEASE_OWNER"] not in (0, fields["owner"]):
             return _LEASED, counts  # a request would use up the number of a command of the lease's owner
@@ -112,45 +265,45 @@ class Banks:
         try:
             words = reg.encode_comp(number, command, **fields)
         except ValueError as error:
-            raise Refused(self._name, operation, str(error)) from None
+            raise Refused(self.name, operation, str(error)) from None
 
         async def write() -> None:
-            await self._session.link.write(reg.COMP_ADDRESS, words, ModbusOperation.NUMBERED)
+            await self.link.write(reg.COMP_ADDRESS, words, ModbusOperation.NUMBERED)
 
         async def acknowledge() -> tuple[int, int]:
             nonlocal counts
-            connection = self._session.link.connections
+            connection = self.link.connections
             counts = await self._comp_counts()
-            if connection != self._session.link.connections:
-                await self._session.check_boot()  # after a restart the numbers begin anew and prove nothing
+            if connection != self.link.connections:
+                await self.check_boot()  # after a restart the numbers begin anew and prove nothing
             return counts["COMP_ACK_SEQ"], counts["COMP_RESULT"]
 
-        return await run_numbered(self._name, operation, number, write, acknowledge), counts
+        return await run_numbered(self.name, operation, number, write, acknowledge), counts
 
     async def _comp_counts(self) -> dict[str, int]:
-        return reg.COMP_STATUS.counts(await self._session.link.read_block(reg.COMP_STATUS))
+        return reg.COMP_STATUS.counts(await self.link.read_block(reg.COMP_STATUS))
 
     async def _seqlock(self) -> tuple[int, int]:
-        counts = reg.SEQLOCK.counts(await self._session.link.read_block(reg.SEQLOCK))
+        counts = reg.SEQLOCK.counts(await self.link.read_block(reg.SEQLOCK))
         return counts["BOOT_ID"], counts["GEN"]
 
     async def _length(self, bank: int, base: int) -> int:
-        header = await self._session.link.read(base, _HEADER_WORDS)
+        header = await self.link.read(base, _HEADER_WORDS)
         length = header[_LENGTH_WORD]
         if header[0] != _MAGIC or not _HEADER_WORDS <= length <= reg.BANK_REGISTERS:
             detail = f"bank {bank} holds no image (magic {header[0]:#06x}, length {length})"
-            raise BadFrame(self._name, "read bank", detail, "empty or half written: give the number of bytes to read it anyway")
+            raise BadFrame(self.name, "read bank", detail, "empty or half written: give the number of bytes to read it anyway")
         return length
 
     def _within(self, operation: str, first: int, n_bytes: int) -> None:
         """Refuse ranges beyond the registers of a bank, or that split a 32-bit value."""
         if n_bytes % 2 or n_bytes <= 0 or first % 2 or not 0 <= first <= reg.BANK_REGISTERS - n_bytes // 2:
             detail = f"{n_bytes} bytes from register {first} on are not within the {reg.BANK_REGISTERS} registers of a bank"
-            raise Refused(self._name, operation, detail)
+            raise Refused(self.name, operation, detail)
 
     def _base(self, bank: int, operation: str) -> int:
         if bank not in (0, 1):
-            raise Refused(self._name, operation, f"there is no bank {bank}", "use 0 or 1")
+            raise Refused(self.name, operation, f"there is no bank {bank}", "use 0 or 1")
         return reg.BANK_BASE[bank]
 
 

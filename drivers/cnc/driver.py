@@ -1,18 +1,27 @@
-"""Driver of a CNC controller: motion, status and compensation banks."""
+"""Driver of a CNC controller: moves, paths, feed hold, and by `Banks` its tables. A move that fails leaves the machine in feed hold."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 
-from abbe.drivers.api import CompStatus, ControllerStatus, DeviceInfo, Point, TableFormat
+from abbe.drivers.api import Condition, ControllerStatus, Point
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.banks import Banks
-from abbe.drivers.cnc.motion import MotionCommands
-from abbe.drivers.cnc.session import ControllerSession
-from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
+from abbe.drivers.links.modbus_link import ModbusLink, ModbusOperation
+from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.links.words import next_number, run_numbered
+
+_POLL_S = 0.003
+_HOLD_S = 3.0
+_HOLD_AGAIN_S = 0.05
+_INTERLOCK = 2
+_STOP_S = 5.0
 
 
-class ModbusController:
+class ModbusController(Banks):
     """A CNC controller with the register map of docs/protocols/cnc.md.
 
     Every method may raise ``LinkDown``, ``ReplyTimeout`` or ``BadFrame`` (the wire) and ``Rebooted`` (the controller restarted since
@@ -21,30 +30,8 @@ class ModbusController:
     """
 
     def __init__(self, link: ModbusLink) -> None:
-        self._session = ControllerSession(link)
-        self._motion = MotionCommands(self._session)
-        self._banks = Banks(self._session)
-        self.name = link.name
-        self.incidents = link.incidents
-        """Incidents of the link: one entry for the detection, one for the outcome."""
-
-    async def identify(self) -> DeviceInfo:
-        """Read the identity of the controller, and accept its boot id as the current one.
-
-        Raises
-        ------
-        WrongDevice
-            Canary registers or map version do not match the protocol.
-        """
-        return await self._session.identify()
-
-    async def table_format(self) -> TableFormat:
-        """Read the unit and the size of the controller's table banks."""
-        return await self._session.table_format()
-
-    async def status(self) -> ControllerStatus:
-        """Read the controller's coherent status block."""
-        return await self._session.status()
+        super().__init__(link)
+        self._commands = asyncio.Lock()  # held during numbering and acknowledge of a command, never while the axes move
 
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
         """Move straight to a target (commanded X, Y, Z in mm), wait until the axes stand there, and return that status.
@@ -61,7 +48,20 @@ class ModbusController:
         ReplyTimeout
             Not in position in time.
         """
-        return await self._motion.move(target_mm, feed_mm_min=feed_mm_min, timeout_s=timeout_s)
+        target = self._counts(target_mm, "move")
+        try:
+            async with self._hold_on_trouble(), asyncio.timeout(timeout_s):
+                number = await self._command(reg.MOVE, "move", target, feed_mm_min)
+                status = await self._done(number)
+        except TimeoutError as error:
+            if isinstance(error, DriverError):
+                raise
+            late = ReplyTimeout(self.name, "move", f"not in position after {timeout_s:g} s, feed hold set", "override at 0?")
+            raise _with_notes(late, error) from None
+        if self._counts(status.position_mm, "move") != target:
+            detail = f"the move ended at {status.position_mm} instead of {tuple(target_mm)}: aborted"
+            raise DeviceFault(self.name, "move", detail, "start again when the reason is known")
+        return status
 
     async def load_path(self, points_mm: Sequence[Point]) -> None:
         """Clear the controller's path and load these points (mm); nothing moves.
@@ -73,7 +73,17 @@ class ModbusController:
         DeviceFault
             The controller received another number of points.
         """
-        await self._motion.load_path(points_mm)
+        points = [self._counts(point, "load path") for point in points_mm]
+        if len(points) > self.fifo_size:
+            detail = f"{len(points)} points, the controller holds {self.fifo_size}"
+            raise Refused(self.name, "load path", detail, "use fewer points")
+        await self._command(reg.PATH_CLEAR, "clear path")
+        for first in range(0, len(points), reg.MAX_CHUNK):
+            await self._chunk(points[first : first + reg.MAX_CHUNK], f"load path points {first}..")
+        block = await self.block()
+        if block.fifo_free != self.fifo_size - len(points):
+            detail = f"{self.fifo_size - block.fifo_free} points arrived instead of {len(points)}"
+            raise DeviceFault(self.name, "load path", detail, "is another program loading a path? load it again")
 
     async def start_path(self, *, feed_mm_min: float) -> None:
         """Start the loaded path at constant feed (mm/min) and return as soon as it runs; ``status`` shows its progress.
@@ -83,15 +93,24 @@ class ModbusController:
         Refused
             Interlock, busy, empty path, feed hold on.
         """
-        await self._motion.start_path(feed_mm_min=feed_mm_min)
+        async with self._hold_on_trouble():
+            await self._command(reg.PATH_START, "start path", feed_mm_min=feed_mm_min)
 
     async def hold(self) -> None:
         """Stop the axes on their path; ``resume`` continues, ``abort`` gives up. Works at any time."""
-        await self._motion.request_hold(reg.HOLD)
+        await self.request_hold(reg.HOLD)
 
     async def resume(self) -> None:
         """Release feed hold: an interrupted motion continues."""
-        await self._motion.request_hold(reg.RUN)
+        await self.request_hold(reg.RUN)
+
+    async def reset_alarm(self) -> None:
+        """Reset the controller's alarm. Raises ``Refused`` while its cause persists."""
+        await self._command(reg.RESET_ALARM, "reset alarm")
+
+    async def request_hold(self, level: int) -> None:
+        """Write HOLD_REQUEST. It is a level, not an event, so the link may repeat the write."""
+        await self.link.write(reg.HOLD_ADDRESS, (level,), ModbusOperation.LEVEL)
 
     async def abort(self) -> None:
         """Stop the axes, forget the motion and the path, and leave the controller ready for the next motion.
@@ -101,84 +120,133 @@ class ModbusController:
         ReplyTimeout
             The axes still move seconds later.
         """
-        await self._motion.abort()
+        await self.request_hold(reg.ABORT)
+        try:
+            async with asyncio.timeout(_STOP_S):
+                await self._standstill()
+        except TimeoutError as error:
+            if isinstance(error, DriverError):
+                raise
+            raise ReplyTimeout(self.name, "abort", f"the axes still move {_STOP_S:g} s after the abort", "press the e-stop") from None
+        await self.request_hold(reg.RUN)
 
-    async def reset_alarm(self) -> None:
-        """Reset the controller's alarm. Raises ``Refused`` while its cause persists."""
-        await self._motion.reset_alarm()
+    async def _standstill(self) -> None:
+        while True:
+            status = await self.status()
+            if not (status.moving or status.path_running):
+                return
+            await asyncio.sleep(_POLL_S)
 
-    async def comp_status(self) -> CompStatus:
-        """Read the compensation status, with boot id and generation verified as unchanged around it.
+    @asynccontextmanager
+    async def _hold_on_trouble(self) -> AsyncIterator[None]:
+        try:
+            yield
+        except (Refused, _MotionStopped):
+            raise  # no motion of ours runs
+        except BaseException as error:
+            # Cancellation, timeout, lost link, alarm: in every case the axes must not run on unattended.
+            await self._hold_quietly(error)
+            raise
 
-        Raises
-        ------
-        DeviceFault
-            Another program or the operator keeps changing banks.
-        """
-        return await self._banks.status()
+    async def _hold_quietly(self, reason: BaseException) -> None:
+        async def hold() -> None:
+            try:
+                async with asyncio.timeout(_HOLD_S):
+                    await self._retry_hold()
+            except (DriverError, TimeoutError) as error:
+                reason.add_note(f"and the feed hold could not be sent: {error}")
 
-    async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
-        """Take (or extend) the lease for changing banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
+        await run_to_end(hold())
 
-        If the status shows another owner, nothing is sent, unless ``anyway``, which tests whether the controller refuses.
+    async def _retry_hold(self) -> None:
+        """Retry the feed hold as often as the link permits: a lost controller may return with moving axes."""
+        while True:
+            try:
+                return await self.request_hold(reg.HOLD)
+            except DriverError as error:
+                if not error.retryable:
+                    raise
+            await asyncio.sleep(_HOLD_AGAIN_S)
 
-        Raises
-        ------
-        Refused
-            Another owner has the lease.
-        """
-        await self._banks.lease(owner, lease_ms, anyway=anyway)
+    async def _command(self, command: int, operation: str, target: tuple[int, int, int] = (0, 0, 0), feed_mm_min: float = 0.0) -> int:
+        async with self._commands:
+            block = await self.block()
+            reasons = reg.interlocks(block.status.conditions)  # an open door may also show as feed hold: report the door
+            if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
+                raise Refused(self.name, operation, "feed hold is on", "call resume or abort first, when it is safe")
+            number = next_number(block.motion_ack_seq)
+            try:
+                words = reg.encode_motion(number, command, target, feed_mm_min)
+            except ValueError as error:
+                raise Refused(self.name, operation, str(error)) from None
 
-    async def release(self, owner: int, *, anyway: bool = False) -> None:
-        """Release the lease; ``anyway`` and errors as for `lease`."""
-        await self._banks.release(owner, anyway=anyway)
+            async def write() -> None:
+                await self.link.write(reg.MOTION_ADDRESS, words, ModbusOperation.NUMBERED)
 
-    async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
-        """Write into the inactive bank from register ``first`` (even) on, in requests of up to 100 registers that never split a value.
+            async def acknowledge() -> tuple[int, int]:
+                now = await self.block()
+                return now.motion_ack_seq, now.motion_result
 
-        Read the bank back before relying on it.
+            result = await run_numbered(self.name, operation, number, write, acknowledge)
+        if result:
+            detail = reg.MOTION_RESULT.get(result, f"result {result}") + (f": {', '.join(reasons)}" if reasons else "")
+            # HOLD_REQUEST at 2 forbids motion without showing in the status
+            unseen = "was an abort not finished? call abort again; else " if result == _INTERLOCK and not reasons else ""
+            raise Refused(self.name, operation, detail, f"{unseen}look at the machine, then try again")
+        return number
 
-        Raises
-        ------
-        Refused
-            The bank is active, or the data does not fit.
-        """
-        await self._banks.write(bank, data, first=first)
+    async def _done(self, number: int) -> ControllerStatus:
+        while True:
+            block = await self.block()
+            # Faults first: after an alarm the controller may count the command as done.
+            self._check(block)
+            if block.motion_done_seq == number:
+                return block.status
+            if Condition.FEED_HOLD in block.status.conditions:
+                raise _MotionStopped(self.name, "move", "stopped by feed hold", "resume or abort when it is safe")
+            if block.motion_ack_seq != number:
+                detail = f"command {number} was overtaken by {block.motion_ack_seq}"
+                raise DeviceFault(self.name, "move", detail, "is another program moving this machine?")
+            await asyncio.sleep(_POLL_S)
 
-    async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
-        """Read a bank from register ``first`` (even) on: ``n_bytes``, or to the end of the image by its header.
+    def _check(self, block: reg.StatusBlock) -> None:
+        conditions = block.status.conditions
+        if Condition.ESTOP in conditions:
+            raise DeviceFault(self.name, "move", "e-stop pressed", "release it, reset the alarm, reference if asked, start again")
+        if Condition.ALARM in conditions or block.alarm_code:
+            what = reg.ALARM.get(block.alarm_code, f"code {block.alarm_code}")
+            raise DeviceFault(self.name, "move", f"alarm: {what}", "clear its cause and reset it at the controller")
+        if Condition.DOOR_OPEN in conditions:
+            raise DeviceFault(self.name, "move", "door opened", "close it and start again")
 
-        Raises
-        ------
-        BadFrame
-            The bank holds no image and ``n_bytes`` is None.
-        Refused
-            The range exceeds the bank.
-        """
-        return await self._banks.read(bank, n_bytes, first=first)
+    async def _chunk(self, points: list[tuple[int, int, int]], operation: str) -> None:
+        async with self._commands:
+            number = next_number((await self.block()).fifo_ack_seq)
 
-    async def seal(self, bank: int, owner: int) -> None:
-        """Have the controller check the bank's image and compute its CRC.
+            async def write() -> None:
+                await self.link.write(reg.FIFO_ADDRESS, reg.encode_fifo(number, points), ModbusOperation.NUMBERED)
 
-        Raises
-        ------
-        Refused
-            Not a valid image, bank active, or the lease is not ours.
-        """
-        await self._banks.seal(bank, owner)
+            async def acknowledge() -> tuple[int, int]:
+                now = await self.block()
+                return now.fifo_ack_seq, now.fifo_result
 
-    async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None:
-        """Make a sealed bank the active one, if CRC and generation are still the expected ones. Sent exactly once.
+            result = await run_numbered(self.name, operation, number, write, acknowledge)
+        if result:
+            raise Refused(self.name, operation, reg.MOTION_RESULT.get(result, f"result {result}"), "check the path against the strokes")
 
-        Raises
-        ------
-        Refused
-            Compare-and-swap, interlock or lease failed at the controller: nothing changed.
-        ReplyTimeout, LinkDown, BadFrame
-            The reply was lost, and the controller reports no execution or is unreachable: read ``comp_status`` before continuing.
-        """
-        await self._banks.activate(bank, expect_crc=expect_crc, expect_gen=expect_gen, owner=owner)
+    def _counts(self, point_mm: Point, operation: str) -> tuple[int, int, int]:
+        try:
+            return reg.position_counts(point_mm)
+        except ValueError as error:
+            raise Refused(self.name, operation, str(error)) from None
 
-    async def close(self) -> None:
-        """Close the link. Closing twice does nothing."""
-        await self._session.link.close()
+
+def _with_notes(error: DriverError, former: BaseException) -> DriverError:
+    """Copy the notes of an earlier error, such as a failed feed hold."""
+    for note in getattr(former, "__notes__", ()):
+        error.add_note(note)
+    return error
+
+
+class _MotionStopped(DeviceFault):
+    """The controller is already in feed hold: a further request could undo a running abort."""

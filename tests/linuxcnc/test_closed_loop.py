@@ -25,8 +25,7 @@ from abbe.drivers.tables import TableImage, encode
 from abbe.models.compensation.grid import GridTable, grid_table, nodes_mm, quantise_grid
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.geometry.volume import field_statistics
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.models.solvers.observe import perpendicular

@@ -108,7 +108,7 @@ async def test_it_is_one_of_ours_moves_and_runs_a_path(machine):
         assert (await cnc.identify()).firmware.startswith("map 1, 3 axes, table unit 100 nm")
         status = await cnc.status()
         assert status.conditions & READY == READY
-        assert (await cnc._session.block()).alarm_code == 0
+        assert (await cnc.block()).alarm_code == 0
         target = (300.0, 100.12345, 50.0)
         assert (await cnc.move(target, feed_mm_min=FEED, timeout_s=20)).position_mm == target
         assert await machine.drives() == pytest.approx(target, abs=1e-9)

@@ -18,7 +18,7 @@ async def test_identify_and_status(controller):
     assert (await controller.identify()).boot_id == 100
     status = await controller.status()
     assert status.conditions == conditions_of(READY)
-    assert (await controller._session.block()).fifo_free == 8192
+    assert (await controller.block()).fifo_free == 8192
 
 
 async def test_wrong_device(tcp_peer, cnc):
