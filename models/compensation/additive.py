@@ -22,7 +22,7 @@ from abbe.models.geometry.bases import Term, legendre_values
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends
+from abbe.models.paths import DIAGONALS, diagonal_ends
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.priors import U_WAVELENGTH
 from abbe.models.uncertainty.inputs import StatedInputs

@@ -16,8 +16,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.effects.effect import Effect, Family, Remedy, Signal, Values
 from abbe.models.effects.path import Kind, Path, at_rest, driven
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import diagonal_ends, step_diagonal
+from abbe.models.paths import diagonal_ends, helix_points, step_diagonal
 
 TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")
 UNITS = ("um", "urad", "ms", "K", "K/h", "mrad")

@@ -15,8 +15,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.observations import RunData, Test
 from abbe.models.solvers.priors import U_WAVELENGTH
 from abbe.models.uncertainty.inputs import StatedInputs

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 
 ORDER = ("ppp", "npp", "pnp", "ppn")
 

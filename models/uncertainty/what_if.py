@@ -17,8 +17,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.volume import volume_grid
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, straight_line
 from abbe.models.uncertainty.known_field import KnownField
 
 DRAWS = 600

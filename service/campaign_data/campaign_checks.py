@@ -58,7 +58,7 @@ def time_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
 
 
 def _clocks(run: Run) -> list[CampaignIssue]:
-    """The disagreement of a run's clocks, if any (`abbe.service.runs.clocks`)."""
+    """The disagreement of a run's clocks, if any (`abbe.service.runs.sample_columns`)."""
     trouble = run.timing.trouble
     return [CampaignIssue(run.run_id, trouble, "look at the sync cable and the links, then measure it again", False)] if trouble else []
 

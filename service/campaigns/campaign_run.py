@@ -10,13 +10,13 @@ from typing import Any
 
 from abbe.drivers.api import DeviceInfo, Point
 from abbe.drivers.errors import DriverError, LinkDown, Rebooted, ReplyTimeout
+from abbe.service.campaigns.plausibility import BEFORE_S
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.columns import path_progress
 from abbe.service.runs.pieces import ReadProgress
 from abbe.service.sequences.control import Control, State, Suspending, Watching, check_interlocks
 from abbe.service.sequences.journal import DONE, WAITS, Journal, RunLine, lines_of
-from abbe.service.sequences.needed import BEFORE_S
 from abbe.service.sequences.resume_plan import Attempt, PathRemainder, ResumeTrail, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, ReadBar, RecordPath, TestPlan

@@ -24,6 +24,7 @@ from abbe.models.alignment.lag import Lag, fit_lag
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
 from abbe.service.campaigns.measure import OpenCampaign, start_campaign, start_document
+from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session
@@ -32,7 +33,6 @@ from abbe.service.runs.recorder import Recorder
 from abbe.service.runs.sample_columns import MM_PER_COUNT
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
-from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.steps import CampaignPlan, MountLaser, MoveTo, ReadLaser, TestPlan, Unmount
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -24,6 +24,7 @@ from abbe.service.campaigns.campaign_run import (
     plan_hash,
     read_path,
 )
+from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.capture.live import LiveFeed
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
@@ -34,7 +35,6 @@ from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, St
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
-from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.paths import warnings_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import Attempt

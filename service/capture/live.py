@@ -20,7 +20,7 @@ from abbe.drivers.api import BarBatch, Point
 from abbe.drivers.flags import bar_is_valid, on_path
 from abbe.service.domain.bounds import WORD
 from abbe.service.domain.progress import RecordedPath
-from abbe.service.runs.helix_axis import about_axis, helix_axis
+from abbe.service.runs.coverage import about_axis, helix_axis
 
 F1 = NDArray[np.float64]
 Values = NDArray[np.float32]

@@ -1,9 +1,10 @@
-"""Run a job at the console: signals that stop the axes first, the display of progress, and the wait for a safe machine."""
+"""Run a job at the console: signals that stop the axes first, the display of progress, questions, and the wait for a safe machine."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterator
@@ -13,13 +14,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
-from abbe.service.errors import Stopped
+from abbe.service.errors import ConfigError, Stopped
 from abbe.service.sequences.control import Control
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from abbe.service.devices.session import Session
+    from abbe.service.devices.session import Ask, Session
     from abbe.service.domain.progress import Progress, ProgressSink
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
@@ -190,3 +191,64 @@ async def rollback_when_safe(session: Session, store: Store, site: Site, wait_s:
 def print_line(text: str) -> None:
     """Print one line on stderr."""
     typer.echo(text, err=True)
+
+
+async def console_ask(text: str) -> None:
+    """Print what to do and wait for Enter. Input typed before the question is discarded: people confirm only what they have read.
+
+    Raises
+    ------
+    ConfigError
+        No one is at the console (standard input is closed or not a terminal).
+    """
+    import termios  # here: a platform without termios still plans and reads
+
+    if not sys.stdin.isatty():
+        raise ConfigError(f"no one is at the console to: {text}", "run this from a terminal, or configure a remote fixture")
+    # The descriptor itself: Python's buffer would keep a pasted second line for the next question, out of reach of tcflush.
+    line = sys.stdin.fileno()
+    termios.tcflush(line, termios.TCIFLUSH)
+    sys.stderr.write(f"\n>> {text}\n   press Enter when done: ")
+    sys.stderr.flush()
+    if await _entered(line) == b"":
+        raise ConfigError("standard input was closed", "start again from a terminal")
+
+
+def person_at_console() -> Ask:
+    """Return how to ask at this console: the person at the terminal, or `no_console`, which refuses before anything moves."""
+    from abbe.service.devices.session import no_console
+
+    return console_ask if sys.stdin is not None and sys.stdin.isatty() else no_console
+
+
+async def _entered(line: int) -> bytes:
+    """Return what is typed up to Enter; empty when the terminal is gone."""
+    loop = asyncio.get_running_loop()
+    entered: asyncio.Future[bytes] = loop.create_future()
+
+    def ready() -> None:
+        if entered.done():
+            return
+        try:
+            entered.set_result(os.read(line, 4096))
+        except OSError:
+            entered.set_result(b"")  # the terminal is gone
+
+    loop.add_reader(line, ready)
+    try:
+        return await entered
+    finally:
+        loop.remove_reader(line)
+
+
+async def console_confirm(text: str) -> bool:
+    """Ask a yes/no question; the answer is no if no one is at the console."""
+    import termios
+
+    if not sys.stdin.isatty():
+        return False
+    line = sys.stdin.fileno()
+    termios.tcflush(line, termios.TCIFLUSH)
+    sys.stderr.write(f"\n>> {text}\n   type yes, or press Enter for no: ")
+    sys.stderr.flush()
+    return (await _entered(line)).strip().lower() in (b"y", b"yes")

@@ -16,6 +16,7 @@ from typing import Any
 
 from abbe.drivers.api import TableController
 from abbe.models.compensation.tables import Predicted
+from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposal_decisions import valid_approval
@@ -31,7 +32,6 @@ from abbe.service.push.limits import Capabilities, PushLimits
 from abbe.service.push.operations import Approval
 from abbe.service.push.validate import Candidate, CandidateContext, EvidenceSeal, content_digest, promise_reason, reasons_against
 from abbe.service.sequences.control import Control
-from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -12,6 +12,7 @@ from itertools import groupby
 
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
 from abbe.service.campaigns.measure import measure, start_campaign
+from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.devices.session import Session
 from abbe.service.discovery.discover import DiscoveryJob, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of
@@ -21,7 +22,6 @@ from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import version
 from abbe.service.errors import CampaignRefused, UnsafeToMove
 from abbe.service.identification.table_removal import campaign_table
-from abbe.service.sequences.needed import check_devices
 from abbe.service.sequences.steps import CampaignPlan, TestPlan, Unmount
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

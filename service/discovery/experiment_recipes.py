@@ -12,7 +12,7 @@ import numpy as np
 from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.experiment.additions import REPEAT_LATE_S
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.service.domain.run import Run
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run_campaign, paced

@@ -306,7 +306,7 @@ class RunPart:
 
 @dataclass(frozen=True, kw_only=True)
 class RunTiming:
-    """Agreement of the clocks of a ball-bar run (`abbe.service.runs.clocks`).
+    """Agreement of the clocks of a ball-bar run (`abbe.service.runs.sample_columns`).
 
     ``trouble``: their disagreement, empty without one; ``pieces``: of a path that was resumed; ``document``: all figures as stored.
     """

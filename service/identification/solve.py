@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from abbe.models.paths.lines import DIAGONALS, step_diagonal
+from abbe.models.paths import DIAGONALS, step_diagonal
 from abbe.models.solvers.helix import HelixSolution, fit_run
 from abbe.models.solvers.joint import JointSolution, Model, implausible, solve_joint
 from abbe.models.solvers.observations import RunData, nominal_reading

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 
 from abbe.service.campaigns.measure import MeasureOptions, measure
-from abbe.service.campaigns.plausibility import INSTRUMENTS, ended_certificates
+from abbe.service.campaigns.plausibility import BALLBAR, INSTRUMENTS, LASER, ended_certificates
 from abbe.service.capture.live import LiveFeed
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.recover import recovered_session
@@ -18,7 +18,6 @@ from abbe.service.domain.run import Run
 from abbe.service.domain.verification import CheckResult
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
-from abbe.service.sequences.needed import BALLBAR, LASER
 from abbe.service.sequences.recipes.campaigns import recipe_plan
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import site_of

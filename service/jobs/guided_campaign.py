@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from abbe.models.compensation.tables import Predicted
 from abbe.service.campaigns.measure import MeasureOptions, measure, start_campaign
-from abbe.service.campaigns.plausibility import certificates
+from abbe.service.campaigns.plausibility import certificates, check_devices, needed_by
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
 from abbe.service.compensation.recover import recovered_session
@@ -20,7 +20,6 @@ from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, make_proposal, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.needed import check_devices, needed_by
 from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
 from abbe.service.tables.nine_tables import read_base
 

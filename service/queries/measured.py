@@ -12,8 +12,7 @@ from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord, RunFacts, RunRecord
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.queries.reader import Reader, as_stored, finite, of_row, read_as, storable
-from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, pack_bar
-from abbe.service.runs.columns import IMPORTED_CHANNEL, run_document, whole_run
+from abbe.service.runs.columns import BAR_CODEC, IMPORTED_CHANNEL, JSON_CODEC, decode_bar, decode_json, pack_bar, run_document, whole_run
 from abbe.service.sequences.journal import Trouble, not_written, troubles
 from abbe.service.storage.repositories.pages import visible_status
 from abbe.service.storage.store import Store

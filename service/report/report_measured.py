@@ -27,8 +27,7 @@ from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_parts import Rules
 from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
-from abbe.service.runs.coverage import not_judged
-from abbe.service.runs.helix_axis import about_axis, path_axis
+from abbe.service.runs.coverage import about_axis, not_judged, path_axis
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.iso_report import Evaluated, evaluate
 from abbe.service.verification.verify import DIAGONALS, Verdict, figure_rows, figures

@@ -1,25 +1,107 @@
-"""Read stored runs: the only place where raw samples become columns.
+"""Read stored runs: the only place where raw samples become columns. Before that the lossless packing of samples into chunks, pure:
+
+``bar/1``: zlib over ``<IQiH`` (seq, device_us, reading_nm, status) for each ball-bar sample.
+``json/1``: zlib over JSON lines, one record per line, floats as written by Python's ``repr``.
 
 `abbe.service.domain.run_start` describes the documents beside the samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from abbe.drivers.api import BarSample
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord, RunRecord
 from abbe.service.domain.run import Columns, Run, RunTiming, parsed_setup
 from abbe.service.domain.run_start import RunEnd, RunStart
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
-from abbe.service.runs.clocks import RunClock, run_clock
-from abbe.service.runs.codec import BAR_CODEC, JSON_CODEC, decode_bar, decode_json
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.pieces import ReadProgress, counted_columns, progress_of
-from abbe.service.runs.sample_columns import bar_columns, bar_point_columns, laser_columns, starts_in_stream, sync_edges
+from abbe.service.runs.sample_columns import (
+    RunClock,
+    bar_columns,
+    bar_point_columns,
+    laser_columns,
+    run_clock,
+    starts_in_stream,
+    sync_edges,
+)
 from abbe.service.storage.store import Store
+
+BAR_CODEC = "bar/1"
+JSON_CODEC = "json/1"
+_SAMPLE = struct.Struct("<IQiH")
+_LEVEL = 1  # fastest; neighbouring samples differ little, so that a higher level is not worth its time
+
+
+def encode_bar(samples: Sequence[BarSample]) -> bytes:
+    """Pack ball-bar samples in order as a chunk ``bar/1``."""
+    return zlib.compress(pack_bar(samples), _LEVEL)
+
+
+def pack_bar(samples: Sequence[BarSample]) -> bytes:
+    """Ball-bar samples as consecutive ``<IQiH``, uncompressed."""
+    return b"".join(_SAMPLE.pack(one.seq, one.device_us, one.reading_nm, one.status) for one in samples)
+
+
+def decode_bar(payload: bytes) -> list[BarSample]:
+    """Unpack the samples of a chunk ``bar/1`` in order.
+
+    Raises
+    ------
+    StoreError
+        The bytes are not ``bar/1``.
+    """
+    raw = _inflate(payload, BAR_CODEC)
+    if len(raw) % _SAMPLE.size:
+        raise StoreError(
+            f"a chunk of codec {BAR_CODEC} has {len(raw)} bytes, not a multiple of {_SAMPLE.size}", "it was not written by Abbe"
+        )
+    return [BarSample(*fields) for fields in _SAMPLE.iter_unpack(raw)]
+
+
+def encode_json(records: Iterable[dict[str, Any]]) -> bytes:
+    """Pack JSON objects in order as a chunk ``json/1``.
+
+    Raises
+    ------
+    StoreError
+        A number is NaN or infinite.
+    """
+    try:
+        lines = "\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False, separators=(",", ":")) for one in records)
+    except ValueError:
+        raise StoreError("a record with NaN or Infinity is not stored", "give null where there is no value") from None
+    return zlib.compress(lines.encode(), _LEVEL)
+
+
+def decode_json(payload: bytes) -> list[dict[str, Any]]:
+    """Unpack the objects of a chunk ``json/1`` in order.
+
+    Raises
+    ------
+    StoreError
+        The bytes are not ``json/1``.
+    """
+    text = _inflate(payload, JSON_CODEC)
+    try:
+        return [json.loads(line) for line in text.split(b"\n") if line]
+    except ValueError as err:
+        raise StoreError(f"a chunk of codec {JSON_CODEC} does not hold JSON lines ({err})", "it was not written by Abbe") from None
+
+
+def _inflate(payload: bytes, codec: str) -> bytes:
+    try:
+        return zlib.decompress(payload)
+    except zlib.error as err:
+        raise StoreError(f"a chunk of codec {codec} cannot be unpacked ({err})", "it was not written by Abbe") from None
+
 
 BAR_CHANNEL = "bar"
 LASER_CHANNEL = "laser"

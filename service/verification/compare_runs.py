@@ -18,8 +18,7 @@ from abbe.models.verification import U_REPEAT_MM, helix_figure
 from abbe.service.domain.run import Run
 from abbe.service.rendering.document import ReportFigure
 from abbe.service.rendering.numbers import COVERAGE, finite
-from abbe.service.runs.coverage import not_judged
-from abbe.service.runs.helix_axis import about_axis, helix_axis, path_axis
+from abbe.service.runs.coverage import about_axis, helix_axis, not_judged, path_axis
 
 MOST = 4
 NEAR_RAD = 0.05

@@ -11,10 +11,10 @@ import pytest
 
 from abbe.drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
 from abbe.service.campaigns.measure import measure
+from abbe.service.campaigns.plausibility import needed_by
 from abbe.service.compensation.correct import correct
 from abbe.service.compensation.gate import PushContext, admit
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.needed import needed_by
 from abbe.service.sequences.recipes.recipe import HelixPoints
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store

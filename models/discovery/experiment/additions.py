@@ -12,7 +12,7 @@ from abbe.models.discovery.answer import BlindSpot
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, at_rest, driven
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 
 BAR_MIN, LASER_MIN, LINE_MIN, TOOL_MIN, WAIT_MIN, LENGTH_MIN = 10.0, 25.0, 20.0, 15.0, 120.0, 10.0
 """Minutes to set up: ball-bar; laser on one diagonal; laser or angular interferometer on one axis; another tool; a late repeat's wait; a

@@ -17,7 +17,7 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.notation.pahk import PahkType, iso_squareness, motions_from_pahk, pahk_machine, pahk_type
 from abbe.models.papers.pahk.random_errors import RandomErrors, parameter_jacobian
 from abbe.models.papers.pahk.volume_map import Form, ParameterTables, chain_deviation_mm
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends
+from abbe.models.paths import DIAGONALS, diagonal_ends
 from abbe.models.solvers.step_diagonal import squareness_contrast
 
 

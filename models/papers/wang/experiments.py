@@ -10,7 +10,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.monomials import monomials
 from abbe.models.papers.wang.model import diagonal_beam, mirror_normal, monomial_field, step_readings_mm, tilt_axes
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.designs import Field, laser_rows, stacked
 
 Deviation = Callable[[F2], F2]

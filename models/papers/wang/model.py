@@ -15,7 +15,7 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.monomials import ErrorArrays, Monomial, error_arrays, individual_terms
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.models.solvers.step_diagonal import ORDER, checked_increments
 
 CHAIN = "w-b-X-Y-Z-t"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F3
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.models.solvers.step_diagonal import ORDER, checked_increments
 
 

@@ -18,8 +18,7 @@ from abbe.models.functions.monomials import monomials
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.notation.yang import workpiece_mm
 from abbe.models.papers.yang.complete import monomial_field
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.designs import DesignRows, Field, bar_rows, laser_rows, stacked, vector_rows
 
 Problem = tuple[F2, F2]

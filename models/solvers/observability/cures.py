@@ -14,8 +14,7 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
 from abbe.models.machine import AXES, Machine, with_tool
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.least_squares import project_out, singular_values
 from abbe.models.solvers.observability.rank import (
     CampaignColumns,

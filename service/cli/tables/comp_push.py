@@ -114,7 +114,7 @@ def rollback(
 
 async def _confirmed(to: int | None) -> bool:
     """Return whether the person at the console wants the rollback; without a console: no."""
-    from abbe.service.cli.ask import console_confirm
+    from abbe.service.cli.running import console_confirm
 
     which = {None: "from before the last kept push", 0: "from before the first push"}.get(to, f"that was in force after push {to}")
     return await console_confirm(f"The table {which} comes back without a measurement, and the machine is unverified then. Really?")

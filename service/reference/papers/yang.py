@@ -11,7 +11,7 @@ from abbe.models.functions.line_fit import slope_through_origin, straight_line
 from abbe.models.notation.yang import YangErrors, iso_squareness, workpiece_mm
 from abbe.models.papers.yang.complete import delta_exact, reading_eq6, second_order_bound_mm
 from abbe.models.papers.yang.difference import confidence_interval
-from abbe.models.paths.helix import helix_points
+from abbe.models.paths import helix_points
 from abbe.models.solvers.helix import LINEAR, fit_helix, helix_design
 from abbe.service.reference.comparison import Comparison, Erratum
 from abbe.service.reference.papers import yang_printed as paper

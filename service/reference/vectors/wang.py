@@ -19,7 +19,7 @@ from abbe.models.papers.wang.model import (
     step_readings_mm,
 )
 from abbe.models.papers.wang.squareness import AcuteSquareness, diagonal_totals_eq12, squareness_eq13_printed
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.models.solvers.designs import ranks, shortest_solution
 from abbe.models.solvers.step_diagonal import closure_mm, demeaned, increments, squareness_contrast, wang_eq7, wang_four
 from abbe.service.errors import FileFormatError

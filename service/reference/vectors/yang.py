@@ -36,7 +36,7 @@ from abbe.models.papers.yang.experiments import (
     all_helices,
     origin_plan,
 )
-from abbe.models.paths.helix import Law, helix_points
+from abbe.models.paths import Law, helix_points
 from abbe.models.solvers.designs import hidden_combination, map_noise_gain, ranks, shortest_solution
 from abbe.service.errors import FileFormatError
 from abbe.service.reference.vector_checks import Checks

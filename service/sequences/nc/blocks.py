@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from abbe.models.machine import AXES
-from abbe.models.paths.circles import PLANES
+from abbe.models.paths import PLANES
 from abbe.service.sequences.steps import (
     CampaignPlan,
     ChangeBar,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.circles import PLANES
+from abbe.models.paths import PLANES
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Halt, Program, Smooth, program
 from abbe.service.sequences.steps import CampaignPlan, Point

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict
 from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.circles import way_on_sphere
+from abbe.models.paths import way_on_sphere
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
 
 

@@ -18,7 +18,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import as_point
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe

@@ -14,9 +14,21 @@ import numpy as np
 from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
-from abbe.models.paths.circles import Plane, arc_through, circle_points, way_on_sphere
-from abbe.models.paths.helix import Law, even_helix_points, helix_points
-from abbe.models.paths.lines import cycles_of, diagonal_ends, face_ends, step_diagonal, straight_line, target_shares
+from abbe.models.paths import (
+    Law,
+    Plane,
+    arc_through,
+    circle_points,
+    cycles_of,
+    diagonal_ends,
+    even_helix_points,
+    face_ends,
+    helix_points,
+    step_diagonal,
+    straight_line,
+    target_shares,
+    way_on_sphere,
+)
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import (
     BAR_APPROACH_MM,

@@ -11,8 +11,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import design, exact_deviation_mm, travel_sign
 from abbe.models.machine import Machine, with_tool
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import perpendicular, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd

@@ -17,7 +17,7 @@ import numpy as np
 
 from abbe.models.geometry.chain import all_chains
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.models.planning.measurements import BAR_CLEARANCE_MM, DiagonalTest, HelixTest, Instruments, candidates
 from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
 from abbe.models.planning.problem import field_rows, problem

@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 
 Kind = Literal["one_tool", "two_tool", "ballbar_only", "laser_only", "joint"]
 RADII_MM = (50.0, 75.0, 100.0, 150.0, 200.0, 250.0, 300.0)

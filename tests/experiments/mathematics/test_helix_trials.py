@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from abbe.models.paths.helix import helix_points
+from abbe.models.paths import helix_points
 from abbe.models.uncertainty.distributions import Distribution
 from tests.experiments.mathematics import helix_trials as module
 from tests.experiments.mathematics.helix_trials import HelixTask, fit_trials, helix_trials, linear_estimator, linear_trials

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.alignment.dwell import Dwells, PlannedDwell, merged
-from abbe.models.paths.lines import cycles_of
+from abbe.models.paths import cycles_of
 
 SETTLE_S = 0.3
 SAMPLE_S = 0.05

@@ -9,7 +9,7 @@ import pytest
 
 from abbe.models.compensation.sign_probe import Shift, bar_shift, expected_changes, probe, sign_proof, step_tables
 from abbe.models.compensation.tables import NineTables
-from abbe.models.paths.helix import helix_points
+from abbe.models.paths import helix_points
 
 CENTRE = np.array([300.0, 250.0, 157.5])
 PLACES = helix_points(CENTRE, 135.0, turns=3.0, n=12, law="area", axis=2)

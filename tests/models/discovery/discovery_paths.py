@@ -10,8 +10,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, at_rest, driven
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import diagonal_ends, step_diagonal
+from abbe.models.paths import diagonal_ends, helix_points, step_diagonal
 
 MACHINE = Machine("w-X-b-Y-Z-t", np.array([[0.0, 700.0], [0.0, 500.0], [0.0, 450.0]]))
 CENTRE = np.array([350.0, 250.0, 200.0])

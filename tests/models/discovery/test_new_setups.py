@@ -10,7 +10,7 @@ from abbe.models.arrays import F1
 from abbe.models.discovery.case import CaseRun
 from abbe.models.discovery.solved_model import left_over, left_together
 from abbe.models.effects.instruments.bar_thermal import relaxing
-from abbe.models.paths.helix import Law, even_helix_points, helix_points
+from abbe.models.paths import Law, even_helix_points, helix_points
 from abbe.service.runs.cases import case_of
 from tests.models.discovery.discovery_paths import MACHINE, campaign
 from tests.run_documents import runs_of

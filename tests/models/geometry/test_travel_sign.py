@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.models.geometry.chain import travel_sign
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal
 
 
 @given(st.lists(st.floats(300.0, 1200.0), min_size=3, max_size=3), st.integers(2, 30), st.sampled_from(sorted(DIAGONALS)))

@@ -35,7 +35,7 @@ from abbe.models.papers.wang.squareness import (
     squareness_eq13_printed,
     sum_test_mm,
 )
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.models.solvers.step_diagonal import (
     closure_mm,
     demeaned,

@@ -13,7 +13,7 @@ from abbe.models.papers.wang.model import (
     step_readings_mm,
 )
 from abbe.models.papers.wang.squareness import abbe_and_spurious_eq7, closure_of_angles_mm
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, straight_line
 from abbe.models.solvers.step_diagonal import closure_mm, increments, project_eq6, squareness_contrast, u_wang_four, wang_eq7, wang_four
 
 

@@ -20,7 +20,7 @@ from abbe.models.papers.yang.complete import (
 from abbe.models.papers.yang.conditioning import SixParameters, delta_eq2, design_eq9, fit_eq9, spread
 from abbe.models.papers.yang.difference import confidence_interval, model_difference
 from abbe.models.papers.yang.experiments import hemisphere_fits, origin_plan
-from abbe.models.paths.helix import helix_points, helix_points_likely_code
+from abbe.models.paths import helix_points, helix_points_likely_code
 from abbe.models.solvers.helix import fit_helix
 
 STROKE = np.array([[0.0, 812.8], [0.0, 495.0], [0.0, 508.0]])

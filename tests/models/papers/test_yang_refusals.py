@@ -7,7 +7,7 @@ from abbe.models.notation.yang import YangErrors
 from abbe.models.papers.yang.complete import delta_eq1, difference_eq3, measured_mm, reading_eq6, reading_eq8, second_order_bound_mm
 from abbe.models.papers.yang.conditioning import conditioning, fit_eq9
 from abbe.models.papers.yang.experiments import YangPlan, all_helices, hemisphere_fits, origin_plan, vector_map
-from abbe.models.paths.helix import helix_points, helix_points_likely_code
+from abbe.models.paths import helix_points, helix_points_likely_code
 
 STROKE = np.array([[0.0, 812.8], [0.0, 495.0], [0.0, 508.0]])
 SMALL = np.array([[0.0, 300.0], [0.0, 300.0], [0.0, 300.0]])

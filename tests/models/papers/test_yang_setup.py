@@ -6,7 +6,7 @@ import pytest
 from abbe.models.notation.yang import YangErrors
 from abbe.models.papers.yang.complete import delta_eq1
 from abbe.models.papers.yang.conditioning import fit_eq9
-from abbe.models.paths.helix import helix_points
+from abbe.models.paths import helix_points
 from abbe.models.solvers.helix import CONDITION_LIMIT, fit_helix
 
 

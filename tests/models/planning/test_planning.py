@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from abbe.models.geometry.bases import DIRECTIONS
 from abbe.models.geometry.chain import all_chains
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.models.planning.measurements import (
     DiagonalTest,
     HelixTest,

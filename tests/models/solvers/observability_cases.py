@@ -16,8 +16,7 @@ from abbe.models.notation.yang import workpiece_mm
 from abbe.models.papers.wang import model as wang_notation
 from abbe.models.papers.yang.complete import monomial_field
 from abbe.models.papers.yang.experiments import origin_plan
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.observability.rank import (
     Knowledge,
     ObservedInformation,

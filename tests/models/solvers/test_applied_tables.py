@@ -12,8 +12,7 @@ from abbe.models.compensation.tables import NineTables, model_uncertainty_mm, ni
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.applied_tables import LEAD_IN_MM, AppliedTables
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData, block_average

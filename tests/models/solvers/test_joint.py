@@ -11,7 +11,7 @@ import pytest
 from abbe.models.compensation.additive import mean_linear
 from abbe.models.compensation.tables import nine_tables, predict_residual, quantise
 from abbe.models.geometry.volume import field_statistics, remove_rigid, rigid_design, volume_grid
-from abbe.models.paths.lines import diagonal_ends, straight_line
+from abbe.models.paths import diagonal_ends, straight_line
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import block_average, nominal_reading
 from abbe.models.uncertainty.inputs import StatedInputs

@@ -13,8 +13,7 @@ from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import all_chains, design, travel_sign
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.assessment import observability, observability_of, posterior_covariance
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observability.rank import (

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.paths.lines import diagonal_ends, step_diagonal
+from abbe.models.paths import diagonal_ends, step_diagonal
 from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observability.cures import STEP_ORDERS, additions, present
 from abbe.models.solvers.observability.rank import Knowledge

@@ -12,7 +12,7 @@ import pytest
 
 from abbe.models.compensation.achievable import individually_observable
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.assessment import motions_of, observability, observability_of
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observability.rank import as_meant

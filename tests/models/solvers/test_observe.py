@@ -13,8 +13,7 @@ import pytest
 from abbe.models.geometry.bases import smooth_terms, term_values
 from abbe.models.geometry.chain import all_chains, travel_sign
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import linearise, perpendicular, predict, run_design, run_jacobian, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd

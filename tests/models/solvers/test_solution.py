@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.models.solvers.observations import RunData
 from abbe.service.cli.results.solve import _print
 from abbe.service.devices.session import DeviceUrls

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import step_diagonal
+from abbe.models.paths import helix_points, step_diagonal
 from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, refuse, time_issues
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, revision, run_digest, versions
 from abbe.service.campaign_data.run_geometry import geometry_mistake

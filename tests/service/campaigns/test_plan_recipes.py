@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, Instruments, LineTest, laser_path, machine_seconds
 from abbe.models.planning.plan import PlanStep
 from abbe.service.campaigns.plan import describe, plan_for, plan_report, read_instruments, recipe_of

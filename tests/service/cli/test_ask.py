@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from abbe.service.cli.ask import console_ask
+from abbe.service.cli.running import console_ask
 from abbe.service.errors import ConfigError
 from tests.patience import within
 

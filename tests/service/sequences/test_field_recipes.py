@@ -8,8 +8,7 @@ import pytest
 
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
-from abbe.models.paths.circles import arc_through, circle_points, way_on_sphere
-from abbe.models.paths.lines import FACES, cycles_of, face_ends, target_shares
+from abbe.models.paths import FACES, arc_through, circle_points, cycles_of, face_ends, target_shares, way_on_sphere
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run, dry_run_campaign
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run, dry_run_campaign, positions
 from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS
+from abbe.models.paths import DIAGONALS
 from abbe.service.campaign_data.run_geometry import geometry_mistake
 from abbe.service.identification.solve import step_diagonals
 from abbe.service.sequences.recipes.recipe import Diagonal

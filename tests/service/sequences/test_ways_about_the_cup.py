@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from abbe.models.machine import Machine
-from abbe.models.paths.circles import way_on_sphere
+from abbe.models.paths import way_on_sphere
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run
 from abbe.service.sequences.recipes.recipe import Circle

@@ -8,7 +8,7 @@ import pytest
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 from abbe.models.solvers.least_squares import analyse, project_out
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import run_design, setup_unknowns

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from abbe.models.paths.helix import helix_points
+from abbe.models.paths import helix_points
 from abbe.models.solvers.helix import fit_helix, helix_design
 from abbe.models.solvers.least_squares import analyse
 from abbe.service.reference.vector_results import check_file

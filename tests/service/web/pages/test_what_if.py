@@ -12,8 +12,7 @@ from abbe.models.geometry.bases import term_values
 from abbe.models.geometry.chain import design, deviation_mm
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, straight_line
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns, predict
 from abbe.models.uncertainty.coverage import apart_from_zero

@@ -1,1 +1,0 @@
-"""Geometry of the tests, shared by sequences and solvers."""
