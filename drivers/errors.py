@@ -1,10 +1,12 @@
-"""Errors of devices and links. Each names the device, the operation, what happened and a remedy."""
+"""Errors of devices and links, each with the device, the operation, what happened and a remedy; and clean-up that ends in spite of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any, TypeVar
 
 NO_RUN = "no run"
 _RUN: ContextVar[str] = ContextVar("run", default=NO_RUN)
@@ -105,3 +107,31 @@ class LossyLine(DriverError):
     """The line lost more than 0.1 % of the samples of a run: the rest is not reliable."""
 
     code = "DRV-011"
+
+
+T = TypeVar("T")
+
+
+async def run_to_end(work: Coroutine[Any, Any, T]) -> T:
+    """Run a short clean-up to its end, regardless of cancellations, and return its result.
+
+    ``work`` must have its own timeout: nothing else can end it.
+
+    Raises
+    ------
+    asyncio.CancelledError
+        After the end of the work, if the caller was cancelled during it: a cancellation is delayed, never swallowed.
+    """
+    task = asyncio.ensure_future(work)
+    interrupted: asyncio.CancelledError | None = None
+    while not task.done():
+        try:
+            # wait() leaves the task alone when we are cancelled; awaiting the task itself would cancel it
+            await asyncio.wait([task])
+        except asyncio.CancelledError as error:
+            interrupted = error
+    if interrupted is not None:
+        if not task.cancelled():
+            task.exception()  # marks it as retrieved: the caller gets the cancellation instead
+        raise interrupted
+    return task.result()

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.solvers.observations import RunData, nominal_reading
-from abbe.models.solvers.observe import bar_normals
+from abbe.models.solvers.observations import RunData, bar_normals, nominal_reading
 from abbe.models.solvers.priors import U_WAVELENGTH
 
 U_REPEAT_MM = 1e-4

@@ -8,11 +8,11 @@ from contextlib import asynccontextmanager
 
 from abbe.drivers.api import BarBatch, BarTap, DeviceInfo
 from abbe.drivers.ballbar import frames
-from abbe.drivers.ballbar.conversation import Box, Conversation
-from abbe.drivers.ballbar.frames import BarCounters, Framing
-from abbe.drivers.ballbar.stream import SLOW, SegmentEnd, Stream
+from abbe.drivers.ballbar.frames import BarCounters, Conversation, Framing
+from abbe.drivers.ballbar.stream import SLOW, OtherPace, OtherSettings, Reads, SegmentEnd, Stream
 from abbe.drivers.errors import (
     Backpressure,
+    DeviceFault,
     DriverError,
     LinkDown,
     LossyLine,
@@ -21,11 +21,11 @@ from abbe.drivers.errors import (
     ReplyTimeout,
     SettingsChanged,
     WrongDevice,
+    run_to_end,
 )
 from abbe.drivers.links.incidents import Backoff, Incidents
 from abbe.drivers.links.reading import Ring
 from abbe.drivers.links.serial_link import ByteLink
-from abbe.drivers.links.shielded import run_to_end
 
 _ANSWER_S = 1.0
 _SAMPLE_TIMEOUT_S = 1.0
@@ -34,6 +34,95 @@ _FRAME_BYTES = 24
 _DRAIN_S = 10.0
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
 _MAX_RATE_HZ = 1000
+_SETTINGS_FIRMWARE = 0x0101
+_RESTORE = "the box's settings were changed: set them back (restore_settings), then measure this test again"
+
+
+class Box:
+    """Identity and settings of the box, which must not change. Accepts only ``serial_no``; None: the first box that answers."""
+
+    def __init__(self, name: str, talk: Conversation, serial_no: int | None) -> None:
+        self.boot_id: int | None = None
+        self.settings: frames.BoxSettings | None = None
+        self._name, self._talk, self._serial_no = name, talk, serial_no
+        self._first: frames.BoxSettings | None = None
+        self._max_rate_hz = 0
+
+    @property
+    def reads(self) -> Reads | None:
+        """Change counter and measuring range of the settings; None if the box does not report them."""
+        return None if self.settings is None else Reads(self.settings.number, self.settings.range_nm)
+
+    async def accept(self) -> frames.Info:
+        """Read identity and settings, and accept the boot id as the current one.
+
+        Raises
+        ------
+        WrongDevice
+            Another box.
+        LinkDown, ReplyTimeout, BadFrame
+            The wire.
+        """
+        info = await self._talk.identify()
+        if self._serial_no not in (None, info.serial_no):
+            detail = f"the box with serial number {info.serial_no} answers instead of {self._serial_no}"
+            raise WrongDevice(self._name, "identify", detail, "plug in the right box, or configure this one as a device of its own")
+        if info.firmware >= _SETTINGS_FIRMWARE:
+            self.settings = await self._talk.settings()
+            self._first = self._first or self.settings
+        self.boot_id, self._serial_no, self._max_rate_hz = info.boot_id, info.serial_no, info.max_rate_hz
+        return info
+
+    async def peek(self) -> int:
+        """Read the boot id without accepting it; errors of the wire as for `accept`."""
+        return (await self._talk.identify()).boot_id
+
+    async def check_boot(self) -> None:
+        """Read identity and settings again; raises as `accept`, and ``Rebooted`` if the box restarted."""
+        known = self.boot_id
+        info = await self.accept()
+        if known not in (None, info.boot_id):
+            self.boot_id = known
+            raise self.rebooted(f"boot id {info.boot_id:#x} instead of {known:#x}")
+
+    def check_settings(self) -> None:
+        """Raise ``SettingsChanged`` if unit, range or zero differ from the first ones, or the unit is inches."""
+        now, first = self.settings, self._first
+        if now is None or first is None:
+            return
+        if (now.unit, now.range_nm, now.zero_nm) != (first.unit, first.range_nm, first.zero_nm):
+            detail = f"the box is set to {frames.reading_text(now)} instead of {frames.reading_text(first)}"
+            raise SettingsChanged(self._name, "start stream", detail, _RESTORE)
+        if now.unit != frames.NANOMETRE:
+            raise SettingsChanged(self._name, "start stream", "the box shows inches", "switch it to millimetres, then open it anew")
+
+    def check_can(self, rate_hz: int, range_mm: float) -> None:
+        """Raise ``Refused`` if rate or stroke exceed the box's; limits that the box does not report are not checked."""
+        if 0 < self._max_rate_hz < rate_hz:
+            detail = f"{rate_hz} Hz are wanted, the box sends at most {self._max_rate_hz}"
+            raise Refused(self._name, "check", detail, "choose a lower rate")
+        if self.settings is not None and self.settings.range_nm < range_mm * 1e6:
+            detail = f"its range is set to +-{self.settings.range_nm * 1e-6:g} mm, needed are {range_mm:g}"
+            raise Refused(self._name, "check", detail, "set a larger range at the box")
+
+    async def restore(self) -> None:
+        """Restore the first unit, range and zero; raises as `accept`, and ``Refused``."""
+        first = self._first
+        if first is not None:
+            await self._talk.command(frames.CONFIGURE, lambda tag: frames.configure_command(tag, first.unit, first.range_nm, first.zero_nm))
+        await self.accept()
+
+    def error_of(self, end: SegmentEnd) -> DriverError:
+        """Return the error of a stream that cannot continue."""
+        if isinstance(end, OtherSettings):
+            return SettingsChanged(self._name, "stream", str(end), _RESTORE)
+        if isinstance(end, OtherPace):
+            return DeviceFault(self._name, "stream", str(end), "did another program set or restart the box? then measure this test again")
+        return self.rebooted(str(end))
+
+    def rebooted(self, detail: str) -> Rebooted:
+        """Return the error of a box that restarted."""
+        return Rebooted(self._name, "stream", detail, "the box restarted: call identify, then measure this test again")
 
 
 class SerialBallBar:

@@ -1,4 +1,8 @@
-"""Ball-bar frames <-> bytes (docs/protocols/ballbar.md). Pure and total: any bytes give frames or counted bad bytes, never an exception."""
+"""Ball-bar frames <-> bytes (docs/protocols/ballbar.md), the thread that makes frames of bytes, and requests with their replies.
+
+Decoding is pure and total: any bytes give frames or counted bad bytes, never an exception. Replies are matched by tag, so that a late reply
+never passes for that of another request.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +10,13 @@ import asyncio
 import struct
 import threading
 from binascii import crc_hqx
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
 from abbe.drivers.api import BarSample
-from abbe.drivers.ballbar import frames
 from abbe.drivers.ballbar.stream import SegmentEnd, Stream
+from abbe.drivers.errors import BadFrame, DriverError, LinkDown, Refused, ReplyTimeout
 from abbe.drivers.links.reading import Ring
 
 SYNC = b"\xa5\x5a"
@@ -244,7 +248,7 @@ class Framing:
         name: str,
         ring: Ring,
         counters: BarCounters,
-        answered: Callable[[frames.Answer], None],
+        answered: Callable[[Answer], None],
         restarted: Callable[[Stream, SegmentEnd], None],
         broken: Callable[[Exception], None],
     ) -> None:
@@ -272,7 +276,7 @@ class Framing:
         await asyncio.to_thread(self._thread.join, _STOP_S)
 
     def _run(self) -> None:
-        decoder = frames.FrameDecoder()
+        decoder = FrameDecoder()
         try:
             while (pieces := self.ring.take(_TAKE_S)) is not None:
                 for piece in pieces:
@@ -282,13 +286,13 @@ class Framing:
         except Exception as error:  # noqa: BLE001 - a silent end of the thread would look like a silent box
             self._call_in_loop(self._broken, error)
 
-    def _sort(self, host_s: float, received: list[frames.Frame]) -> None:
+    def _sort(self, host_s: float, received: list[Frame]) -> None:
         samples: list[BarSample] = []
         self._counters.frames += len(received)
         for frame in received:
             if type(frame) is BarSample:
                 samples.append(frame)
-            elif isinstance(frame, frames.Bad):
+            elif isinstance(frame, Bad):
                 self._counters.bad_bytes += frame.n_bytes
                 self._counters.bad_frames += frame.reason == "check sum"
                 self._counters.frames -= 1
@@ -324,3 +328,119 @@ class Framing:
     def _call_in_loop(self, call: Callable[..., None], *arguments: object) -> None:
         with suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(call, *arguments)
+
+
+_DRAIN_S = 10.0
+_OPERATION = {START: "start stream", STOP: "stop stream", CONFIGURE: "set range and zero"}
+
+
+class Conversation:
+    """Sends requests to the box, one by one or concurrently, and waits for their replies.
+
+    Parameters
+    ----------
+    send : callable
+        Opens the line if necessary, and sends the bytes.
+    counters : BarCounters
+        Of the line: whether any frame was valid distinguishes a silent box from a wrong baud rate.
+    answer_s : callable
+        Longest time of a reply, s.
+    backlog : callable
+        Fill of the ring between reading and framing: a reply may wait behind samples for a slow disk.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        send: Callable[[bytes], Awaitable[None]],
+        counters: BarCounters,
+        answer_s: Callable[[], float],
+        backlog: Callable[[], float],
+    ) -> None:
+        self._name, self._send, self._counters, self._answer_s, self._backlog = name, send, counters, answer_s, backlog
+        self._open: dict[int, asyncio.Future[Answer]] = {}
+        self._tag = 0
+
+    async def identify(self) -> Info:
+        """Read the identity of the box.
+
+        Raises
+        ------
+        LinkDown, ReplyTimeout, BadFrame
+            No connection, no reply, or an invalid one.
+        """
+        answer = await self._ask(identify_command, "identify")
+        if not isinstance(answer, Info):
+            raise BadFrame(self._name, "identify", "an ACK came instead of the INFO", "is this a ball-bar box of protocol version 1?")
+        return answer
+
+    async def settings(self) -> BoxSettings:
+        """Read the settings of the box (firmware 1.1 and later); errors as for ``identify``."""
+        answer = await self._ask(read_settings_command, "read settings")
+        if not isinstance(answer, BoxSettings):
+            raise BadFrame(self._name, "read settings", "an ACK came instead of the SETTINGS", "is the firmware really 1.1 or later?")
+        return answer
+
+    async def command(self, kind: int, make: Callable[[int], bytes]) -> None:
+        """Send a command of this type, which ``make`` builds from its tag, and wait for its ACK.
+
+        Raises
+        ------
+        Refused
+            The box refused the command.
+        LinkDown, ReplyTimeout, BadFrame
+            As for ``identify``.
+        """
+        operation = _OPERATION[kind]
+        answer = await self._ask(make, operation)
+        if not isinstance(answer, Ack) or answer.command != kind:
+            raise BadFrame(self._name, operation, "the answer belongs to another command", "is another program talking to this box?")
+        if answer.result:
+            remedy = "is the rate one the box can do?" if kind == START else "look at the box"
+            raise Refused(self._name, operation, ACK_TEXT.get(answer.result, f"result {answer.result}"), remedy)
+
+    def answered(self, frame: Answer) -> None:
+        """Deliver a reply; drop it if no request waits for it."""
+        future = self._open.get(frame.tag)
+        if future is not None and not future.done():
+            future.set_result(frame)
+
+    def fail(self, error: LinkDown) -> None:
+        """Fail all waiting requests with this error."""
+        for future in self._open.values():
+            if not future.done():
+                future.set_exception(error)
+
+    def forget(self) -> None:
+        """Stop waiting for replies."""
+        self._open.clear()
+
+    async def _ask(self, make: Callable[[int], bytes], operation: str) -> Answer:
+        self._tag = tag = self._tag % 0xFFFF + 1
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._open[tag] = future
+        understood, bad = self._counters.frames, self._counters.bad_bytes
+        try:
+            await self._send(make(tag))
+            return await self._waited(future)
+        except TimeoutError as error:
+            if isinstance(error, DriverError):
+                raise
+            if self._counters.bad_bytes > bad and self._counters.frames == understood:
+                detail = f"{self._counters.bad_bytes - bad} bytes came, but not one frame of a ball-bar box"
+                raise BadFrame(self._name, operation, detail, "baud rate and parity as on the box? is it a ball-bar box at all?") from None
+            detail = f"no answer within {self._answer_s():g} s"
+            raise ReplyTimeout(self._name, operation, detail, "box on? baud rate and port right?") from None
+        finally:
+            self._open.pop(tag, None)
+
+    async def _waited(self, future: asyncio.Future[Answer]) -> Answer:
+        loop = asyncio.get_running_loop()
+        last_s = loop.time() + _DRAIN_S
+        while True:
+            try:
+                async with asyncio.timeout(self._answer_s()):
+                    return await asyncio.shield(future)
+            except TimeoutError as error:
+                if isinstance(error, DriverError) or not self._backlog() or loop.time() > last_s:
+                    raise

@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from abbe.drivers.api import BarBatch, BarSample, BarTap
+from abbe.drivers.api import BarBatch, BarSample, BarTap, bar_is_out, overran
 from abbe.drivers.errors import Backpressure, BadFrame, DriverError, LossyLine
-from abbe.drivers.flags import bar_is_out, overran
 
 _WRAP = 1 << 32
 _HALF = _WRAP // 2

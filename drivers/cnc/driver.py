@@ -9,9 +9,8 @@ from contextlib import asynccontextmanager
 from abbe.drivers.api import Condition, ControllerStatus, Point
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.banks import Banks
-from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout
+from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout, run_to_end
 from abbe.drivers.links.modbus_link import ModbusLink, ModbusOperation
-from abbe.drivers.links.shielded import run_to_end
 from abbe.drivers.links.words import next_number, run_numbered
 
 _POLL_S = 0.003

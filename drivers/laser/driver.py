@@ -6,9 +6,8 @@ import asyncio
 import time
 from collections.abc import Sequence
 
-from abbe.drivers.api import DeviceInfo, LaserReading
+from abbe.drivers.api import DeviceInfo, LaserFlag, LaserReading, beam_is_gone, is_zeroed
 from abbe.drivers.errors import DeviceFault, Rebooted, Refused, ReplyTimeout, WrongDevice
-from abbe.drivers.flags import LaserFlag, beam_is_gone, is_zeroed
 from abbe.drivers.links.modbus_link import ModbusLink, ModbusOperation
 from abbe.drivers.links.words import Register, RegisterBlock, check_clock, check_identity, next_number, run_numbered
 

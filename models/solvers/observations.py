@@ -187,3 +187,10 @@ def nominal_reading(run: RunData) -> F1:
     if run.centre_mm is None or run.radius_mm is None:
         return np.zeros(run.deviation_mm.size)
     return np.asarray(np.linalg.norm(run.axes_mm - run.centre_mm, axis=1) - run.radius_mm)
+
+
+def bar_normals(run: RunData) -> F2:
+    """Unit vectors from the nominal cup to the commanded positions, shape (n, 3)."""
+    assert run.centre_mm is not None
+    d = run.axes_mm - run.centre_mm
+    return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))

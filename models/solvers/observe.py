@@ -254,7 +254,6 @@ class AxisPlaces:
 
 __all__ = [
     "SetupUnknowns",
-    "bar_normals",
     "linearise",
     "perpendicular",
     "predict",
@@ -296,13 +295,6 @@ def linearise(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Se
     """`predict` and `run_jacobian` at once, for a step of an iteration."""
     at = _of(machine, terms, run, setup, theta)
     return at.reading(), at.jacobian()
-
-
-def bar_normals(run: RunData) -> F2:
-    """Unit vectors from the nominal cup to the commanded positions, shape (n, 3)."""
-    assert run.centre_mm is not None
-    d = run.axes_mm - run.centre_mm
-    return np.asarray(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)

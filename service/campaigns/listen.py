@@ -14,10 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.api import ControllerStatus, LaserReading, Point
-from abbe.drivers.errors import DriverError
-from abbe.drivers.flags import air_is_compensated
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.api import ControllerStatus, LaserReading, Point, air_is_compensated
+from abbe.drivers.errors import DriverError, run_to_end
 from abbe.models.alignment.clock import ClockFit, fit_clock
 from abbe.models.alignment.dwell import DwellReading, Dwells, PlannedDwell, detect, merged, named
 from abbe.models.alignment.lag import Lag, fit_lag

@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
-from abbe.drivers.errors import DriverError
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import DriverError, run_to_end
 from abbe.service.campaigns.campaign_run import (
     BarBreaks,
     CampaignRun,

@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from abbe.drivers.api import beam_is_good, is_zeroed
 from abbe.drivers.errors import DriverError
-from abbe.drivers.flags import beam_is_good, is_zeroed
 from abbe.service.campaigns.campaign_run import (
     Confirm,
     Item,

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from abbe.drivers.api import BarBatch, BarSample
-from abbe.drivers.flags import bar_is_valid, bar_reasons, overran
+from abbe.drivers.api import BarBatch, BarSample, bar_is_valid, bar_reasons, overran
 from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.segment import CHUNK, CLOSE, GAP, OPEN, Record, Scan
 from abbe.service.domain.measured import ChunkRecord

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from abbe.drivers.api import BarBatch, Point
-from abbe.drivers.flags import bar_is_valid, on_path
+from abbe.drivers.api import BarBatch, Point, bar_is_valid, on_path
 from abbe.service.domain.bounds import WORD
 from abbe.service.domain.progress import RecordedPath
 from abbe.service.runs.coverage import about_axis, helix_axis

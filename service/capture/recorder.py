@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.drivers.api import BarBatch
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import run_to_end
 from abbe.service.capture.ingest import Ingest
 from abbe.service.capture.ledger import BAR, Drafter, Item, SampleGap, joined, streams_doc
 from abbe.service.capture.segment import CHUNK, GAP, FileIO, RealFileIO, Record, Reserve, Segment, fault

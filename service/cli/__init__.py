@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import io
@@ -38,12 +39,11 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
     from abbe.drivers.errors import DriverError
     from abbe.service.cli.app import app
-    from abbe.service.cli.plain_text import degrade
     from abbe.service.errors import AbbeError
 
     if sys.stdout is None:
         sys.stdout = _Closed()
-    degrade()
+    _degrade()
     if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:  # the usual option
         arguments = ["version"]
     try:
@@ -92,3 +92,62 @@ def complain(code: str, text: str) -> int:
     if sys.stderr is not None:  # closed: only the exit code remains
         sys.stderr.write(f"error {code}: {visible(mask_secrets(' '.join(text.split())))}\n")
     return BAD_INPUT
+
+
+PLAIN_ERRORS = "abbe-plain"
+PLAIN = {
+    "µ": "u",
+    "μ": "u",
+    "±": "+-",
+    "×": "x",
+    "·": "*",
+    "°": "deg",
+    "²": "^2",
+    "³": "^3",
+    "−": "-",
+    "–": "-",
+    "—": "-",
+    "…": "...",
+    "→": "->",
+    "←": "<-",
+    "↔": "<->",
+    "≤": "<=",
+    "≥": ">=",
+    "≈": "~",
+    "≠": "!=",
+    "√": "sqrt",
+    "∞": "inf",
+    "σ": "sigma",
+    "Δ": "delta",
+    "’": "'",
+    "‘": "'",
+    "“": '"',
+    "”": '"',
+    "✔": "ok",
+    "✖": "x",
+}
+
+
+def _degrade() -> None:
+    """Make stdout and stderr replace characters missing in their encoding: by plain letters, or ``?`` where there are none."""
+    codecs.register_error(PLAIN_ERRORS, _plain)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=PLAIN_ERRORS)
+
+
+def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    out = []
+    for one in error.object[error.start : error.end]:
+        if 0xDC80 <= ord(one) <= 0xDCFF:  # a byte of a file name that is not text: show its escape
+            out.append(f"\\x{ord(one) - 0xDC00:02x}")
+            continue
+        text = PLAIN.get(one, "?")
+        try:
+            text.encode(error.encoding)
+        except UnicodeEncodeError:
+            text = "?"
+        out.append(text)
+    return "".join(out), error.end

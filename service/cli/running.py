@@ -77,7 +77,7 @@ async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int],
     assert task is not None
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        # A second signal cancels once more: what must reach the machine is shielded from it (abbe.drivers.links.shielded).
+        # A second signal cancels once more: what must reach the machine is shielded from it (abbe.drivers.errors).
         received.append(number)
         gently = control is not None and number == signal.SIGINT and len(received) == 1
         if control is not None:  # code that mistakes the cancellation for something else still sees the request

@@ -17,8 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, fields
 
 from abbe.drivers.api import BankState, CompStatus, Controller, ControllerStatus, Point
-from abbe.drivers.errors import DeviceFault, Refused
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import DeviceFault, Refused, run_to_end
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof

@@ -13,8 +13,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 
 from abbe.drivers.api import TableController
-from abbe.drivers.errors import DriverError
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import DriverError, run_to_end
 from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.service.clock import Clock, SystemClock

@@ -13,8 +13,7 @@ from contextlib import asynccontextmanager
 from dataclasses import replace
 
 from abbe.drivers.api import BankState, Controller, Identity, TableController
-from abbe.drivers.errors import DriverError
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import DriverError, run_to_end
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.pushing import pushes_here

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import run_to_end
 from abbe.service.campaigns.measure import measure
 from abbe.service.children import python_command
 from abbe.service.clock import Clock, SystemClock

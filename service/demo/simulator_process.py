@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import run_to_end
 from abbe.service.children import python_command
 from abbe.service.errors import AbbeError
 

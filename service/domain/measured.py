@@ -8,15 +8,187 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
+import numpy as np
+
+from abbe.models.arrays import F1, F2
 from abbe.service.domain.document import Doc, DocumentRow, HistoryRow
-from abbe.service.domain.run_start import RunEnd, RunStart
+from abbe.service.domain.run import RunTable
 from abbe.service.errors import StoreError
+
+
+@dataclass(frozen=True, slots=True)
+class RunPiece:
+    """An interrupted run, and the position on the whole path up to which its readings count, mm from the first point."""
+
+    run: int
+    to_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CommandedPath:
+    """The path of a ball-bar run, a polyline at constant feed.
+
+    ``points_mm``: shape (n, 3), from the machine's position at the start of the path; ``measured``: numbers of the first and last point
+    between which readings count, None: all count. A path that was interrupted and resumed (`abbe.service.sequences.resume_plan`) begins
+    ``offset_mm`` behind the start of the whole path, and the readings of the interrupted ``pieces`` belong to it.
+    """
+
+    points_mm: F2
+    feed_mm_min: float
+    direction: int
+    measured: tuple[int, int] | None
+    offset_mm: float
+    pieces: tuple[RunPiece, ...]
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse ``path`` of a start document."""
+        measured = doc.get("measured")
+        return cls(
+            points_mm=np.asarray(doc["points_mm"], dtype=np.float64).reshape(-1, 3),
+            feed_mm_min=float(doc["feed_mm_min"]),
+            direction=int(doc["direction"]),
+            measured=(int(measured[0]), int(measured[1])) if measured else None,
+            offset_mm=float(doc.get("offset_mm", 0.0)),
+            pieces=tuple(RunPiece(int(one["run"]), float(one["to_mm"])) for one in doc.get("pieces", ())),
+        )
+
+    @property
+    def feed_mm_s(self) -> float:
+        """The feed in mm/s."""
+        return self.feed_mm_min / 60.0
+
+    @property
+    def arc_mm(self) -> F1:
+        """Length of the path up to each of its points, mm, shape (n,)."""
+        return arc_of(self.points_mm)
+
+    @property
+    def counted_mm(self) -> tuple[float, float]:
+        """Where the readings begin and end to count, mm along this path."""
+        arc = self.arc_mm
+        first, last = self.measured or (0, len(arc) - 1)
+        return float(arc[first]), float(arc[last])
+
+
+def arc_of(points_mm: F2 | Sequence[Sequence[float]]) -> F1:
+    """Length of a polyline up to each of its points, mm."""
+    steps = np.linalg.norm(np.diff(np.asarray(points_mm, dtype=np.float64), axis=0), axis=1)
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunStart:
+    """What is known when a run begins.
+
+    ``ctrl0_us``: zero of the campaign's clock in controller time; ``clock_us``: controller time when the document was written;
+    ``path_start_us``: of the path, if known; ``standstills``: planned number of readings at standstill. A ball-bar run whose ``setup``
+    states the number of ``samples`` was read point by point (``point_by_point``): it has no path, and records like those of a laser run.
+    ``imported``: an imported run as it was, without its columns; ``entry``: its line in the campaign's file.
+    """
+
+    setup: Doc
+    machine: Doc
+    ctrl0_us: int
+    rate_hz: float
+    path: CommandedPath | None
+    table: RunTable
+    clock_us: int | None
+    path_start_us: int | None
+    standstills: int
+    imported: Doc | None = field(repr=False)
+    entry: Doc | None
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse a start document; what is missing is empty or zero."""
+        imported: Doc | None = doc.get("imported")
+        path = doc.get("path")
+        return cls(
+            setup=doc.get("setup") or {},
+            machine=doc.get("machine") or {},
+            ctrl0_us=int(doc.get("ctrl0_us", 0)),
+            rate_hz=float(doc.get("rate_hz", 1.0)),
+            path=CommandedPath.from_document(path) if path else None,
+            table=RunTable.from_document((doc if imported is None else imported).get("table")),
+            clock_us=(doc.get("clock") or {}).get("ctrl_us"),
+            path_start_us=doc.get("path_start_us"),
+            standstills=int(doc.get("standstills") or 0),
+            imported=imported,
+            entry=doc.get("entry"),
+        )
+
+    @property
+    def pieces(self) -> tuple[RunPiece, ...]:
+        """The interrupted runs whose readings belong to this one, oldest first; empty for a run without interruption."""
+        return () if self.path is None else self.path.pieces
+
+    @property
+    def point_by_point(self) -> bool:
+        """Whether a ball-bar was read at standstill."""
+        return "samples" in self.setup
+
+    @property
+    def commanded(self) -> CommandedPath:
+        """Commanded path of the run.
+
+        Raises
+        ------
+        KeyError
+            The run has no path.
+        """
+        if self.path is None:
+            raise KeyError("path")
+        return self.path
+
+    def since_zero_s(self, ctrl_us: float) -> float:
+        """Seconds of the campaign's clock at a controller time in µs."""
+        return float(ctrl_us - self.ctrl0_us) * 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunEnd:
+    """What is known when a run ends; all None or empty without an end document.
+
+    ``path_start_us``, ``path_end_us``: of the path, in controller time; ``good_us``, ``box_boot_id``: how far an interrupted path came at
+    constant feed, and the start of the box; ``clock_pairs``: controller time (µs) and arrival (host s) of statuses; ``mounted_us``: of cup
+    or laser in controller time, after the start document was written.
+    """
+
+    path_start_us: int | None = None
+    path_end_us: int | None = None
+    good_us: int | None = None
+    box_boot_id: int | None = None
+    mounted_us: int | None = None
+    clock_pairs: tuple[tuple[float, float], ...] = ()
+
+    @classmethod
+    def from_document(cls, doc: Doc | None) -> Self:
+        """Parse an end document; None counts as empty."""
+        known = doc or {}
+        pairs = tuple((float(ctrl_us), float(host_s)) for ctrl_us, host_s in known.get("clock_pairs", ()))
+        return cls(
+            path_start_us=known.get("path_start_us"),
+            path_end_us=known.get("path_end_us"),
+            good_us=known.get("good_us"),
+            box_boot_id=known.get("box_boot_id"),
+            mounted_us=known.get("mounted_us"),
+            clock_pairs=pairs,
+        )
+
+    @property
+    def path_us(self) -> tuple[int, int] | None:
+        """Start and end of the path in controller time; None unless it ran to its end."""
+        if not self.path_end_us or self.path_start_us is None:
+            return None
+        return self.path_start_us, self.path_end_us
+
 
 UNKNOWN = "?"
 """Start time of a living process if the system does not show it; only its pid identifies such a process."""

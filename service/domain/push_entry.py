@@ -82,7 +82,7 @@ FOLLOWS: dict[PushState | None, frozenset[PushState]] = {
 class PushTransition:
     """One transition of one push, chained by ``prev`` to the entry before it in the same journal.
 
-    ``number``: given by the database; ``machine``: name of the journal (`abbe.service.storage.repositories.decisions.chain_of`); ``push``:
+    ``number``: given by the database; ``machine``: name of the journal (`abbe.service.storage.repositories.results.chain_of`); ``push``:
     number of the push in it; ``seq``: number of the entry in its push, from 0; ``utc``: for people; ``prev``, ``digest``: SHA-256 of the
     entry before (of any push of the machine) and of this one.
     """

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from abbe.models.paths import DIAGONALS, step_diagonal
 from abbe.models.solvers.helix import HelixSolution, fit_run
 from abbe.models.solvers.joint import JointSolution, Model, implausible, solve_joint
-from abbe.models.solvers.observations import RunData, nominal_reading
-from abbe.models.solvers.observe import bar_normals, setup_unknowns
+from abbe.models.solvers.observations import RunData, bar_normals, nominal_reading
+from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import U_WAVELENGTH, Priors
 from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
 from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, check_readings, copy_issues, refuse

@@ -3,7 +3,7 @@
 ``bar/1``: zlib over ``<IQiH`` (seq, device_us, reading_nm, status) for each ball-bar sample.
 ``json/1``: zlib over JSON lines, one record per line, floats as written by Python's ``repr``.
 
-`abbe.service.domain.run_start` describes the documents beside the samples.
+`abbe.service.domain.measured` describes the documents beside the samples.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from typing import Any
 
 from abbe.drivers.api import BarSample
 from abbe.service.domain.document import Doc
-from abbe.service.domain.measured import ChunkRecord, RunRecord
+from abbe.service.domain.measured import ChunkRecord, RunEnd, RunRecord, RunStart
 from abbe.service.domain.run import Columns, Run, RunTiming, parsed_setup
-from abbe.service.domain.run_start import RunEnd, RunStart
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.pieces import ReadProgress, counted_columns, progress_of

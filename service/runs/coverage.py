@@ -14,9 +14,8 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
-from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.measured import RunRecord, RunStart
 from abbe.service.domain.run import BarSetup, Run, RunState
-from abbe.service.domain.run_start import RunStart
 from abbe.service.errors import AbbeError, MeasurementFault
 
 STRAIGHT = 0.8

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.measured import RunEnd, RunPiece, RunRecord, RunStart
 from abbe.service.domain.run import Columns
-from abbe.service.domain.run_start import RunEnd, RunPiece, RunStart
 
 STRETCH_S, STRETCH_MM = 0.5, 5.0
 """Duration, and least length, of the stretch that is read twice."""

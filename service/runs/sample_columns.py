@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from abbe.drivers.api import BarSample
-from abbe.drivers.flags import bar_is_valid, beam_is_gone, on_path
+from abbe.drivers.api import BarSample, bar_is_valid, beam_is_gone, on_path
 from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, breaks, fit_clock, relative_rate
 from abbe.models.arrays import F1
 from abbe.service.domain.document import Doc
-from abbe.service.domain.measured import ChunkRecord
+from abbe.service.domain.measured import ChunkRecord, CommandedPath, RunEnd, RunStart
 from abbe.service.domain.run import Columns
-from abbe.service.domain.run_start import CommandedPath, RunEnd, RunStart
 from abbe.service.errors import MeasurementFault
 
 U_DELAY_S = 2e-3

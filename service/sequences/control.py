@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, TypeVar
 
-from abbe.drivers.api import Condition, ControllerStatus, LaserReading
-from abbe.drivers.flags import beam_is_gone, beam_is_good
+from abbe.drivers.api import Condition, ControllerStatus, LaserReading, beam_is_gone, beam_is_good
 from abbe.service.domain.progress import Progress
 from abbe.service.errors import (
     Aborted,

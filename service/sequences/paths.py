@@ -9,10 +9,8 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
-from abbe.drivers.api import BarBatch, Condition, ControllerStatus, Motion, Paths
-from abbe.drivers.errors import DriverError
-from abbe.drivers.flags import bar_is_out, bar_is_valid, on_path
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.api import BarBatch, Condition, ControllerStatus, Motion, Paths, bar_is_out, bar_is_valid, on_path
+from abbe.drivers.errors import DriverError, run_to_end
 from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, BarOutOfRange, MeasurementFault, RunInterrupted
 from abbe.service.runs.recorder import Recorder

@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.api import BarSample, ControllerStatus
-from abbe.drivers.flags import bar_is_valid, on_path
+from abbe.drivers.api import BarSample, ControllerStatus, bar_is_valid, on_path
 from abbe.models.arrays import F1
-from abbe.service.domain.run_start import RunPiece, arc_of
+from abbe.service.domain.measured import RunPiece, arc_of
 from abbe.service.errors import RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, ReadProgress
 from abbe.service.sequences.recipes.approach import cup_of, over_pole

@@ -7,9 +7,8 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point
+from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point, air_is_compensated, bar_is_out, bar_is_valid
 from abbe.drivers.errors import Refused
-from abbe.drivers.flags import air_is_compensated, bar_is_out, bar_is_valid
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from abbe.service.runs.recorder import Recorder

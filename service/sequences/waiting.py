@@ -9,9 +9,8 @@ import asyncio
 from collections.abc import Awaitable
 from dataclasses import dataclass
 
-from abbe.drivers.api import ControllerStatus
+from abbe.drivers.api import ControllerStatus, signal_is_there
 from abbe.drivers.errors import DriverError
-from abbe.drivers.flags import signal_is_there
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, DoorOpen, Interlock, PreconditionsChanged
 from abbe.service.sequences.control import (

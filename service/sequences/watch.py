@@ -21,9 +21,8 @@ from functools import partial
 from typing import Any
 
 from abbe.drivers.api import ControllerStatus, DisplacementMeter
-from abbe.drivers.errors import NO_RUN, DriverError, Rebooted, on_behalf_of
+from abbe.drivers.errors import NO_RUN, DriverError, Rebooted, on_behalf_of, run_to_end
 from abbe.drivers.links.incidents import Incident, Incidents
-from abbe.drivers.links.shielded import run_to_end
 from abbe.service.clock import Clock
 from abbe.service.devices.session import Session, latest_status
 from abbe.service.errors import Interlock, MeasurementFault, StatusUnknown

@@ -12,11 +12,10 @@ from sqlalchemy import Connection, Engine, func, select, text
 from abbe.service.domain.service_records import StoreHealth
 from abbe.service.storage.database import Database
 from abbe.service.storage.engine import head_revision, revision_of
-from abbe.service.storage.repositories.decisions import Proposals, Pushes
 from abbe.service.storage.repositories.measured import Campaigns, Checkpoints, Chunks, Machines, Runs
 from abbe.service.storage.repositories.pages import Pages
 from abbe.service.storage.repositories.people import People
-from abbe.service.storage.repositories.results import Discoveries, Models, Solutions, Tables, Verifications
+from abbe.service.storage.repositories.results import Discoveries, Models, Proposals, Pushes, Solutions, Tables, Verifications
 from abbe.service.storage.repositories.service_records import Alarms, Audit, Heartbeats, Outbox, Replies, Slots
 from abbe.service.storage.tables import identity, machines, outbox
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.drivers import flags
+from abbe.drivers import api
 from abbe.drivers.api import Condition
 from abbe.drivers.cnc.registers import conditions_of, interlocks
 
@@ -59,19 +59,19 @@ def test_motion_is_refused_unless_0_1_2_11_are_clear_and_3_4_5_set():
 @pytest.mark.parametrize("word", [*range(64), 0xFF00 | 1 << 3, 0x0100])
 def test_the_bar_says_that_it_reads(word: int):
     """Bit 0 out of range, 2 samples lost before it, 3 sync, 4 no bar; bits 8 to 15 number its settings."""
-    assert flags.on_path(word) == bool(word >> 3 & 1)
-    assert flags.bar_is_out(word) == bool(word & 1 or word >> 4 & 1)
-    assert flags.overran(word) == bool(word >> 2 & 1)
-    assert flags.bar_is_valid(word) == (not (word & 1 or word >> 2 & 1 or word >> 4 & 1))
-    assert (flags.bar_reasons(word) == []) == flags.bar_is_valid(word)
+    assert api.on_path(word) == bool(word >> 3 & 1)
+    assert api.bar_is_out(word) == bool(word & 1 or word >> 4 & 1)
+    assert api.overran(word) == bool(word >> 2 & 1)
+    assert api.bar_is_valid(word) == (not (word & 1 or word >> 2 & 1 or word >> 4 & 1))
+    assert (api.bar_reasons(word) == []) == api.bar_is_valid(word)
 
 
 @pytest.mark.parametrize("word", range(32))
 def test_the_laser_says_that_it_counts(word: int):
     """Bit 0 beam lost (latched), 1 signal low now, 2 zeroed, 3 air compensated, 4 no reflector."""
     lost, low, zeroed, compensated, missing = (bool(word >> k & 1) for k in range(5))
-    assert flags.beam_is_gone(word) == (lost or missing)
-    assert flags.beam_is_good(word) == (not (lost or low or missing))
-    assert flags.signal_is_there(word) == (not (low or missing))
-    assert flags.is_zeroed(word) == zeroed
-    assert flags.air_is_compensated(word) == compensated
+    assert api.beam_is_gone(word) == (lost or missing)
+    assert api.beam_is_good(word) == (not (lost or low or missing))
+    assert api.signal_is_there(word) == (not (low or missing))
+    assert api.is_zeroed(word) == zeroed
+    assert api.air_is_compensated(word) == compensated

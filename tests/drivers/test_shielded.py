@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from abbe.drivers.links.shielded import run_to_end
+from abbe.drivers.errors import run_to_end
 
 
 async def test_result_and_error_pass_through():

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from abbe.drivers.api import BankState, BarSample, Condition
+from abbe.drivers.api import BankState, BarSample, Condition, LaserFlag
 from abbe.drivers.ballbar import frames
 from abbe.drivers.ballbar.frames import Ack, FrameDecoder, Info
 from abbe.drivers.cnc import registers as cnc
-from abbe.drivers.flags import LaserFlag
 from abbe.drivers.laser import driver as laser
 from abbe.drivers.links.modbus import tcp_mismatch
 from abbe.drivers.links.words import words_of

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from abbe.drivers.api import BarSample
-from abbe.drivers.ballbar.conversation import Box, Conversation
-from abbe.drivers.ballbar.frames import Bad, BarCounters, FrameDecoder
+from abbe.drivers.ballbar.driver import Box
+from abbe.drivers.ballbar.frames import Bad, BarCounters, Conversation, FrameDecoder
 from abbe.drivers.ballbar.stream import Reads, SegmentEnd, Stream
 from abbe.drivers.errors import DriverError, on_behalf_of
 from abbe.simulators.faults.serial_bytes import Sample

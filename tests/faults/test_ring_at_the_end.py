@@ -108,7 +108,7 @@ async def test_and_into_the_runs_account_with_an_open_gap_behind_it(tmp_path: Pa
 
 async def test_a_tap_that_never_takes_it_fails_a_run_that_ended_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "_DRAIN_S", 0.1)
-    monkeypatch.setattr("abbe.drivers.ballbar.conversation._DRAIN_S", 0.1)
+    monkeypatch.setattr("abbe.drivers.ballbar.frames._DRAIN_S", 0.1)
     monkeypatch.setattr(driver, "_ANSWER_S", 0.1)
     async with stage(tmp_path, "ring", "never") as on:
         await on.bar.identify()

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.drivers.api import LaserFlag
 from abbe.drivers.ballbar.frames import BoxSettings
 from abbe.drivers.errors import DeviceFault, Rebooted, SettingsChanged, on_behalf_of
-from abbe.drivers.flags import LaserFlag
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import parse_url

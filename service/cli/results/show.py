@@ -125,7 +125,7 @@ def show(
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
     """Return the account of all ball-bar samples: stored, flagged, or in which gap."""
-    from abbe.drivers.flags import BAR_REASONS
+    from abbe.drivers.api import BAR_REASONS
     from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 
     streams = streams_from_end_doc(run.end_doc)

@@ -10,8 +10,8 @@ from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
 from abbe.models.paths import diagonal_ends, helix_points, step_diagonal, straight_line
-from abbe.models.solvers.observations import RunData, block_average, nominal_reading, reading_noise_mm
-from abbe.models.solvers.observe import bar_normals, predict, setup_unknowns
+from abbe.models.solvers.observations import RunData, bar_normals, block_average, nominal_reading, reading_noise_mm
+from abbe.models.solvers.observe import predict, setup_unknowns
 from abbe.models.solvers.priors import Priors
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.observations import BLOCKS, bar_noise_mm, run_data

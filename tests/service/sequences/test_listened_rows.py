@@ -7,7 +7,7 @@ from abbe.drivers.api import Condition, LaserReading
 from abbe.models.machine import Machine
 from abbe.service.campaigns import listen
 from abbe.service.campaigns.listen import Heard, planned_readings, row_times
-from abbe.service.domain.run_start import RunStart
+from abbe.service.domain.measured import RunStart
 from abbe.service.runs.observations import run_data
 from abbe.service.runs.sample_columns import MM_PER_COUNT, laser_columns
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from abbe.drivers.api import BarSample, Condition, ControllerStatus
-from abbe.service.domain.run_start import RunPiece, arc_of
+from abbe.service.domain.measured import RunPiece, arc_of
 from abbe.service.errors import RunInterrupted, StretchDiffers
 from abbe.service.runs.pieces import ReadProgress
 from abbe.service.sequences.recipes.recipe import Circle
