@@ -56,7 +56,7 @@ async def test_an_end_from_outside_is_heard_while_an_interlock_stops_the_axes(pl
     """SIGTERM comes while the feed hold of an opened door is under way: the measurement ends, although the door would only suspend it."""
     b, store = place
     plan = CampaignPlan("c", (small("Linear"),))
-    motion = b.session.controller
+    motion = b.session.controller.noted_controller
     hold, loop, came = motion.request_hold, asyncio.get_running_loop(), []
 
     async def slow(level: int) -> None:
