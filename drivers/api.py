@@ -32,7 +32,7 @@ class DeviceInfo:
 class BarSample(NamedTuple):
     """One ball-bar sample (docs/protocols/ballbar.md). A plain tuple: thousands are made every second.
 
-    ``status``: bits of `abbe.drivers.flags.BarFlag`; the driver of another box translates its own.
+    ``status``: bits of `abbe.drivers.api.BarFlag`; the driver of another box translates its own.
     """
 
     seq: int
@@ -71,7 +71,7 @@ class BarTap(Protocol):
 class LaserReading:
     """One coherent output sample of the laser (docs/protocols/laser.md).
 
-    ``status``: bits of `abbe.drivers.flags.LaserFlag`; the driver of another instrument translates its own.
+    ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument translates its own.
     """
 
     host_s: float

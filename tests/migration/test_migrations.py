@@ -11,8 +11,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import Engine, inspect
 
 from abbe.service.errors import StoreError
-from abbe.service.storage.engine import make_engine
-from abbe.service.storage.migrate import current_revision, downgrade, head_revision, upgrade
+from abbe.service.storage.engine import current_revision, downgrade, head_revision, make_engine, upgrade
 from abbe.service.storage.migrations.versions import r0100_first as first
 from abbe.service.storage.store import Store
 from abbe.service.storage.tables import metadata

@@ -14,7 +14,7 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
 from abbe.service.domain.progress import ignore_progress
-from abbe.service.sequences.interlocks import Watching
+from abbe.service.sequences.control import Watching
 from abbe.service.sequences.recipes.campaigns import identification, quick_check
 from abbe.service.sequences.recipes.recipe import Linear
 from abbe.service.sequences.steps import CampaignPlan

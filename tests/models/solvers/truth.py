@@ -6,8 +6,7 @@ import numpy as np
 
 from abbe.models.geometry.chain import exact_deviation_mm, travel_sign
 from abbe.models.machine import Machine, with_tool
-from abbe.models.paths.helix import helix_points
-from abbe.models.paths.lines import DIAGONALS, diagonal_ends, step_diagonal, straight_line
+from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diagonal, straight_line
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.models.solvers.observe import perpendicular
