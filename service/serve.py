@@ -242,9 +242,10 @@ class Service:
         return all(state == "done: pass" for state in states)
 
     async def _heartbeat(self) -> None:
-        notify("READY=1")
         watchdog_us = int(os.environ.get("WATCHDOG_USEC") or 0)
+        ready = False
         while True:
+            ready = ready or notify("READY=1")
             notify("WATCHDOG=1")
             # From inside the loop: if the loop hangs, the heartbeat stops, and systemd restarts the service.
             await self._clock.sleep(watchdog_us / 2e6 if watchdog_us else 3600.0)
@@ -342,14 +343,18 @@ def leave_now(code: int) -> None:
     os._exit(code)
 
 
-def notify(state: str) -> None:
-    """Notify systemd (``sd_notify``). Does nothing without systemd; one that does not listen holds nothing up."""
+def notify(state: str) -> bool:
+    """Notify systemd (``sd_notify``); false if it does not listen now, which holds nothing up. Does nothing without systemd."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
-        return
+        return True
     if address.startswith("@"):
         address = "\0" + address[1:]
-    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
-        channel.settimeout(0.2)  # its queue may be full
-        channel.connect(address)
-        channel.send(state.encode())
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+            channel.setblocking(False)  # its queue may be full, and the watch over a motion runs in this loop
+            channel.connect(address)
+            channel.send(state.encode())
+    except OSError:
+        return False
+    return True

@@ -105,7 +105,7 @@ def _towards_diagonals(field: Field, stroke_mm: F2, nodes: int, order: int) -> n
     columns = [np.ones((len(points), 1))]
     for a in range(3):
         coordinates, back = np.unique(points[:, a], return_inverse=True)
-        left -= _mean_over_others(field, stroke_mm, a, coordinates, nodes)[back]
+        left = left - _mean_over_others(field, stroke_mm, a, coordinates, nodes)[back]
         columns.append(legendre_values(points[:, a], stroke_mm[a], order)[:, 1:])
     basis: F2 = np.concatenate(columns, axis=1)
     q, r = np.linalg.qr(basis * weight[:, None])

@@ -3,6 +3,7 @@
 import json
 import re
 import tarfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,10 +35,11 @@ def assessed_once():
     assess, known = solve_report.assess, {}
 
     def look_up(solved):
-        key = (repr(solved.joint.machine), solve_report.model_key(solved.joint), *sorted(solved.digests.items()))
+        values = (solved.joint.coefficients.tobytes(), repr(solved.removed), repr(solved.tables))
+        key = (repr(solved.joint.machine), solve_report.model_key(solved.joint), *values, *sorted(solved.digests.items()))
         if key not in known:
             known[key] = assess(solved)
-        return known[key]
+        return replace(known[key], solved=solved)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solve_report, "assess", look_up)

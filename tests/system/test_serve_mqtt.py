@@ -71,17 +71,18 @@ def test_messages_wait_for_the_next_start_and_the_broker_says_offline_when_the_s
     for _ in range(2):
         first.expect('"check done"')
     first.terminate()
+    first.wait()
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        kept = sorted(check.id for check in store.verifications.of_machine("mill-7"))
 
     broker.start()
     endless = ["x", "* * * * * *", "endless"]
     second = ending.enter_context(closing(service(tmp_path, schedules=[endless], mqtt=broker.url, port=free_port())))
     assert payload(receiver.expect('"state":"measuring"'))["schedule"] == "x"
-    while not received(receiver)[1:]:
+    while len(received(receiver)) < len(kept):
         receiver.expect("mill-7/verification")
     second.kill()
     assert payload(receiver.expect('"state":"offline"'))["machine"] == "mill-7"
-    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        kept = sorted(check.id for check in store.verifications.of_machine("mill-7"))
     assert received(receiver) == kept
     assert kept[:2] == [1, 2]
 

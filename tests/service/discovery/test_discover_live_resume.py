@@ -236,7 +236,7 @@ def test_a_person_s_word_for_the_table_in_force_is_not_said_again_in_later_round
 
 # First discovery opened, searched, ended; added campaign begun; its first run started, read; its last one complete; end. What comes
 # between them is of the same kinds, in the first round or the second: ABBE_TEST_LONG=1 plays all.
-SOME = (1, 3, 6, 7, 8, 9, 13, COUNT)
+SOME = (1, 3, 6, 7, 8, 9, 13, 16, COUNT)
 
 
 @pytest.mark.parametrize("end_after", range(1, COUNT + 1) if LONG else SOME)

@@ -161,7 +161,7 @@ async def test_checks_trends_and_timetable(client):
 
 
 async def test_proposals_and_journal(client, plant):
-    """Where they stand is held by tests/service/queries/test_proposals.py."""
+    """Where they stand is held by the tests of service/queries and of proposals."""
     found = {one["number"]: one for one in (await got(client, "/proposals"))["proposals"]}
     detail = await got(client, "/proposals/4")
     assert found[4].items() <= detail.items()

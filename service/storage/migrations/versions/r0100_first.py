@@ -38,7 +38,7 @@ ONLY_GROWS_SQLITE = (
 
 def upgrade() -> None:
     connection = op.get_bind()
-    metadata.create_all(connection)
+    metadata.create_all(connection, checkfirst=False)
     for statement in ONLY_GROWS_POSTGRESQL if connection.dialect.name == "postgresql" else ONLY_GROWS_SQLITE:
         op.execute(statement)
     op.bulk_insert(identity, [{"id": 1, "uid": uuid.uuid4().hex}])
@@ -46,6 +46,6 @@ def upgrade() -> None:
 
 def downgrade() -> None:
     connection = op.get_bind()
-    metadata.drop_all(connection)
+    metadata.drop_all(connection, checkfirst=False)
     if connection.dialect.name == "postgresql":
         op.execute("DROP FUNCTION audit_only_grows()")
