@@ -94,7 +94,7 @@ def lower_envelope(x: F1, y: F1) -> Envelope:
     if x.size < 2 * LOWEST + 2 or x.shape != y.shape:
         raise ValueError(f"envelope: {x.size} points, at least {2 * LOWEST + 2} are needed")
     if not (np.isfinite(x).all() and np.isfinite(y).all()) or (np.diff(x) < 0.0).any() or x[-1] <= x[0]:
-        raise ValueError("envelope: x must rise and all be finite numbers")
+        raise ValueError("envelope: x must rise, and all x and y must be finite")
     middle = 0.5 * float(x[0] + x[-1])
     slope0 = float(np.polyfit(x - middle, y, 1)[0])  # rough: what is left is small, so that nothing is lost to rounding
     left, rest = x - middle, y - y[0] - slope0 * (x - middle)

@@ -40,7 +40,7 @@ class CaptureSettings:
 
 
 def is_memory(database_url: str) -> bool:
-    """Whether the database ends with the process; remaining segments would belong to no database."""
+    """Whether the database is in memory only: it ends with the process, and segments that outlast it would belong to no database."""
     parsed = parse_url(database_url)
     return parsed.drivername == "sqlite" and parsed.database in {None, "", ":memory:"}
 
