@@ -150,8 +150,9 @@ def _above(x: F1, y: F1, a: int, b: int, c: int) -> bool:
 class ClockFit:
     """One clock in terms of another: ``host = host_s0 + rate (device - device_s0)``, least delay taken off.
 
-    ``u_offset_s`` and ``u_rate`` are standard uncertainties at ``device_s0``, the middle of what was fitted, and of the rate; ``u_delay_s``
-    that of the least delay, which no arrival tells. ``early``: arrivals that were left out because they came before they could.
+    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host's time there, ``u_rate`` of the rate,
+    ``u_delay_s`` of the least delay, which arrivals cannot show. ``early``: arrivals that were left out because they came too soon to be
+    possible.
     """
 
     device_s0: float

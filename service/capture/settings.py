@@ -83,7 +83,7 @@ def _named(folder: str, name: str, what: str) -> Path:
 def other_folders(database_url: str, settings: CaptureSettings, present: Path) -> list[Path]:
     """Folders where earlier versions or another machine file may have left segments of this database.
 
-    They may also hold segments of other databases: touch only those of runs of this one.
+    They may also hold segments of other databases: touch a segment only if its run is in this database.
     """
     parsed = parse_url(database_url)
     found = []
