@@ -131,7 +131,7 @@ def _check(image: TableImage) -> None:
     elif min(image.counts) < 2:
         raise TableCodecError(f"{image.counts} points: each axis needs 2 or more")
     if image.lsb_nm <= 0:
-        raise TableCodecError(f"a value's unit of {image.lsb_nm} nm means nothing")
+        raise TableCodecError(f"lsb_nm, the unit of the values, is {image.lsb_nm} nm: it must be above 0")
     for index, value in enumerate(image.values):
         if not -32768 <= value <= 32767:
             raise TableCodecError(f"value {index} is {value} LSB: beyond 16 bits ({value * image.lsb_nm / 1000:g} um)")

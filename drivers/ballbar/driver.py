@@ -300,7 +300,7 @@ class SerialBallBar:
         Raises
         ------
         Refused
-            The box does not accept this rate, or already streams to another caller here.
+            The box does not accept this rate, or already streams to another caller in this process.
         Rebooted
             The box has restarted since ``identify``.
         SettingsChanged

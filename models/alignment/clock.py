@@ -94,7 +94,7 @@ def lower_envelope(x: F1, y: F1) -> Envelope:
     if x.size < 2 * LOWEST + 2 or x.shape != y.shape:
         raise ValueError(f"envelope: {x.size} points, at least {2 * LOWEST + 2} are needed")
     if not (np.isfinite(x).all() and np.isfinite(y).all()) or (np.diff(x) < 0.0).any() or x[-1] <= x[0]:
-        raise ValueError("envelope: x must rise and all be finite numbers")
+        raise ValueError("envelope: x must rise, and all x and y must be finite")
     middle = 0.5 * float(x[0] + x[-1])
     slope0 = float(np.polyfit(x - middle, y, 1)[0])  # rough: what is left is small, so that nothing is lost to rounding
     left, rest = x - middle, y - y[0] - slope0 * (x - middle)
@@ -150,8 +150,9 @@ def _above(x: F1, y: F1, a: int, b: int, c: int) -> bool:
 class ClockFit:
     """One clock in terms of another: ``host = host_s0 + rate (device - device_s0)``, least delay taken off.
 
-    ``u_offset_s`` and ``u_rate`` are standard uncertainties at ``device_s0``, the middle of what was fitted, and of the rate; ``u_delay_s``
-    that of the least delay, which no arrival tells. ``early``: arrivals that were left out because they came before they could.
+    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host's time there, ``u_rate`` of the rate,
+    ``u_delay_s`` of the least delay, which arrivals cannot show. ``early``: arrivals that were left out because they came too soon to be
+    possible.
     """
 
     device_s0: float

@@ -328,7 +328,9 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
         by = after.level - before.level
         if after.first - before.last <= JUMP_SAMPLES and abs(by) < tolerance:
             at_s = after.start_s - found[0].start_s
-            raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, while nothing moved")
+            raise ValueError(
+                f"dwells: the reading jumped by {by:.4f} mm {at_s:.1f} s after the first standstill began, while nothing moved"
+            )
 
 
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
@@ -358,7 +360,9 @@ def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: 
         ]
         if not any(abs(by - move) <= 0.5 * abs(move) for move in moves):
             at_s = after.start_s - found[0].start_s
-            raise ValueError(f"dwells: the reading jumped by {by:.4f} mm at {at_s:.1f} s, which is not in the plan")
+            raise ValueError(
+                f"dwells: the reading jumped by {by:.4f} mm {at_s:.1f} s after the first standstill began: the plan has no such move"
+            )
 
 
 def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[int, Standstill], ...]:
@@ -406,7 +410,7 @@ def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
     stand, ours, other = best.rival
     at_s = found[stand].start_s - found[0].start_s
     which = f"planned standstill {ours + 1} or {other + 1}" if ours != other else f"planned standstill {ours + 1}, or another of them"
-    raise ValueError(f"dwells: the standstill at {at_s:.1f} s may be {which}; nothing is guessed")
+    raise ValueError(f"dwells: the standstill that began {at_s:.1f} s after the first may be {which}; nothing is guessed")
 
 
 def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:

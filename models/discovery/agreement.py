@@ -53,7 +53,9 @@ def agreements(
 
     Parameters
     ----------
-    problem : fitted runs with their noise. solved : of the problem, no effects. predicted_mm : reading of every run, shape (n,), by label.
+    problem : fitted runs with their noise.
+    solved : solution of this problem without effects.
+    predicted_mm : reading of every run, shape (n,), by label.
 
     Returns
     -------

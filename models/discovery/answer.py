@@ -162,7 +162,8 @@ class Discovery:
     noise_mm : of one reading, by "bar", "laser"; from repeats where these scatter less than the fit's residuals.
     p_value : of the whole finding.
     theta, theta_names, theta_covariance : the refitted model without the effects.
-    agreement : of holdout runs, where nothing was found; the worst first. unjudged : holdout runs that cannot be judged.
+    agreement : how holdout runs agree with their prediction, if nothing was found; the worst first.
+    unjudged : holdout runs that cannot be judged.
     unseen : blind spots of the runs, where nothing was found.
     fitted : values of the present simulation that people want to know (the scale of a single axis).
     """

@@ -30,7 +30,8 @@ class Baseline:
 
     Attributes
     ----------
-    setup : set-up unknowns as `abbe.models.solvers.observe` takes them. parts : array, shape (theirs, ours): theirs from ours.
+    setup : set-up unknowns as `abbe.models.solvers.observe` takes them.
+    parts : array: values of ``setup`` = parts @ the set-up unknowns of ``names``.
     names, prior_sd : of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves all radii, so that it is too long by
         the same ``bar_length`` with all of them.
     root : array, shape (p, p)
@@ -82,7 +83,7 @@ class Baseline:
         return out
 
     def along(self, path: Path, run: RunData, theta: F1) -> Path:
-        """The path as the fitted machine really looks along it: a bar turns with the cup's offset and the machine's deviation.
+        """The path with ``look`` as a bar really points on the fitted machine: the cup's offset and the machine's deviation turn it.
 
         A lag of a millimetre along the path times an offset of 30 um over a bar of 150 mm is 0.2 um of reading (discovery.md 5).
         """

@@ -266,7 +266,7 @@ class ChangeContext:
         return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
 
     def size(self, chosen: Chosen, asked: AskedChange) -> tuple[float, float]:
-        """Value of a change and its standard uncertainty (as `Change` of the comparison), all that is linear free beside it."""
+        """Value of a change and its standard uncertainty, units as in `Change`; scales and squareness are estimated together with it."""
         coefficients, covariance = self._coefficients(chosen, asked)
         if not asked.several:
             direction = self.known.linear({asked.name: 1.0})
@@ -379,8 +379,8 @@ class Change:
     name : str
         ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for what is not linear in it (of an angle: all of it).
     value, u : float
-        Change and standard uncertainty, all scales and squareness free beside it: rad (m/m) of a linear one; of a shape its rms over the
-        stroke, mm or rad. ``u`` includes the old solution's uncertainty.
+        Change and standard uncertainty, estimated together with all scales and squareness: of a scale or squareness rad (m/m); of a shape
+        its rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.
     evidence : float
         Gain in log evidence after its price, beside all other named changes.
     rivals : tuple of (name, evidence less)

@@ -113,10 +113,11 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
 
 
 def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
-    """Coefficients of the plain effect nearest to the effect with its forms, per coefficient, shape (plain, all).
+    """Matrix from all coefficients of a pick to those of its effect without forms whose signal is nearest (least squares).
 
-    Only forms that carry part of the size count: an amplitude that changes along the axis, other thermal courses, a followed sensor.
-    Additions such as a second harmonic or wind-up are not part of the strength.
+    Shape (columns of the effect, columns with those of its forms). Only forms that carry part of the effect's size count: an amplitude that
+    changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic or wind-up, are no part of the
+    strength. ``offset``: estimate the start value of a sensor beside the effect, so that it does not count.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]

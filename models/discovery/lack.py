@@ -81,8 +81,10 @@ def lack_of_fit(
 
     Parameters
     ----------
-    problem : the fitted runs. left_mm : residual of every judged run, by label.
-    floor : of `floors`. agreement : of holdout runs.
+    problem : the fitted runs.
+    left_mm : residual of every judged run, by label.
+    floor : noise by kind of instrument, from `floors`.
+    agreement : how each holdout run agrees with its prediction.
     """
     runs = problem.runs
     rest = [np.nan_to_num(left_mm[r.path.label]) / floor[r.path.kind].sd_mm for r in runs]

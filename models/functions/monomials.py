@@ -1,4 +1,4 @@
-"""The 21 error functions as powers of u = position / travel, the form in which the papers' vectors state a machine (math.md 4.6).
+"""The 21 error functions as powers of u = position / travel, the form in which the papers' reference vectors state a machine (math.md 4.6).
 
 Positioning and angles have powers 1..d, straightness 2..d, squareness one value: 18 d - 3 coefficients. Both papers' letters fit: delta_ij
 and eps_ij (Yang), delta_i(J) and alpha_i(J) (Wang); `abbe.models.notation` converts their signs.
@@ -47,7 +47,7 @@ class ErrorArrays:
 
 
 def monomials(degree: int) -> tuple[Monomial, ...]:
-    """All 18 degree - 3 monomials: delta_ij by moving axis, then eps_ij by moving axis, then squareness (order of the vectors).
+    """All 18 degree - 3 monomials: delta_ij by moving axis, then eps_ij by moving axis, then squareness (order of the reference vectors).
 
     Raises
     ------
@@ -72,10 +72,11 @@ def error_arrays(terms: tuple[Monomial, ...], theta: F1, u: F2, angle_scale: flo
     Parameters
     ----------
     terms, theta : tuple of Monomial, array of shape (len(terms),)
+        Coefficients: mm for translations; rad for angles and squareness, times ``1 / angle_scale``.
     u : array, shape (n, 3)
         Position over travel of each axis.
     angle_scale : float
-        Factor on the coefficients of angles and squareness (the vectors state them times 500 mm: 1/500).
+        Factor on the coefficients of angles and squareness: 1/500 for those of the reference vectors, which are stated times 500 mm.
 
     Raises
     ------

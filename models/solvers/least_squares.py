@@ -148,8 +148,8 @@ def _column_scale(a: F2) -> F1:
 class Combination:
     """A direction of parameter space that leaves no trace in the observations.
 
-    ``weights`` relate the parameters in units of their typical size, largest first, including small members: without them the combination
-    leaves a trace. ``text``: a sentence about the members that matter (`LEAST_SHARE`).
+    ``weights``: name and component of each parameter in the direction, in units of the parameter's typical size, largest first. Small ones
+    belong to it: without them the direction would leave a trace. ``text``: a sentence about the members above `LEAST_SHARE`.
     """
 
     weights: tuple[tuple[str, float], ...]

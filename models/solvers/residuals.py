@@ -132,7 +132,7 @@ def _holm(tests: list[ResidualTest]) -> tuple[ResidualTest, ...]:
 def inflation(z: tuple[F1, ...]) -> float:
     """Ratio of all readings to independent ones: 1 + 2 sum of the autocorrelation, at least 1.
 
-    Summed over all runs of an instrument up to the first lag that noise explains.
+    Summed over all runs of an instrument up to the first lag that noise explains. ``z``: residuals over their noise, an array per run.
     """
     sizes = [v.size for v in z if v.size >= FEWEST]
     if not sizes:

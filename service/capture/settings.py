@@ -40,7 +40,7 @@ class CaptureSettings:
 
 
 def is_memory(database_url: str) -> bool:
-    """Whether the database ends with the process; remaining segments would belong to no database."""
+    """Whether the database is in memory only: it ends with the process, and segments that outlast it would belong to no database."""
     parsed = parse_url(database_url)
     return parsed.drivername == "sqlite" and parsed.database in {None, "", ":memory:"}
 
@@ -83,7 +83,7 @@ def _named(folder: str, name: str, what: str) -> Path:
 def other_folders(database_url: str, settings: CaptureSettings, present: Path) -> list[Path]:
     """Folders where earlier versions or another machine file may have left segments of this database.
 
-    They may also hold segments of other databases: touch only those of runs of this one.
+    They may also hold segments of other databases: touch a segment only if its run is in this database.
     """
     parsed = parse_url(database_url)
     found = []

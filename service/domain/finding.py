@@ -241,7 +241,8 @@ class Finding:
     location : location of the gap of the present model.
     rejected : labels that were tried, and the reason against each.
     confounded_with : rivals of the names that the price rule does not exclude. beside : structures without a name beside them.
-    agreement, unjudged, unseen : of runs that were never fitted, if nothing is missing.
+    agreement : how runs that were never fitted agree with their prediction, if nothing is missing.
+    unjudged, unseen : runs that cannot be judged, and blind spots, if nothing is missing.
     fitted : values of the present simulation that these runs show.
     thinning : decimation of long runs before the search; None: they were searched as they were read.
     predictions : of sealed runs, mm.

@@ -320,7 +320,7 @@ class RunRecord(RunFacts):
             return parse(doc)
         except (AttributeError, KeyError, TypeError, ValueError) as err:
             text = f"run {self.campaign}/{self.label}: its documents lack or garble {err}"
-            raise StoreError(text, "it was not written by Abbe") from None
+            raise StoreError(text, "it was not written by Abbe, or is damaged: restore a backup") from None
 
     @property
     def visible_status(self) -> str:

@@ -389,7 +389,7 @@ class Run:
         except (AttributeError, KeyError, TypeError, ValueError) as err:
             raise StoreError(
                 f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document has a missing or invalid field {err}",
-                "it was not written by Abbe",
+                "it was not written by Abbe, or is damaged: restore a backup",
             ) from None
 
     def to_document(self) -> Doc:

@@ -60,7 +60,8 @@ def decode_bar(payload: bytes) -> list[BarSample]:
     raw = _inflate(payload, BAR_CODEC)
     if len(raw) % _SAMPLE.size:
         raise StoreError(
-            f"a chunk of codec {BAR_CODEC} has {len(raw)} bytes, not a multiple of {_SAMPLE.size}", "it was not written by Abbe"
+            f"a chunk of codec {BAR_CODEC} has {len(raw)} bytes, not a multiple of {_SAMPLE.size}",
+            "it was not written by Abbe, or is damaged: restore a backup",
         )
     return [BarSample(*fields) for fields in _SAMPLE.iter_unpack(raw)]
 
@@ -92,14 +93,18 @@ def decode_json(payload: bytes) -> list[dict[str, Any]]:
     try:
         return [json.loads(line) for line in text.split(b"\n") if line]
     except ValueError as err:
-        raise StoreError(f"a chunk of codec {JSON_CODEC} does not hold JSON lines ({err})", "it was not written by Abbe") from None
+        raise StoreError(
+            f"a chunk of codec {JSON_CODEC} does not hold JSON lines ({err})", "it was not written by Abbe, or is damaged: restore a backup"
+        ) from None
 
 
 def _inflate(payload: bytes, codec: str) -> bytes:
     try:
         return zlib.decompress(payload)
     except zlib.error as err:
-        raise StoreError(f"a chunk of codec {codec} cannot be unpacked ({err})", "it was not written by Abbe") from None
+        raise StoreError(
+            f"a chunk of codec {codec} cannot be unpacked ({err})", "it was not written by Abbe, or is damaged: restore a backup"
+        ) from None
 
 
 BAR_CHANNEL = "bar"
@@ -195,7 +200,8 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as err:
         raise StoreError(
-            f"run {record.campaign}/{record.label}: its documents lack or garble {err}", "it was not written by Abbe"
+            f"run {record.campaign}/{record.label}: its documents lack or garble {err}",
+            "it was not written by Abbe, or is damaged: restore a backup",
         ) from None
 
 

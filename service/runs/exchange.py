@@ -140,7 +140,9 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
         entry = run.start.entry or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
         if read.setup.t_set_s is None:
-            raise StoreError(f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe")
+            raise StoreError(
+                f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe, or is damaged: restore a backup"
+            )
         setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
         _write_json(folder / entry["file"], run_document(read, run, chunks))
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))

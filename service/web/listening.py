@@ -51,7 +51,7 @@ def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Se
     wide, proxied = not is_loopback(host), [name for name in names if not is_loopback(name.removeprefix("[").removesuffix("]"))]
     if not wide and not proxied:
         return
-    what = f"[web] host {host!r} can be reached" if wide else f"[web] names {', '.join(map(repr, proxied))} are asked for"
+    what = f"[web] host {host!r} can be reached" if wide else f"[web] names {', '.join(map(repr, proxied))} can be reached"
     if admins() == 0:
         raise ConfigError(
             f"{what} from other computers, and there is no user who is admin, has a password and may log in",

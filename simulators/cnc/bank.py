@@ -52,7 +52,7 @@ def parse(words: list[int]) -> tuple[int, Correction]:
     if (magic, fmt, lsb) != (MAGIC, FORMAT, LSB_NM):
         raise ImageError("magic, format or table unit differ")
     if kind not in (0, 1, 2):
-        raise ImageError(f"kind {kind} is unknown")
+        raise ImageError(f"kind {kind} is none of 0, 1, 2")
     if kind == 0 and counts != (0, 0, 0):
         raise ImageError("kind 0 has no grid")
     expected = HEADER_WORDS + {0: 0, 1: 3 * sum(counts), 2: 3 * nx * ny * nz}[kind]

@@ -75,11 +75,17 @@ class Hidden:
         return "XYZ".index(self.key[1]) if self.key[1] in "XYZ" else "ABC".index(self.key[1])
 
     def rng(self, *stream: int) -> np.random.Generator:
-        """Generator of its phases."""
+        """Random generator of the effect: its phases, directions of a set-up.
+
+        ``stream``: numbers that set apart what is drawn (which quantity, run, set-up); the same ones always give the same sequence.
+        """
         return np.random.default_rng([STREAM_WILD, self.stream, *stream])
 
     def freedom(self, low: float, high: float, which: int, *, signed: bool = False) -> float:
-        """A departure from the textbook between two sizes, 0 for the textbook itself."""
+        """A departure from the textbook, drawn between ``low`` and ``high`` times ``bent``; 0 for the textbook itself.
+
+        ``which``: number of the departure, different for each of one effect. ``signed``: half of them are negative.
+        """
         if not self.wild:
             return 0.0
         rng = np.random.default_rng([STREAM_WILD + 1, self.wild, which])

@@ -64,7 +64,10 @@ def reference_mm(run: Run) -> F:
 
 
 def smooth_columns(machine: PerfectMachine, run: Run, level: str) -> F:
-    """Columns of the error motions that the present model has."""
+    """Readings of a run per unit of each error motion's coefficients, mm per mm or mm per rad, shape (n, k).
+
+    ``level``: rigid21 (six motions per axis, as splines) or rigid6 (scales and squareness).
+    """
     track, reference = run.track, reference_mm(run)
     out = []
     for a in range(3):
@@ -81,7 +84,10 @@ def smooth_columns(machine: PerfectMachine, run: Run, level: str) -> F:
 
 
 def setup_columns(runs: list[Run], terms: frozenset[str]) -> F:
-    """Columns of the set-up terms: centre per bar set-up, bar length, mirror tilt per laser set-up, a zero per laser run."""
+    """Readings of all runs per unit of each set-up term, mm per mm or mm per rad.
+
+    Terms: centre per bar set-up, bar length, mirror tilt per laser set-up, a zero per laser run.
+    """
     rows = np.cumsum([0, *(r.track.n for r in runs)])
     pieces: dict[str, list[tuple[int, F]]] = {}
     for i, run in enumerate(runs):

@@ -14,7 +14,7 @@ STREAM_NOISE = 45
 
 
 class BentMachine:
-    """The true machine; hidden effects add to the error motions of its carriages. Without a ``machine``: a perfect one."""
+    """The true machine; hidden effects add to the commanded positions and to the error motions of its carriages."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine

@@ -48,7 +48,11 @@ MOVING = "what shows in motion on a curve only (reversals of two axes, servo mis
 
 @dataclass(frozen=True)
 class ExperimentOffer:
-    """One addition: its runs; ``subtracted``: runs whose readings are subtracted (angular); minutes; why, for people."""
+    """One addition to a campaign (run-format.md 5): the runs to simulate, the minutes they take; ``why``: for people.
+
+    ``subtracted``: the second beam of an angular interferometer, a run for each of ``runs`` from whose readings its own are subtracted.
+    ``knows_length``: it makes the bar's length known.
+    """
 
     adds: str
     runs: tuple[CaseRun, ...]

@@ -178,7 +178,7 @@ class _Columns:
         return cls(base, tuple(np.asarray(s @ c) for s in own), found)
 
     def gram(self, run: CaseRun, k: int, weight: float, subtracted: tuple[CaseRun, int] | None = None) -> F2:
-        """Normal matrix of one run: simulation, rivals, leader; ``subtracted``: a run whose readings are subtracted, and its index."""
+        """Normal matrix of one run: simulation, rivals, leader; ``subtracted``: the run whose columns are subtracted, its index."""
         columns = self._of_run(run, k)
         if subtracted is not None:
             columns = columns - self._of_run(*subtracted)

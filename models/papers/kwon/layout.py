@@ -212,7 +212,10 @@ class Layout:
 
     @property
     def plane_mm(self) -> F1 | None:
-        """a, b, c of the one plane Z = a + b X + c Y on which all points lie, shape (3,); None if there is none that Z crosses."""
+        """a (mm), b, c of the plane Z = a + b X + c Y on which all points lie, shape (3,).
+
+        None if they lie on no plane, on several, or on one that faces X or Y (`Planes.axis`).
+        """
         at = self.planes
         return np.array([at.levels_mm[0], *at.slope[:2]]) if at and at.axis == 2 and len(at.levels_mm) == 1 else None
 

@@ -136,7 +136,7 @@ def exact_positions_mm(errors: ErrorArrays, axes_mm: F2) -> F2:
 
 
 def monomial_errors(terms: tuple[Monomial, ...], theta: F1, axes_mm: F2, travel_mm: F1, angle_scale: float = 1.0) -> ErrorArrays:
-    """The 21 errors of a machine stated by coefficients of u = position / travel, the form of the vectors (math.md 4.6, 5.5).
+    """The 21 errors of a machine stated by coefficients of u = position / travel, the form of the reference vectors (math.md 4.6, 5.5).
 
     Parameters
     ----------

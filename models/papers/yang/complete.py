@@ -15,7 +15,7 @@ from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
 
 ANGLE_MM = 500.0
-"""The vectors state coefficients of angles and squareness times this length, so that all coefficients are lengths of like size."""
+"""The reference vectors state angles and squareness times this length, so that all coefficients are lengths of like size."""
 
 
 def delta_eq1(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
@@ -75,7 +75,7 @@ def delta_exact(errors: YangErrors, slide_mm: F2, tool_mm: F1, *, small_angles: 
 
 
 def monomial_errors(terms: tuple[Monomial, ...], theta: F1, slide_mm: F2, travel_mm: F1) -> YangErrors:
-    """The 21 errors of a machine stated by coefficients of u = scale / travel, the form of the vectors (math.md 4.6).
+    """The 21 errors of a machine stated by coefficients of u = scale / travel, the form of the reference vectors (math.md 4.6).
 
     Parameters
     ----------

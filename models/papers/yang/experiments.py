@@ -2,7 +2,7 @@
 
 Ball-bar helices about one or several cups, step diagonals with flat mirror, plain diagonals, and whole vector maps, with or without the
 set-up unknowns. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. Number and places of the paper's cups (Fig.
-6) are lost; centre plus four at (±200, ±75) mm is the plan of the vectors (math.md 4.3).
+6) are lost; centre plus four at (±200, ±75) mm is the plan of the reference vectors (math.md 4.3).
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "d2": lambda p: step_diagonals(p, tilts=True),
     "d3": lambda p: step_diagonals(p, tilts=False, sequential=False),
 }
-"""Experiments of math.md 4.6 by the letters of the vectors."""
+"""Experiments of math.md 4.6 by the letters of the reference vectors."""
 
 
 @dataclass(frozen=True, slots=True)

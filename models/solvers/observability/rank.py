@@ -381,8 +381,8 @@ def _reason(hidden: tuple[str, ...], share: float, status: Status) -> str:
 def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -> tuple[str, ...]:
     """Error motions that may be written into tables of their own: numbers that rest on readings.
 
-    Rule: none of its coefficients is in a hidden combination, and the readings carry at least 90 % of its information (with ``weak``:
-    10 %). A hidden combination then changes neither readings nor tables. Other motions may still be corrected where only their sum counts:
-    in a grid of the volume for the tool that was measured with.
+    Rule for each: none of the motion's coefficients is in a hidden combination, and at least 90 % of what is known of it comes from the
+    readings (with ``weak``: 10 %). A hidden combination then changes neither readings nor tables. Other motions may still be corrected
+    where only their sum counts: in a grid of the volume for the tool that was measured with.
     """
     return tuple(m.name for m in found if m.status == "observed" or (weak and m.status == "weak"))

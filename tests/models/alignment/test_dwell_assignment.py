@@ -75,7 +75,7 @@ def test_counts_that_are_lost_at_standstill_are_no_short_move():
     """A step of 50 um while nothing moves, far from where the plan has so short a move."""
     t, y = stream([(x, 1.0) for x in WAY])
     at = np.flatnonzero(np.abs(y - 20.0) < 5e-3)[10]
-    with pytest.raises(ValueError, match=r"jumped by 0\.05.* which is not in the plan"):
+    with pytest.raises(ValueError, match=r"jumped by 0\.05.* the plan has no such move"):
         detect(t, y + np.where(np.arange(t.size) >= at, 0.05, 0.0), PLANNED, settle_s=SETTLE_S, zero=0.0)
 
 

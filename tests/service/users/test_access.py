@@ -378,7 +378,7 @@ async def test_a_foreign_name_of_this_computer_is_refused_also_at_the_login(gate
         ("127.0.0.1", ("localhost", "[::1]"), 0, "no", None),
         ("0.0.0.0", (), 0, "own", "no user who is admin"),
         ("192.168.1.5", (), 0, "own", "no user who is admin"),
-        ("127.0.0.1", ("abbe.plant",), 0, "proxy", "names 'abbe.plant' are asked for .* no user who is admin"),
+        ("127.0.0.1", ("abbe.plant",), 0, "proxy", "names 'abbe.plant' can be reached .* no user who is admin"),
         ("127.0.0.1", ("abbe.plant",), 1, "no", "in clear - .*behind_tls"),
         ("127.0.0.1", ("abbe.plant",), 1, "proxy", None),
         ("127.0.0.1", ("abbe.plant",), 1, "own", None),
