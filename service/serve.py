@@ -69,6 +69,7 @@ LEAVE_S = 0.3
 WORK_END_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0
+READY_AGAIN_S = 0.2
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - compared with, not listened on
 
@@ -242,10 +243,10 @@ class Service:
         return all(state == "done: pass" for state in states)
 
     async def _heartbeat(self) -> None:
+        while not notify("READY=1"):
+            await self._clock.sleep(READY_AGAIN_S)  # its watchdog begins with this message
         watchdog_us = int(os.environ.get("WATCHDOG_USEC") or 0)
-        ready = False
         while True:
-            ready = ready or notify("READY=1")
             notify("WATCHDOG=1")
             # From inside the loop: if the loop hangs, the heartbeat stops, and systemd restarts the service.
             await self._clock.sleep(watchdog_us / 2e6 if watchdog_us else 3600.0)

@@ -9,24 +9,13 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
-from abbe.models.arrays import F1, F2, F3
+from abbe.models.arrays import F1, F2
 from abbe.models.functions.axis_function import frozen_vector, interval, positions, same_size
 
 
 def legendre_values(x_mm: F1, stroke_mm: ArrayLike, order: int) -> F2:
     """Legendre polynomials P0..P_order over the stroke, shape (n, order + 1); the end value is held outside the stroke."""
-    return np.moveaxis(legendre_polynomials(_unit(np.asarray(x_mm, dtype=np.float64), stroke_mm), order), 0, -1)
-
-
-def legendre_polynomials(u: F1 | F2, order: int) -> F2 | F3:
-    """P0..P_order of numbers between -1 and 1 of any shape, along a new first axis."""
-    out = np.empty((order + 1, *u.shape))
-    out[0] = 1.0
-    if order:
-        out[1] = u
-    for k in range(2, order + 1):  # Bonnet's recursion, as in `numpy.polynomial.legendre.legvander`, which is slow on a few points
-        out[k] = (out[k - 1] * u * (2 * k - 1) - out[k - 2] * (k - 1)) / k
-    return out
+    return np.asarray(legendre.legvander(_unit(np.asarray(x_mm, dtype=np.float64), stroke_mm), order), dtype=np.float64)
 
 
 def _unit(x_mm: F1, stroke_mm: ArrayLike) -> F1:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from abbe.models.arrays import F1, F2
-from abbe.models.functions.legendre import legendre_polynomials, legendre_values
+from abbe.models.functions.legendre import legendre_values
 from abbe.models.functions.motions import ROTATIONS, motion_names
 from abbe.models.machine import AXES as DIRECTIONS
 
@@ -68,7 +69,7 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
     layout = layout_of(terms)
     start, travel_mm = stroke_mm[:, :1], np.asarray(axes_mm).T - stroke_mm[:, :1]
     u = np.minimum(np.maximum(2.0 * travel_mm / (stroke_mm[:, 1:] - start) - 1.0, -1.0), 1.0)
-    out = legendre_polynomials(u, layout.highest).reshape(-1, u.shape[1])[layout.row]
+    out = np.moveaxis(legendre.legvander(u, layout.highest), -1, 0).reshape(-1, u.shape[1])[layout.row]
     out -= layout.at_start[:, None]
     for i, axis, sign in layout.squareness:
         out[i] = sign * travel_mm[axis]
@@ -91,27 +92,9 @@ class TermLayout:
     squareness: tuple[tuple[int, int, float], ...]
 
 
-class _Same:
-    """A tuple of terms that is compared by what it is: hashing hundreds of terms takes longer than using them."""
-
-    def __init__(self, terms: tuple[Term, ...]) -> None:
-        self.terms = terms
-
-    def __hash__(self) -> int:
-        return id(self.terms)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.terms is other.terms
-
-
+@lru_cache(maxsize=64)
 def layout_of(terms: tuple[Term, ...]) -> TermLayout:
     """The layout of these terms, made once."""
-    return _layout(_Same(terms))
-
-
-@lru_cache(maxsize=64)
-def _layout(same: _Same) -> TermLayout:
-    terms = same.terms
     straight = np.array([t.component < 3 and t.component != t.axis for t in terms], dtype=bool)
     return TermLayout(
         np.array([6 * t.axis + t.component for t in terms], dtype=np.intp),

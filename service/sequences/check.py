@@ -90,7 +90,9 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
             )
     at = np.array(list(positions(plan.steps)), dtype=np.float64).reshape(-1, 3)
     low, high = machine.stroke_mm.T
-    for n, a in np.argwhere(~((low - 1e-9 <= at) & (at <= high + 1e-9)))[:1]:
+    beyond = np.argwhere(~((low - 1e-9 <= at) & (at <= high + 1e-9)))
+    if beyond.size:
+        n, a = beyond[0]
         over = low[a] - at[n, a] if at[n, a] < low[a] else at[n, a] - high[a]
         raise StrokeError(
             f"test {plan.label}: {AXES[a]} would go to {at[n, a]:.3f} mm, {over:.3f} mm beyond its stroke {low[a]:g}..{high[a]:g}",

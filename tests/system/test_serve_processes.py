@@ -243,7 +243,7 @@ def frozen_and_thawed(made: Running) -> None:
     with connect(f"ws://127.0.0.1:{made.port}/api/v1/live", additional_headers=viewer) as live:
         os.kill(made.process.pid, signal.SIGSTOP)
         with pytest.raises(TimeoutError):
-            listen(live, 6)  # nothing is told any more; longer than the page believes what it heard last
+            listen(live, 6)  # silence, for longer than the page trusts its last snapshot
     answers = [made.http.get(path, headers=viewer) for path in ("/readyz", "/api/v1/status", "/api/v1/jobs", "/")]
     assert [answer.status_code for answer in answers] == [503] * 4
     assert {answer.json()["code"] for answer in answers[:3]} == {"SRV-002"}

@@ -151,8 +151,7 @@ class CupTest(TestRecipe):
 
 def as_point(v: Array) -> Point:
     """Three floats on the controller's 10 nm grid."""
-    x, y, z = v.tolist()
-    return (round(x, 5), round(y, 5), round(z, 5))
+    return as_points(v[np.newaxis])[0]
 
 
 def as_points(rows: Array) -> tuple[Point, ...]:
