@@ -35,11 +35,9 @@ def measured(seed: int, kind: population.Kind = "joint") -> tuple[Site, list[Doc
 
 
 def thinned(runs: list[Doc], every: int) -> list[Doc]:
-    """The same runs with every so manieth reading of a ball-bar: for what does not depend on how many there are."""
-    for run in runs:
-        if run["test"].startswith("ballbar"):
-            run["columns"] = {name: values[::every] for name, values in run["columns"].items()}
-    return runs
+    """The same runs with every n-th reading of a ball-bar: for what does not depend on how many there are."""
+    parts = {run["run_id"]: every if run["test"].startswith("ballbar") else 1 for run in runs}
+    return [run | {"columns": {name: values[:: parts[run["run_id"]]] for name, values in run["columns"].items()}} for run in runs]
 
 
 def machine_of(seed: int, kind: population.Kind = "joint") -> Site:

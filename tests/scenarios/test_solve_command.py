@@ -18,7 +18,7 @@ from abbe.service.runs.exchange import import_folder
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from tests.experiments.campaigns.population import draw_case
-from tests.scenarios.campaign_files import measured, write_folder
+from tests.scenarios.campaign_files import measured, thinned, write_folder
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
 SEED = 7
@@ -56,12 +56,7 @@ def folder(tmp_path_factory):
 def small(tmp_path_factory):
     """The same with fifty readings of a ball-bar run: trials draw every reading many thousand times."""
     site, runs = measured(SEED, "one_tool")
-    return write_folder(tmp_path_factory.mktemp("small") / "c1", site.doc, [thinned(run) for run in runs])
-
-
-def thinned(run):
-    every = 10 if run["test"].startswith("ballbar") else 1
-    return run | {"columns": {k: v[::every] for k, v in run["columns"].items()}}
+    return write_folder(tmp_path_factory.mktemp("small") / "c1", site.doc, thinned(runs, 10))
 
 
 def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(command, folder, tmp_path):
@@ -232,7 +227,7 @@ def test_a_bad_run_in_the_store_stores_no_solution(command, tmp_path):
 
 def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(command, small, tmp_path):
     site, runs = measured(SEED, "one_tool")
-    runs = [thinned(run) for run in runs]
+    runs = thinned(runs, 10)
     runs[-1]["columns"]["deviation_mm"][7] += 1e-3
     with Store.open("sqlite:///d.sqlite3") as store:
         import_folder(store, write_folder(tmp_path / "other", site.doc, runs))
@@ -247,7 +242,7 @@ def test_another_machine_with_the_same_readings_is_another_campaign(command, sma
     doc = json.loads(json.dumps(site.doc))
     doc["pivots_mm"] = {a: [0.0, 0.0, 700.0] for a in "XYZ"}
     with Store.open("sqlite:///e.sqlite3") as store:
-        import_folder(store, write_folder(tmp_path / "other", doc, [thinned(run) for run in runs]))
+        import_folder(store, write_folder(tmp_path / "other", doc, thinned(runs, 10)))
     code, _, err = command("solve", small, "--model", "rigid6", "--db", "sqlite:///e.sqlite3")
     assert code == 2
     assert "the machine (chain, strokes, pivots or tool) differs" in err
