@@ -1,8 +1,8 @@
 """ISO 230-2: accuracy and repeatability of positioning of a linear axis, from approaches of the same positions from both sides.
 
-Positions are counted by i (1 to m), cycles by j (1 to n); n may differ from m, and single approaches may be missing. The expanded
-uncertainties follow the idea of ISO/TR 230-9 - what the scatter of n cycles leaves open, and what instrument and temperature add - by
-propagation through the figure's own formula. They are not the closed formulas of ISO 230-2's annex, which hold for five cycles.
+Index i counts positions (1 to m), j cycles (1 to n); single approaches may be missing. The standard uncertainties follow ISO/TR 230-9: the
+scatter of the cycles and the contributions of instrument and temperature are propagated through each figure's own formula. They are not
+the closed formulas of ISO 230-2's annex, which hold for five cycles.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from abbe.models.arrays import F1, F2
 
 CYCLES = 5
 POSITIONS = 5
-"""ISO 230-2 asks for five cycles, and at least five positions per metre, five in all."""
+"""ISO 230-2 asks for five cycles and five positions per metre, and for five positions on a shorter axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Approaches:
     backward_mm: F2
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check positions and shapes.
 
         Raises
         ------
@@ -39,21 +39,21 @@ class Approaches:
         """
         m = self.position_mm.size
         if m < 2 or not (np.diff(self.position_mm) > 0.0).all():
-            raise ValueError(f"ISO 230-2: {m} positions; two or more are needed, growing")
+            raise ValueError(f"ISO 230-2: {m} positions; two or more are needed, in growing order")
         if self.forward_mm.shape != self.backward_mm.shape or self.forward_mm.ndim != 2 or self.forward_mm.shape[0] != m:
             raise ValueError(f"ISO 230-2: {m} positions, but readings of shape {self.forward_mm.shape} and {self.backward_mm.shape}")
         for name, values in (("+", self.forward_mm), ("-", self.backward_mm)):
             lost = np.flatnonzero(~np.isfinite(values).any(axis=1))
             if lost.size:
-                raise ValueError(f"ISO 230-2: position {self.position_mm[lost[0]]:g} mm was never read moving in {name}")
+                raise ValueError(f"ISO 230-2: no reading at position {self.position_mm[lost[0]]:g} mm approached in {name} direction")
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleBudget:
     """Standard uncertainties that the repeats do not show.
 
-    ``per_length``: of the length scale, mm per mm (wavelength, expansion of the scales); ``reading_mm``: of the mean of a position, common
-    to none of the others (resolution, drift of the environment).
+    ``per_length``: of the length scale, mm per mm (wavelength, expansion of the scales); ``reading_mm``: of the mean at each position,
+    independent from position to position (resolution, drift of the environment).
     """
 
     per_length: float = 0.0
@@ -70,11 +70,11 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Positioning:
-    """All figures of ISO 230-2 of a bidirectional test. Arrays have the shape (m,); ``None``: one cycle has no scatter.
+    """All figures of ISO 230-2 of a bidirectional test, mm. Arrays have the shape (m,); None: one cycle has no scatter.
 
     ``mean_forward_mm``, ``mean_backward_mm``, ``mean_mm``: mean deviations; ``reversal_mm``: B_i; ``s_forward_mm``, ``s_backward_mm``:
-    estimators of the standard uncertainty of positioning. The rest are the figures of the standard by their symbols; ``lowest`` and
-    ``most``: fewest and most approaches of a position from one side.
+    standard deviations of the approaches. ``lowest``, ``most``: fewest and most approaches of a position from one side. All others are
+    named by the standard's symbols.
     """
 
     position_mm: F1
@@ -100,7 +100,7 @@ class Positioning:
     most: int
 
     def departures(self) -> tuple[str, ...]:
-        """Texts of the test's departures from ISO 230-2."""
+        """Return a sentence for each departure of the test from ISO 230-2."""
         m = self.position_mm.size
         travel = float(np.ptp(self.position_mm))
         needed = max(POSITIONS, int(np.ceil(POSITIONS * travel * 1e-3 - 1e-9)))
@@ -115,7 +115,7 @@ class Positioning:
 
 @dataclass(frozen=True, slots=True)
 class _Side:
-    """Means, scatter and number of approaches of one direction, shape (m,)."""
+    """Mean, standard deviation and number of the approaches in one direction, shape (m,) each."""
 
     x: F1
     s: F1
@@ -132,8 +132,8 @@ def positioning(readings: Approaches, budget: ScaleBudget | None = None) -> Posi
     ----------
     readings : Approaches
     budget : ScaleBudget, optional
-        Without it only the scatter is in the uncertainties: of the cycles, or where there is one cycle, of the reversals B_i about their
-        mean (which holds more than noise where lost motion changes along the axis).
+        Without it the uncertainties contain only the scatter of the cycles. A single cycle takes the scatter of the reversals B_i about
+        their mean, which is too large where lost motion changes along the axis.
     """
     budget = budget or ScaleBudget()
     fwd, bwd = _side(readings.forward_mm), _side(readings.backward_mm)
@@ -177,7 +177,7 @@ def _side(values: F2) -> _Side:
 
 
 def _of_mean(side: _Side, reversal: F1) -> F1:
-    """Standard uncertainty of the means. What was read once has the scatter of the reversals about their mean, as two readings' noise."""
+    """Standard uncertainty of the means; for single readings, from the scatter of the reversals, each a difference of two readings."""
     from_reversal = float(np.std(reversal, ddof=1)) / np.sqrt(2.0)
     return np.where(side.n > 1.0, side.s / np.sqrt(side.n), from_reversal)
 
@@ -188,7 +188,7 @@ def _of_s(side: _Side) -> F1:
 
 
 def _range(at: F1, upper: F1, lower: F1, u: F1, budget: ScaleBudget) -> Value:
-    """max(upper) - min(lower), with the uncertainty of the two places that decide it and of the scale between them."""
+    """max(upper) - min(lower), with the uncertainty of the two positions that decide it and of the length scale between them."""
     hi, lo = int(np.argmax(upper)), int(np.argmin(lower))
     scale = budget.per_length * float(abs(at[hi] - at[lo]))
     apart = float(np.hypot(u[hi], u[lo])) if hi != lo else 0.0
@@ -199,7 +199,7 @@ def _accuracy(at: F1, sides: tuple[_Side, ...], u: F1, budget: ScaleBudget) -> V
     x, s, u_s = (np.concatenate(v) for v in zip(*((side.x, side.s, _of_s(side)) for side in sides), strict=True))
     hi, lo = int(np.argmax(x + 2.0 * s)), int(np.argmin(x - 2.0 * s))
     value = _range(at, x + 2.0 * s, x - 2.0 * s, np.hypot(u, 2.0 * u_s), budget)
-    # One place may decide both ends: then its mean does not count, and its scatter twice.
+    # If one position decides both ends, its mean cancels and its scatter counts twice.
     return value if hi != lo else Value(value.value_mm, float(4.0 * u_s[hi]))
 
 

@@ -1,8 +1,8 @@
 """ISO 230-4: circular tests. Circular deviation G, bidirectional G(b), radial deviation F and hysteresis H of a plane.
 
-The deviation of a ball-bar's length around a circle is c + a cos + b sin + the machine's deviation; a, b is the centring of the set-up.
-G and H are about the least squares circle of the path (of both paths for G(b) and H); F is about the centre that the set-up had, and about
-the least squares centre. G by the minimum zone (two concentric circles as close as possible) is given beside it.
+The deviation of a ball-bar's length around a circle is c + a cos + b sin + the machine's deviation; a and b are the centring error of the
+set-up. G refers to the least squares circle of its path, G(b) and H to the common one of both paths. F is given about the set-up's centre
+and about the least squares centre, G also by the minimum zone (two concentric circles as close as possible).
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from abbe.models.arrays import F1, F2
 from abbe.models.solvers.observations import reading_noise_mm
 
 BINS = 360
-"""Angles at which the two paths are compared: the mean of each degree."""
+"""Sectors of the circle, one degree each, whose means compare the two paths."""
 FULL_RAD = np.deg2rad(350.0)
-"""A path that covers less is an arc: its least-squares centre is less certain, and the result states that it is an arc."""
+"""A path that covers less is an arc (`OnePath.is_whole`), whose least squares centre is less certain."""
 ZONE_POINTS = 2000
-"""Readings that the minimum zone is looked for in: the highest and lowest of each of half so many stretches."""
+"""Most readings for the minimum zone; of a longer path, the highest and the lowest of each of `ZONE_POINTS` / 2 stretches count."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +31,12 @@ class CircularTest:
     deviation_mm: F1
 
     def __post_init__(self) -> None:
-        """Check.
+        """Check shapes and numbers.
 
         Raises
         ------
         ValueError
-            Unequal shapes, fewer than 8 readings, or no finite numbers.
+            Unequal shapes, fewer than 8 readings, or numbers that are not finite.
         """
         if self.angle_rad.shape != self.deviation_mm.shape or self.angle_rad.ndim != 1 or self.angle_rad.size < 8:
             raise ValueError("ISO 230-4: a circle needs as many angles as deviations, eight or more")
@@ -48,8 +48,9 @@ class CircularTest:
 class OnePath:
     """Figures of one path, mm.
 
-    ``centre_mm``: of the least squares circle against the set-up's centre; ``radius_mm``: its radius minus the nominal one. ``F_max_mm``,
-    ``F_min_mm``: extremes of the radial deviation about the set-up's centre; ``..._centred_mm``: about the least squares one.
+    ``G_mm``, ``G_zone_mm``: by least squares; by the minimum zone, NaN if the search fails. ``centre_mm``: least squares centre minus the
+    set-up's centre; ``radius_mm``: least squares radius minus the nominal one. ``F_max_mm``, ``F_min_mm``: extremes of the radial deviation
+    about the set-up's centre; ``..._centred_mm``: about the least squares centre. ``noise_mm``: standard deviation of one reading.
     """
 
     G_mm: float
@@ -65,7 +66,7 @@ class OnePath:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it went all round."""
+        """Whether the path covers at least `FULL_RAD`."""
         return bool(self.covered_rad >= FULL_RAD)
 
 
@@ -117,7 +118,7 @@ def both_ways(forward: CircularTest, backward: CircularTest) -> BothWays:
 
 
 def centred(path: CircularTest) -> F1:
-    """Radial deviation about the least squares circle, mm, shape (n,): what a polar picture shows."""
+    """Radial deviation about the least squares circle, mm, shape (n,), for a polar plot."""
     return _centred([path])[1][0]
 
 
@@ -126,14 +127,14 @@ def _columns(angle_rad: F1) -> F2:
 
 
 def _centred(paths: list[CircularTest]) -> tuple[F1, list[F1]]:
-    """Common least squares circle (a, b, c) of the paths, and what is left of each."""
+    """Common least squares circle (a, b, c) of the paths, and the residuals of each path, mm."""
     a = _columns(np.concatenate([p.angle_rad for p in paths]))
     found = np.linalg.lstsq(a, np.concatenate([p.deviation_mm for p in paths]), rcond=None)[0]
     return found, [np.asarray(p.deviation_mm - _columns(p.angle_rad) @ found) for p in paths]
 
 
 def zone_mm(path: CircularTest) -> float:
-    """Smallest difference of the radii of two concentric circles around all readings: a linear programme in centre and two radii."""
+    """Width of the minimum zone, mm: smallest radius difference of two concentric circles that enclose all readings; NaN if not found."""
     left = centred(path)
     keep = _extremes(left)
     a, y = _columns(path.angle_rad[keep]), left[keep]

@@ -16,8 +16,8 @@ class Diagonals:
     """The diagonals of a volume (four) or of one plane (two).
 
     ``each``: by name. ``E_d``, ``B_d``, ``M_d``: largest bidirectional systematic deviation, reversal, and range of the bidirectional
-    means, each with the name of the diagonal that has it; ``R_d``: largest repeatability, None without repeats. ``missing``: what the
-    standard asks for and was not measured: then the figures are lower bounds.
+    means, each with the name of its diagonal; ``R_d``: largest repeatability, None without repeats. ``missing``: diagonals that the
+    standard asks for and that were not measured; if there are any, the figures are lower bounds.
     """
 
     each: Mapping[str, Positioning]
@@ -34,19 +34,21 @@ def diagonals(readings: Mapping[str, Approaches], wanted: Iterable[str] = BODY, 
     Parameters
     ----------
     readings : mapping of str to Approaches
-        By name (``ppp``: all axes grow); positions along the diagonal.
+        By name, a letter per axis: ``p`` grows along the diagonal, ``n`` falls. Positions are distances along the diagonal.
     wanted : iterable of str
         Names that the standard asks for: `BODY` or `FACE`.
 
     Raises
     ------
     ValueError
-        No diagonal, or one that is not wanted.
+        No diagonal, or one that is not in ``wanted``.
     """
     names = set(wanted)
     strange = sorted(set(readings) - names)
     if strange or not readings:
-        raise ValueError(f"ISO 230-6: diagonal {strange[0]!r} is none of {sorted(names)}" if strange else "ISO 230-6: no diagonal")
+        raise ValueError(
+            f"ISO 230-6: diagonal {strange[0]!r} is not one of {sorted(names)}" if strange else "ISO 230-6: no diagonal was given"
+        )
     each = {name: positioning(readings[name], budget) for name in sorted(readings)}
     repeats = {name: p.R for name, p in each.items() if p.R is not None}
     return Diagonals(

@@ -1,1 +1,1 @@
-"""Which measurements to make in the time there is, and what each of them buys."""
+"""Plan which measurements to make in the available time, with the uncertainty that each of them reaches."""

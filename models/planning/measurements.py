@@ -1,8 +1,8 @@
-"""What a campaign can use and do: instruments with the minutes of their set-ups, and all collision-free measurements with their records.
+"""Instruments with the minutes of their set-ups, and all collision-free measurements with the runs that they would record.
 
-Measurements are helices, edge lines and body diagonals. Collision-free means: the whole path lies inside the strokes less a clearance;
-hemispheres open towards the spindle, so that it never comes beyond the cup (`opening`); laser paths stay inside the strokes. The service's
-sequences move to the same positions (a test keeps both in step); here they are reduced to the needs of the solver's design.
+Measurements are helices, edge lines and body diagonals. Collision-free means that the whole path stays inside the strokes less a clearance
+and that hemispheres open towards the spindle (`opening`), which then never moves beyond the cup. The service's sequences move to the same
+positions (a test compares the two).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from abbe.models.solvers.priors import U_WAVELENGTH
 from abbe.models.uncertainty.inputs import StatedInputs
 
 BAR_LENGTHS_MM = (50.0, 100.0, 150.0, 200.0, 250.0, 300.0)
-"""Bars that exist as a bar with extensions."""
+"""Default lengths: one bar with its extensions."""
 Point = tuple[float, float, float]
 RAPID_MM_MIN = 6000.0
 BAR_FEED_MM_MIN = 2000.0
@@ -31,29 +31,29 @@ READING_S = 0.4
 CLEARANCE_MM = 10.0
 """Laser paths keep this distance from the ends of the strokes."""
 BAR_VALUES = 400
-"""Block averages that one ball-bar run gives the solution."""
+"""Block means that the solution uses of one ball-bar run."""
 _FINE = 8
 BAR_CLEARANCE_MM = 5.0
-"""Hemispheres keep this distance from the ends of the strokes: approach, lost motion and cup offset need some."""
+"""Hemispheres keep this distance from the ends of the strokes, for approach, lost motion and cup offset."""
 EDGES = (0.1, 0.5, 0.9)
-"""Relative places of laser lines across the two other axes."""
+"""Positions of laser lines on the two other axes, as fractions of the stroke."""
 ORDERS = tuple("".join(p) for p in permutations("XYZ"))
 SHORTEST_TOOL_MM = 1.0
-"""A shorter tool does not show the side of the spindle."""
+"""A shorter tool vector does not tell on which side of the cup the spindle is."""
 OBLIQUE = 0.5
-"""Second longest component of a tool over its longest, from which on the spindle's direction is doubtful."""
+"""From this ratio of the tool's second longest to its longest component, the spindle's direction is doubtful."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetupMinutes:
-    """How long a person needs for each set-up, minutes: typical figures, to be replaced by one's own.
+    """How long a person needs for each set-up, minutes; the defaults are typical values.
 
     Attributes
     ----------
-    cup : put up cup and bar at a new centre.
-    bar : hang another bar in at the same cup. Another direction with the same bar takes no set-up at all.
+    cup : mount cup and bar at a new centre.
+    bar : change to another bar at the same cup. The other direction with the same bar needs no set-up.
     line : align the laser along an edge.
-    diagonal : align laser and flat mirror along a body diagonal. Another step order on the same mirror takes no set-up at all.
+    diagonal : align laser and flat mirror along a body diagonal. Another step order with the same mirror needs no set-up.
     """
 
     cup: float = 3.0
@@ -69,7 +69,7 @@ class SetupMinutes:
 
 @dataclass(frozen=True, slots=True)
 class Instruments:
-    """What there is to measure with, and how well it reads.
+    """The instruments at hand and their uncertainties.
 
     Attributes
     ----------
@@ -80,7 +80,8 @@ class Instruments:
     bar_noise_mm, laser_noise_mm : float
         Standard deviation of one reading.
     floor_mm : float
-        Smallest uncertainty of an averaged value: what smooth error functions do not follow (as in the joint solution).
+        Standard uncertainty that averaging cannot reduce, because smooth error functions do not follow the machine (as in the joint
+        solution).
     u_bar_length_mm : float
         Standard uncertainty of each bar's calibrated length.
     u_wavelength : float
@@ -90,7 +91,7 @@ class Instruments:
     max_feed_mm_min : float
         Fastest feed of any measurement on the machine.
     inputs : StatedInputs
-        How well temperatures of bars and scales are known; default: as in the budget of a solution.
+        How well the temperatures of bars and scales are known; default: as in the budget of a solution.
     """
 
     bar_lengths_mm: tuple[float, ...] = BAR_LENGTHS_MM
@@ -105,7 +106,7 @@ class Instruments:
     inputs: StatedInputs = field(default_factory=StatedInputs)
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument has, in one line."""
+        """Refuse values that no instrument can have."""
         noise = (self.bar_noise_mm, self.laser_noise_mm)
         sizes = (*self.bar_lengths_mm, *noise, self.u_bar_length_mm, self.u_wavelength, self.max_feed_mm_min)
         if not all(0 < v < float("inf") for v in sizes) or not 0 <= self.floor_mm < float("inf"):
@@ -118,7 +119,7 @@ class Instruments:
 class HelixTest:
     """Ball-bar on a hemispherical helix about one cup, pole to equator or (direction -1) back.
 
-    ``axis``, ``opens``: the pole stands on this axis, on its positive (1) or negative (-1) side of the cup: where the spindle is.
+    The pole lies along ``axis`` (0 to 2), on the positive (``opens`` 1) or negative (-1) side of the cup, where the spindle is.
     """
 
     centre_mm: Point
@@ -149,7 +150,7 @@ class DiagonalTest:
 
     @property
     def mounting(self) -> str:
-        """Tests with equal mounting share the mirror's tilt."""
+        """Key of the mirror's mounting: tests with the same key share the mirror's tilt."""
         return f"diagonal {self.diagonal}"
 
     @property
@@ -160,7 +161,7 @@ class DiagonalTest:
 
 @dataclass(frozen=True, slots=True)
 class LineTest:
-    """Laser along one axis, ``n`` positions out and back; ``at``: relative places of the two other axes, in the order X, Y, Z."""
+    """Laser along one axis, ``n`` positions out and back; ``at``: positions of the two others, X before Y before Z, fractions of stroke."""
 
     axis: int
     at: tuple[float, float]
@@ -168,7 +169,7 @@ class LineTest:
 
     @property
     def mounting(self) -> str:
-        """Every line has its own alignment."""
+        """Key of the laser's alignment: every line has its own."""
         return self.label
 
     @property
@@ -181,7 +182,7 @@ Measurement = HelixTest | DiagonalTest | LineTest
 
 
 def laser_path(machine: Machine, test: DiagonalTest | LineTest) -> tuple[F2, F1]:
-    """Positions of a laser test, shape (n, 3), and its nominal beam (unit vector)."""
+    """Positions of a laser test, shape (n, 3), mm, and the unit vector of its nominal beam."""
     if isinstance(test, DiagonalTest):
         start, end = diagonal_ends(machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM]), test.diagonal)
         path = step_diagonal(start, end, test.steps, test.order) if test.order else straight_line(start, end, test.steps + 1)
@@ -198,18 +199,18 @@ def laser_path(machine: Machine, test: DiagonalTest | LineTest) -> tuple[F2, F1]
 def helix_path(test: HelixTest, n: int) -> F2:
     """Positions of a ball-bar test in the order of measuring, shape (n, 3), mm."""
     points = helix_points(np.array(test.centre_mm), test.radius_mm, turns=test.turns, n=n, law="area", axis=test.axis)
-    if test.opens < 0:  # seen in a mirror across the equator
+    if test.opens < 0:  # mirrored at the equator
         points[:, test.axis] = 2.0 * test.centre_mm[test.axis] - points[:, test.axis]
     return points if test.direction > 0 else points[::-1]
 
 
 def feed_mm_min(tools: Instruments, test: Measurement) -> float:
-    """Feed along a test's path: the usual one, or the machine's fastest where that is less."""
+    """Feed along a test's path: the instrument's usual feed, limited to the machine's fastest."""
     return min(BAR_FEED_MM_MIN if isinstance(test, HelixTest) else RAPID_MM_MIN, tools.max_feed_mm_min)
 
 
 def machine_seconds(machine: Machine, test: Measurement, tools: Instruments) -> float:
-    """Time the machine moves and reads for one test: out to the path, along it, reading; without any set-up."""
+    """Time that one test takes for approach, path and readings, s, without the set-up."""
     feed = feed_mm_min(tools, test)
     if isinstance(test, HelixTest):
         length = np.linalg.norm(np.diff(helix_path(test, 2000), axis=0), axis=1).sum()
@@ -220,9 +221,9 @@ def machine_seconds(machine: Machine, test: Measurement, tools: Instruments) -> 
 
 
 def expected_run(machine: Machine, test: Measurement, tools: Instruments, *, values: int = BAR_VALUES, start_s: float = 0.0) -> RunData:
-    """The run that a perfect machine would give: real positions, directions, times and weights; every deviation zero.
+    """Return the run that a perfect machine would give: real positions, directions, times and weights; every deviation zero.
 
-    A ball-bar run comes as ``values`` block means on the sphere, each of ``weight_n`` readings; a laser run has one reading a position.
+    A ball-bar run has ``values`` block means on the sphere, each of ``weight_n`` readings; a laser run has one reading per position.
     """
     if isinstance(test, HelixTest):
         return _expected_helix(test, tools, values, start_s)
@@ -260,7 +261,7 @@ def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: f
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Where hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why that may be wrong; empty where the tool states it."""
+    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why it may be wrong, empty if the tool fixes it."""
 
     axis: int
     side: int
@@ -273,21 +274,22 @@ class Opening:
 
 
 def opening(machine: Machine, vertical: int = 2) -> Opening:
-    """Side on which the spindle is, seen from the cup: against the tool, which reaches from the spindle to the ball.
+    """Find the side of the cup on which the spindle is: against the tool vector, which points from the spindle to the ball.
 
-    Without a known tool: the upper side of the vertical axis, which is right for a vertical spindle.
+    Without a known tool it is the upper side of the vertical axis, which is right for a vertical spindle.
     """
     longest = int(np.argmax(np.abs(machine.tool_mm)))
     sizes = np.sort(np.abs(machine.tool_mm))
     if sizes[2] < SHORTEST_TOOL_MM:
         reason = f"hemispheres open along +{AXES[vertical]}, the vertical axis: without tool_mm the direction of the spindle is unknown"
-        return Opening(vertical, 1, f"{reason}; if it is horizontal, state tool_mm in the machine file, else it may meet the cup")
+        return Opening(vertical, 1, f"{reason}; if the spindle is horizontal, state tool_mm in the machine file, or it may hit the cup")
     found = Opening(longest, -1 if machine.tool_mm[longest] > 0 else 1)
     if sizes[1] < OBLIQUE * sizes[2]:
         return found
     tool = ", ".join(f"{v:g}" for v in machine.tool_mm)
     warning = (
-        f"hemispheres open along {found.text}, against the longest part of tool_mm ({tool}): it is oblique, look where the spindle goes"
+        f"hemispheres open along {found.text}, against the longest component of tool_mm ({tool}); the tool is oblique: check that the "
+        "spindle cannot hit the cup"
     )
     return Opening(found.axis, found.side, warning)
 
@@ -313,19 +315,19 @@ def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple
         found += [LineTest(a, (u, v)) for a in range(3) for u, v in product(EDGES, repeat=2)]
         found += [DiagonalTest(d, order) for d in DIAGONALS for order in (*ORDERS, "")]
     if not found:
-        raise ValueError("planner: no helix of the bars at hand and no laser path fits into the strokes")
+        raise ValueError("planner: the strokes are too short for a helix with any of the bars and for every laser path")
     return tuple(found)
 
 
 def _room(machine: Machine, radius_mm: float, spindle: Opening) -> tuple[F1, F1]:
-    """Lowest and highest cup place (whole mm) at which the hemisphere of a radius stays inside the strokes."""
+    """Lowest and highest cup centre (whole mm) at which a hemisphere of this radius stays inside the strokes."""
     below, above = np.full(3, radius_mm + BAR_CLEARANCE_MM), np.full(3, radius_mm + BAR_CLEARANCE_MM)
     (below if spindle.side > 0 else above)[spindle.axis] = BAR_CLEARANCE_MM
     return np.ceil(machine.stroke_mm[:, 0] + below), np.floor(machine.stroke_mm[:, 1] - above)
 
 
 def bars_that_fit(machine: Machine, tools: Instruments, test: HelixTest) -> tuple[float, ...]:
-    """Bars whose whole hemisphere about the cup of a helix stays inside the strokes."""
+    """Lengths (mm) of the bars whose whole hemisphere about the cup of ``test`` stays inside the strokes."""
     fit = []
     for radius in tools.bar_lengths_mm:
         lo, hi = _room(machine, radius, Opening(test.axis, test.opens))
@@ -335,7 +337,7 @@ def bars_that_fit(machine: Machine, tools: Instruments, test: HelixTest) -> tupl
 
 
 def helix_centres(machine: Machine, radius_mm: float, spindle: Opening) -> tuple[Point, ...]:
-    """Cup places (whole mm) at which the whole hemisphere of a radius stays inside the strokes."""
+    """A grid of cup centres (whole mm) at which the whole hemisphere of this radius stays inside the strokes."""
     lo, hi = _room(machine, radius_mm, spindle)
     if (hi < lo).any():
         return ()

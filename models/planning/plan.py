@@ -1,8 +1,8 @@
-"""Plan a campaign: which set-ups, in which order, what each of them buys in micrometres, and what the whole leaves open.
+"""Plan a campaign: which set-ups in which order, the uncertainty after each step, and what remains unobservable.
 
-The uncertainties stated here are the posterior (Bayesian Cramer-Rao) bound of the planned readings, the bars' temperature included, and on
-top of it the temperature of the scales, both as in the solution's own budget (`abbe.models.uncertainty.inputs`). Not in them: error motions
-above the planner's order, and that noise and typical sizes will be estimated from the readings.
+The uncertainties are the posterior (Bayesian Cramer-Rao) bound of the planned readings, with the temperatures of bars and scales as in the
+solution's own budget (`abbe.models.uncertainty.inputs`). They leave out error motions above the planner's order, and that noise and typical
+sizes will be estimated from the readings.
 """
 
 from __future__ import annotations
@@ -20,11 +20,9 @@ from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 
-# Sentences about the blind spots of a planned campaign, before anything is measured.
-
 __all__ = ["Plan", "PlanStep", "laid_out", "plan_campaign", "uncertainty_mm"]
 PLAN_ORDER = 8
-"""Legendre order of the error motions a plan is judged with; orders above 6 fade in the prior."""
+"""Highest Legendre order of the error motions in a plan's uncertainty; the prior of orders above 6 is small."""
 INNER_SHARE = 0.8
 REPORT_NODES = 5
 PASSES = 8
@@ -49,8 +47,8 @@ def not_observable(what: PlanningProblem, runs: Iterable[RunData]) -> tuple[str,
     if silent:
         tool = ", ".join(f"{v:g}" for v in what.machine.tool_mm)
         out.append(
-            f"What {silent} of the error motions' {len(what.terms)} degrees of freedom do is not seen: they move nothing with the tool "
-            f"({tool}) mm, but do with another. All of this holds for this tool length only."
+            f"{silent} of the {len(what.terms)} degrees of freedom of the error motions are not observable: with the tool ({tool}) mm they "
+            "move nothing, with another tool they would. The plan's uncertainties hold for this tool only."
         )
     return (*out, *(a.text for a in found.advice))
 
@@ -62,13 +60,13 @@ class PlanStep:
     Attributes
     ----------
     label, setup_id : str
-        Name of the run; set-up that it shares with the steps beside it.
+        Name of the run; name of its set-up, which consecutive steps can share.
     test : HelixTest, DiagonalTest or LineTest
     minutes, until_min : float
-        Set-up and machine time of this step; the same of the plan up to its end.
+        Set-up and machine time of this step; of the plan up to the end of this step.
     u_worst_mm, u_mean_mm : float
-        After this step: standard uncertainty of the deviation vector (rigid motion free) at the worst node and as root mean square over
-        the nodes of the inner volume.
+        Standard uncertainty of the deviation vector (rigid motion removed) after this step: at the worst node, and the root mean square
+        over the nodes of the inner volume.
     """
 
     label: str
@@ -89,17 +87,17 @@ class Plan:
     machine : Machine
     tools : Instruments
     steps : tuple of PlanStep
-        In the order of measuring: what gains most per minute comes first.
+        In the order of measuring: the set-up that gains most per minute comes first.
     runs : tuple of RunData
-        What a perfect machine would record, deviations zero: positions, directions, times, weights of the block means.
-    u_before_mm : (worst, mean)
-        From the priors alone.
+        The runs of a perfect machine: positions, directions, times and weights of the block means, deviations zero.
+    u_before_mm : tuple of two floats
+        Worst and mean standard uncertainty from the priors alone.
     u_temperature_mm : float
-        What the temperature of the scales does at its worst node: part of every figure above, and nothing measured takes it away.
+        Largest standard uncertainty of a node from the temperature of the scales: part of every figure above; no measurement reduces it.
     open_questions : tuple of str
-        Sentences about what is not observable.
+        Sentences about combinations of error motions that the plan cannot observe, with cause and cure.
     goal : Goal or None
-        Result for the wanted uncertainty, if one was given.
+        How the plan meets the wanted uncertainty; None if none was wanted.
     warnings : tuple of str
         Points that the operator must check before anything moves.
     """
@@ -183,7 +181,7 @@ def plan_campaign(
 
 
 def laid_out(search: Search, chosen: Chosen, goal_mm: float | None = None) -> Plan:
-    """A choice of measurements as a plan: ordered by gain per minute, named, with what each buys; it ends where a goal is reached."""
+    """Turn a choice of measurements into a plan: order them by gain per minute, label them, stop where the goal (U, mm) is reached."""
     machine, tools = search.what.machine, search.what.tools
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     stated = scale_temperature_mm2(search.what, rows)

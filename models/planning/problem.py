@@ -1,8 +1,8 @@
-"""Information of one mounting on the machine: a matrix over the unknowns that all mountings share.
+"""Information of one mounting, as a matrix over the unknowns that all mountings share.
 
-Shared are the smooth terms, the lost motion, the length of every bar, their temperature and the laser's wavelength; cup, mirror tilts, zero
-and drift belong to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its
-prior standard deviation, so that the prior is the unit matrix.
+Shared are the smooth terms, the lost motion, the bars' lengths and temperature and the laser's wavelength. Cup, mirror tilts, zero and
+drift belong to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its prior
+standard deviation, so the prior's information is the unit matrix.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from abbe.models.solvers.priors import Priors, term_prior_sd
 LASER_SCALE = "laser_scale"
 BAR_SCALE = "bar_temperature"
 PAUSE_S = 60.0
-"""Between two runs of one mounting: drifts go on."""
+"""Pause between two runs of one mounting; drifts continue in it."""
 SEARCH_VALUES = 120
-"""Points that stand for the block means of a helix while searching: 24 a turn follow every smooth term; the weight stays the run's."""
+"""Points that replace a helix's block means during the search, at the same total weight: 24 per turn resolve every smooth term."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class PlanningProblem:
 
 
 def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | None = None) -> PlanningProblem:
-    """Set up what a plan is about; ``order``: highest Legendre order of the error motions."""
+    """Set up the planning problem; ``order``: highest Legendre order of the error motions."""
     priors, terms = priors or Priors(), smooth_terms(order)
     bars = [bar_length_name(r) for r in sorted(tools.bar_lengths_mm)]
     names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE, BAR_SCALE)
@@ -58,7 +58,7 @@ def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | N
 
 
 def mounting_information(what: PlanningProblem, tests: tuple[Measurement, ...]) -> F2:
-    """Information of all tests of one mounting on the shared unknowns, shape (size, size), in units of their priors."""
+    """Information of all tests of one mounting about the shared unknowns in units of their prior sd, shape (size, size)."""
     runs = _search_runs(what, tests)
     setup = setup_unknowns(runs, what.priors)
     own = [i for i, n in enumerate(setup.names) if n not in what.names]
@@ -73,7 +73,7 @@ def mounting_information(what: PlanningProblem, tests: tuple[Measurement, ...]) 
 
 
 def _search_runs(what: PlanningProblem, tests: tuple[Measurement, ...]) -> tuple[RunData, ...]:
-    """The runs of one mounting, one after the other: drifts go on while it stands."""
+    """The runs of one mounting, one after the other in time, because drifts continue from run to run."""
     runs: list[RunData] = []
     for test in tests:
         start_s = float(runs[-1].t_s[-1]) + PAUSE_S if runs else 0.0
@@ -99,20 +99,20 @@ def _shared_columns(what: PlanningProblem, run: RunData, full: F2, setup_names: 
     for i, name in enumerate(setup_names):
         if name in what.names:
             out[:, what.names.index(name)] = full[:, first + i]
-    if run.radius_mm is not None:  # a bar that is warmer than thought is longer in proportion
+    if run.radius_mm is not None:  # a bar that is warmer than assumed is longer in proportion to its length
         out[:, what.names.index(BAR_SCALE)] = full[:, first + setup_names.index(bar_length_name(run.radius_mm))] * run.radius_mm
     return np.asarray(out * what.prior_sd)
 
 
 def factor(information: F2) -> F2:
-    """Rows F with F^T F = information, without directions that tell less than a hundred-thousandth of the prior, shape (r, size)."""
-    value, vector = scipy.linalg.eigh(information, driver="evd")  # faster than only the wanted part by another driver
+    """Rows F with F^T F = information, without directions that hold less than 1e-5 of the prior's information, shape (r, size)."""
+    value, vector = scipy.linalg.eigh(information, driver="evd")  # faster than a driver that finds only the needed eigenvalues
     told = value > 1e-5
     return np.asarray(np.sqrt(value[told])[:, None] * vector.T[told])
 
 
 def field_rows(what: PlanningProblem, share: float, nodes: int) -> F2:
-    """Deviation free of rigid motion at the nodes of the inner volume per unit of every shared unknown, shape (nodes^3 * 3, size), mm."""
+    """Deviation, rigid motion removed, at nodes of the inner volume per prior sd of each shared unknown, shape (nodes^3 * 3, size), mm."""
     box = what.machine.centre_mm[:, None] + share * (what.machine.stroke_mm - what.machine.centre_mm[:, None])
     grid = volume_grid(box, nodes)
     g = design(what.machine, what.terms, grid).reshape(-1, len(what.terms))
@@ -123,9 +123,9 @@ def field_rows(what: PlanningProblem, share: float, nodes: int) -> F2:
 
 
 def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
-    """Variance that scales of unknown temperature leave at each node of ``rows`` (`field_rows`), rigid motion free, shape (nodes,), mm^2.
+    """Variance from the scales' unknown temperature at each node of ``rows`` (`field_rows`), rigid motion removed, shape (nodes^3,), mm^2.
 
-    As in the budget of a solution (`abbe.models.uncertainty.sources`): each axis is independently too long by expansion times temperature.
+    As in the budget of a solution (`abbe.models.uncertainty.sources`), each axis is independently too long by expansion times temperature.
     No reading shows this, because it concerns the days after the campaign.
     """
     slope = what.tools.inputs.u_scale_temperature_k * what.tools.inputs.scale_expansion_per_k
@@ -139,7 +139,7 @@ def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
 def uncertainty_mm(information: F2, rows: F2, stated_mm2: F1 | float = 0.0) -> tuple[float, float]:
     """Standard uncertainty of the deviation vector at the worst node and as root mean square over the nodes, mm.
 
-    ``stated_mm2``: variance on top of what readings and priors leave, at each node (`scale_temperature_mm2`).
+    ``stated_mm2``: further variance at each node, which readings do not reduce (`scale_temperature_mm2`).
     """
     half = scipy.linalg.solve_triangular(scipy.linalg.cholesky(information, lower=True), rows.T, lower=True)
     v = (half**2).sum(axis=0).reshape(-1, 3).sum(axis=1) + stated_mm2

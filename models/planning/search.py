@@ -1,8 +1,8 @@
-"""Choice of measurements for the available minutes: greedy by gain per minute, then exchanges; minutes for a wanted uncertainty.
+"""Choose measurements for the available minutes, greedily by gain per minute and then by exchanges; find the minutes for a goal.
 
-The criterion is I-optimal: the variance of the predicted, rigid-motion-free deviation over the inner volume, as a power mean over the
-nodes that leans on the worst node (power 1 is the plain mean, an infinite power the worst node). It leaves out what no choice of
-measurements changes (temperature of the scales).
+The criterion is I-optimal: the variance of the predicted deviation, rigid motion removed, over the inner volume, as a power mean over the
+nodes: between the plain mean (power 1) and the worst node (infinite power). It leaves out the temperature of the scales, which no choice of
+measurements changes.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from abbe.models.planning.problem import (
 )
 
 POWER = 4.0
-"""Of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
+"""Power of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
 SEARCH_NODES = 4
 THRIFTS = (1.0, 0.5, 0.0)
 """Exponents of the minutes in gain / minutes^thrift: 1 prefers cheap measurements, 0 large gains."""
 LOOK_AT_ALL = 4
-"""Additions between two evaluations of all candidates; in between only the best third of the last one is evaluated."""
+"""All candidates are evaluated at every fourth addition; in between, only the best third of the previous evaluation."""
 
 Chosen = dict[str, tuple[Measurement, ...]]
-"""Mounting to its tests, in the order in which they were chosen."""
+"""Tests of each mounting (`HelixTest.mounting`), in the order in which they were chosen."""
 COVERAGE = 2.0
-"""U = 2 u."""
+"""Coverage factor: U = 2 u."""
 LONGEST_MIN = 480.0
-"""Longest plan, one day's work: beyond it the answer is the limit."""
+"""Longest plan considered, one day's work; for a goal that needs more, only the limit is reported (`Goal`)."""
 _FOREVER = 1e6
 _KNOWN = 1e12
 
@@ -60,7 +60,7 @@ def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, 
 
 @dataclass
 class Search:
-    """Searches one problem; keeps every mounting's information, because the same ones are asked for again and again."""
+    """Search of one planning problem; caches the information of every mounting."""
 
     what: PlanningProblem
     candidates: tuple[Measurement, ...]
@@ -78,7 +78,7 @@ class Search:
         self._rows = field_rows(self.what, self.share, SEARCH_NODES)
 
     def cost_min(self, test: Measurement, before: tuple[Measurement, ...]) -> float:
-        """Minutes that a test takes after the others on its mounting."""
+        """Minutes that a test takes when its mounting already holds ``before``."""
         if test not in self._machine_min:
             self._machine_min[test] = machine_seconds(self.what.machine, test, self.what.tools) / 60.0
         return extra_minutes(self.what.tools.setup, self._machine_min[test], test, before)
@@ -123,7 +123,7 @@ class Search:
         return ranked[0] if ranked else None
 
     def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...], thrift: float = 1.0) -> list[Measurement]:
-        """Affordable tests of the pool, and what fits to the cups that stand, by gain / minutes^thrift, the best first."""
+        """Rank the affordable tests of the pool and those at cups already chosen by gain / minutes^thrift, best first."""
         costs = self._affordable(chosen, budget_min, pool)
         if not costs:
             return []
@@ -142,7 +142,7 @@ class Search:
         return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
 
     def _affordable(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...]) -> dict[Measurement, float]:
-        """Minutes of each test of the pool, and of what fits to the cups that stand, that can come next within the budget."""
+        """Minutes of each test, of the pool or at a cup already chosen, that can come next within the budget."""
         costs = {}
         for test in (*pool, *self._at_cups(chosen)):
             before = chosen.get(test.mounting, ())
@@ -154,7 +154,7 @@ class Search:
         return costs
 
     def _at_cups(self, chosen: Chosen) -> list[Measurement]:
-        """Other bars, and the way back with the same bar, at the cups that stand already."""
+        """Tests with other bars, and with the same bar in the other direction, at cups already chosen."""
         found: list[Measurement] = []
         for tests in chosen.values():
             last = tests[-1]
@@ -175,7 +175,7 @@ class Search:
             left -= self.cost_min(test, before)
             chosen[test.mounting] = (*before, test)
             looks += 1
-            # Gains fall from step to step for all alike: between two looks at everything the best are enough.
+            # All gains fall alike from step to step, so the best candidates suffice between two full evaluations.
             pool = (
                 self.candidates if looks % LOOK_AT_ALL == 0 else tuple(t for t in ranked[: len(self.candidates) // 3] if t in self._known)
             )
@@ -188,7 +188,7 @@ class Search:
         return min((self.fill({}, budget_min, thrift) for thrift in THRIFTS), key=self.criterion)
 
     def exchange(self, chosen: Chosen, budget_min: float, passes: int) -> Chosen:
-        """Take every mounting, and every last test of one, out in turn; fill the time again; keep what is better."""
+        """Remove each mounting, and each mounting's last test, in turn and fill the time again; keep every better plan."""
         best = self.criterion(chosen)
         for number in range(passes):
             improved = False
@@ -205,7 +205,7 @@ class Search:
 
 
 def _follows(test: HelixTest, before: tuple[Measurement, ...]) -> bool:
-    """Whether a helix can come next at a cup: with the same bar only back, and no bar is hung in twice."""
+    """Whether a helix can come next at a cup: no bar is mounted twice, and the bar in place can only measure the other direction."""
     last, used = before[-1], [b.radius_mm for b in before if isinstance(b, HelixTest)]
     return isinstance(last, HelixTest) and (
         test.radius_mm not in used or (test.radius_mm == last.radius_mm and test.direction != last.direction)
@@ -234,8 +234,7 @@ class Goal:
     minutes_needed : float or None
         Minutes after which it is reached; None: not within `LONGEST_MIN`.
     limit_mm : float
-        U that every measurement the planner knows, repeated without end, and the temperature of the scales would leave: no plan comes
-        below it.
+        U that would remain if every candidate were repeated without end, temperature of the scales included: no plan reaches less.
     limit_by : str
         Main contribution to the limit, as text.
     """
@@ -248,7 +247,7 @@ class Goal:
 
 
 def limit(search: Search, rows: F2) -> tuple[float, str]:
-    """Expanded uncertainty (mm) that endless repetition of everything would leave at the worst node, and what makes most of it."""
+    """Return the U = 2 u (mm) that endless repetition of every candidate leaves at the worst node, and its largest contribution as text."""
     what, total = search.what, np.zeros((search.what.size, search.what.size))
     for test in search.candidates:
         total += search.mounting((test,))
@@ -258,9 +257,9 @@ def limit(search: Search, rows: F2) -> tuple[float, str]:
     readings = uncertainty_mm(information, rows)[0]
     unseen = uncertainty_mm(information + np.diag(np.where(scales, _KNOWN, 0.0)), rows)[0]
     shares = {
-        "the temperature of the machine's scales, which no measurement tells for another day": whole**2 - readings**2,
+        "the temperature of the machine's scales on later days, which no measurement shows": whole**2 - readings**2,
         "the calibration of the bars, their temperature and the laser's wavelength": readings**2 - unseen**2,
-        "combinations of error motions that none of these measurements sees": unseen**2,
+        "combinations of error motions that none of these measurements shows": unseen**2,
     }
     return COVERAGE * whole, max(shares, key=lambda name: shares[name])
 
@@ -272,7 +271,7 @@ def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, pass
         chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)
         return chosen, bool(chosen) and _enough(search, rows, chosen, wanted_mm)
     chosen = search.exchange(search.best_fill(first), first, passes)
-    if not _enough(search, rows, chosen, wanted_mm):  # the criterion leans on the worst node, it is not the worst node
+    if not _enough(search, rows, chosen, wanted_mm):  # the criterion is a mean over the nodes, the goal concerns the worst node
         chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)
         return chosen, _enough(search, rows, chosen, wanted_mm)
     while True:
@@ -284,7 +283,7 @@ def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, pass
 
 
 def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen, longest_min: float = LONGEST_MIN) -> float | None:
-    """Minutes at which going on from a plan reaches the goal; None: not within the longest time."""
+    """Minutes of a plan that extends ``start`` until it reaches the goal; None: not within ``longest_min``."""
     chosen = dict(start)
     while True:
         left = longest_min - search.total_min(chosen)

@@ -1,10 +1,10 @@
-"""Trials of a whole campaign: readings, calibrations, temperatures and omitted orders drawn anew, solved anew, predicted anew.
+"""Trials of a whole campaign: each draws readings, calibrations, temperatures and omitted orders, solves and predicts.
 
-Memory: one batch of results, 10^4 trials of 3 figures per point, and single-precision readings in parts; `MOST_POINTS` at a time. The
-same seed draws the same trials whatever the points (but for a single approach), so more points are worked in parts.
+A batch of results has 10^4 trials of 3 figures per point, so at most `MOST_POINTS` points are allowed at a time. More points can be worked
+in parts: except for a single approach, the same seed draws the same trials for any points.
 
-Linear: the solver's own gain, applied to all trials of a batch at once. Exact: every trial is iterated with the exact reading of every run
-(finite rotations, length of the bar, tilted mirror) as the solver iterates; slow, and there to show that the linear one is good enough.
+Linear trials apply the solver's gain to a whole batch at once. Exact trials iterate like the solver with the exact reading of every run
+(finite rotations, length of the bar, tilted mirror). They are slow, and show that the linear trials are good enough.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ READINGS = ("bar_noise", "laser_noise")
 LIMITS: Mapping[str, Distribution] = MappingProxyType(
     {name: Distribution("rectangular") for name in ("wavelength", "bar_temperature", "scale_temperature")}
 )
-"""For inputs that were stated as limits: rectangular, of unit standard deviation. What no distribution is given for is normal."""
+"""Distributions for inputs that are stated as limits: rectangular, of unit standard deviation."""
 EXACT_ROUNDS = 4
 MOST_POINTS = 500
-"""Points of one set of trials: a batch of 10^4 results is then 120 MB, and so are the copies that sorting and moments make."""
+"""Most points of one set of trials: a batch of 10^4 results then takes 120 MB, and so does each copy for sorting and moments."""
 CHUNK_READINGS = 4_000_000
 """Simulated readings held at once: 16 MB."""
 
@@ -93,7 +93,7 @@ class CampaignTrials:
         return draw
 
     def _with_others(self, out: F2, others: list[tuple[str, F2]], rng: np.random.Generator) -> F2:
-        """What the other sources do to the results, drawn and added in place, about the prediction itself."""
+        """Add the prediction and draws of all other sources to the results, in place."""
         for name, factor in others:
             out += self._drawn(name, rng, (len(out), len(factor))) @ factor
         scatter = self.sources.inputs.repeatability_mm if self.sources.inputs.single_approach else 0.0
@@ -103,7 +103,7 @@ class CampaignTrials:
         return out
 
     def _settled(self, measured: F1, gain: F2, theta: F1) -> F1:
-        """The solver's iteration to the exact model, with its weights and sizes."""
+        """Iterate with the exact model as the solver does, at its final weights and sizes."""
         for _ in range(EXACT_ROUNDS):
             theta = gain @ (measured - _predicted(self.sources.solution, theta) + self.response.design @ theta)
         return np.asarray(theta)
@@ -141,9 +141,9 @@ class CampaignTrials:
 
 
 def _clamped(plus: F2, subtracted: F2) -> F2:
-    """Factor (inputs, 3 m) of the contribution of the estimated sizes, non-negative at every point as in the law of propagation.
+    """Factor (inputs, 3 m) of the contribution of the estimated sizes, clipped at every point as in `predict_deviation`.
 
-    All points use the same draws and stay correlated, and the contribution at a point does not depend on the other points.
+    All points use the same draws and stay correlated; the contribution at one point does not depend on the other points.
     """
     points = plus.reshape(len(plus), -1, 3).transpose(1, 2, 0)  # (m, 3, inputs)
     minus = subtracted.reshape(len(subtracted), subtracted.shape[1] // 3, 3).transpose(1, 2, 0)
@@ -153,7 +153,7 @@ def _clamped(plus: F2, subtracted: F2) -> F2:
 
 
 def _powered(covariance: F3, power: float) -> F3:
-    """Power of each of m symmetric matrices, (m, 3, 3), on what is positive of them."""
+    """Power of each of m symmetric matrices, (m, 3, 3), on its positive eigenvalues; the others become zero."""
     value, vector = np.linalg.eigh(covariance)
     positive = value > 1e-12 * np.maximum(value[:, -1:], 1e-300)
     powered = np.where(positive, np.where(positive, value, 1.0) ** power, 0.0)
@@ -172,21 +172,21 @@ def campaign_trials(
     frame: RigidFree | None = None,
     distributions: Mapping[str, Distribution] | None = None,
 ) -> CampaignTrials:
-    """Make trials of a solution for a prediction at points, shape (m, 3); tool and frame as in `predict_deviation`.
+    """Prepare trials of a solution for a prediction at points, shape (m, 3); tool and frame as in `predict_deviation`.
 
-    ``distributions``: per source name, of unit standard deviation (``u`` 1 for normal and rectangular), e.g. `LIMITS`; normal where none
-    is given. The repeatability of the machine is drawn with the readings it is part of.
+    ``distributions``: by name of the source, of unit standard deviation (``u`` 1 for normal and rectangular), e.g. `LIMITS`; all others are
+    normal. The repeatability of the machine is part of the readings' noise and drawn with it.
 
     Raises
     ------
     ValueError
-        More than `MOST_POINTS` points, or positions that are none.
+        No points, more than `MOST_POINTS`, another shape, or numbers that are not finite.
     """
     if points_mm.ndim != 2 or points_mm.shape[1] != 3 or not len(points_mm) or not np.isfinite(points_mm).all():
         raise ValueError(f"campaign trials: points_mm must be finite numbers of shape (m, 3), got shape {points_mm.shape}")
     if len(points_mm) > MOST_POINTS:
         raise ValueError(
-            f"campaign trials: {len(points_mm)} points need too much memory, at most {MOST_POINTS}: work them in parts, same seed"
+            f"campaign trials: {len(points_mm)} points need too much memory; pass at most {MOST_POINTS} at a time, with the same seed"
         )
     d = unit_deviation(sources.solution.machine, sources.terms, points_mm, tool_mm, frame)
     return CampaignTrials(sources, response(sources.solution), d.reshape(-1, d.shape[2]), distributions or {})

@@ -12,7 +12,7 @@ from abbe.models.probability import chi2_quantile, t_quantile
 
 PROBABILITY = 0.95
 _FLAT, _NOTHING = 1e-12, 1e-24
-"""Variances below this share of the largest, and below this one (of lengths in mm), are rounding."""
+"""Eigenvalues below `_FLAT` times the largest, or below `_NOTHING` (mm^2), are rounding."""
 
 
 def effective_dof(variances: F2, dof: F1) -> F1:
@@ -41,7 +41,7 @@ def coverage_factor(dof: F1, probability: float = PROBABILITY) -> F1:
 
 
 def vector_factor(components: int = 3, probability: float = PROBABILITY) -> float:
-    """Factor of the ellipsoid that holds a whole vector of normal components, e.g. 2.80 for three and 95 % (GUM-S2 6.5.2)."""
+    """Factor of the coverage ellipsoid of a normal vector, e.g. 2.80 for three components and 95 % (GUM-S2 6.5.2)."""
     _checked_probability(probability)
     return float(np.sqrt(chi2_quantile(probability, components)))
 
@@ -81,7 +81,7 @@ def apart_from_zero(vectors: F2, covariance: F3, probability: float = PROBABILIT
 
 
 def symmetric_interval(samples: F2, probability: float = PROBABILITY) -> Interval:
-    """Probabilistically symmetric interval of samples, shape (trials, m): as many above as below (GUM-S1 7.7.2)."""
+    """Probabilistically symmetric interval of samples, shape (trials, m): as many lie above it as below (GUM-S1 7.7.2)."""
     ordered = np.sort(samples, axis=0)
     trials = len(ordered)
     inside = _inside(trials, probability)

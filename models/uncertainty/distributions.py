@@ -68,7 +68,7 @@ class Distribution:
     dof: float = float("inf")
 
     def __post_init__(self) -> None:
-        """Refuse what has no variance."""
+        """Refuse parameters without a finite variance."""
         if self.shape not in ("normal", "rectangular", "t"):
             raise ValueError(f"distribution {self.shape!r}: must be 'normal', 'rectangular' or 't'")
         if not (np.isfinite(self.u) and self.u >= 0):
@@ -84,7 +84,7 @@ class Distribution:
         return self.u
 
     def fill(self, rng: np.random.Generator, out: NDArray[Any]) -> None:
-        """Draw into an array of any shape, double or single precision, in place."""
+        """Fill an array of any shape, double or single precision, with draws."""
         kind: Any = out.dtype.type
         if self.shape == "t" and np.isfinite(self.dof):
             out[...] = rng.standard_t(self.dof, out.shape)

@@ -1,7 +1,7 @@
-"""Stated inputs of an uncertainty budget beside the campaign's data, with documented defaults, each an ASSUMPTION.
+"""Stated inputs of an uncertainty budget beside the campaign's data; each default is an ASSUMPTION.
 
-The solution of a campaign includes the noise of its readings and the priors of its set-ups. It does not include the laser's wavelength,
-temperatures, and errors that a smooth model cannot follow: those are stated here, and the budget prints them as stated.
+The solution of a campaign includes the noise of its readings and the priors of its set-ups, but not temperatures or errors that its smooth
+model cannot follow. Those are stated here, and the budget marks them as stated.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ class StatedInputs:
     Attributes
     ----------
     u_wavelength : float
-        Of the laser's wavelength after air compensation, relative; one laser in all runs. Default:
-        `abbe.models.solvers.priors.U_WAVELENGTH`.
+        Of the laser's wavelength after air compensation, relative; one laser in all runs. It counts only for a solution whose unknowns do
+        not include the wavelength.
     u_scale_temperature_k, scale_expansion_per_k : float
-        How well the temperature of each axis' scale is known, K, for which the prediction holds; 0.2 K is a Pt100 on the scale and a drift
-        of ±0.3 K in the campaign. The three axes are independent. Expansion coefficient of the scales.
+        Standard uncertainty of each scale's temperature, K, and expansion coefficient of the scales, 1/K. 0.2 K stands for a Pt100 on the
+        scale and a drift of ±0.3 K during the campaign. The three axes are independent.
     u_bar_temperature_k, bar_expansion_per_k : float
-        The same of the ball-bar against the temperature of its calibration; one thermometer for all bar runs.
+        The same for the ball-bar, against its calibration temperature; one thermometer serves all bar runs.
     repeatability_mm : float
-        Standard deviation of the machine from one approach of a point to the next, per component. It is part of the scatter of the
-        readings: the budget takes its share out of theirs, at most all of it. Default 0: not known apart.
+        Standard deviation of the machine from one approach of a point to the next, per component. The readings' scatter contains it, so
+        the budget subtracts it from the noise of the readings, down to zero. Default 0: not known separately.
     repeatability_dof : float
-        Degrees of freedom of that figure; inf when it is stated.
+        Degrees of freedom of ``repeatability_mm``; inf if it is stated.
     single_approach : bool
         False (default): the predicted deviation is the mean of many approaches. True: that of one approach, with its repeatability on top.
     orders_above : int
-        How many Legendre orders above the chosen one may still be in the machine (model order); 0 leaves them out.
+        How many Legendre orders above the solution's the machine's errors may still have; 0: none.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class StatedInputs:
     orders_above: int = 4
 
     def __post_init__(self) -> None:
-        """A negative uncertainty would be squared and never seen."""
+        """Refuse negative figures, which would go unnoticed once squared."""
         for name in (
             "u_wavelength", "u_scale_temperature_k", "scale_expansion_per_k",
             "u_bar_temperature_k", "bar_expansion_per_k", "repeatability_mm",
@@ -69,11 +69,11 @@ class StatedInputs:
             raise ValueError("uncertainty inputs: orders_above must be 0 or more, repeatability_dof above 0")
 
     def as_measured(self) -> StatedInputs:
-        """The inputs at the temperature of the measurement: without the temperature of the scales."""
+        """The same inputs for a prediction at the measurement's temperature: scale temperature without uncertainty."""
         return replace(self, u_scale_temperature_k=0.0)
 
     def without_stated_inputs(self) -> StatedInputs:
-        """Zero stated inputs: only the covariance of the solution itself remains."""
+        """The same inputs with every uncertainty zero: only the covariance of the solution remains."""
         return replace(
             self,
             u_wavelength=0.0,

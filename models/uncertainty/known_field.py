@@ -1,6 +1,6 @@
 """Deviation of a machine over its volume by one solution, with covariance: whole, or the part of chosen error motions.
 
-It needs only what a store keeps of a solution: terms, coefficients and their covariance from all sources.
+Only the stored part of a solution is needed: terms, coefficients and their covariance from all sources.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from abbe.models.machine import Machine
 
 @dataclass(frozen=True)
 class KnownField:
-    """What is known of a machine's error motions.
+    """A machine's error motions by one solution, with their covariance.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class KnownField:
     scatter_mm: float = 0.0
 
     def index(self, names: Iterable[str]) -> list[int]:
-        """Places of the terms of motions (``"EXX"``) and of single parameters (``"EXX.1"``), in order.
+        """Indices of the terms of motions (``"EXX"``) and of single parameters (``"EXX.1"``), ascending.
 
         Raises
         ------
@@ -56,24 +56,24 @@ class KnownField:
         return [k for k, t in enumerate(self.terms) if t.motion in wanted or t.name in wanted]
 
     def per_unit(self, points_mm: F2) -> F3:
-        """Deviation per unit of each coefficient, best-fit rigid motion over the strokes removed, shape (m, 3, P)."""
+        """Deviation at points (m, 3) per unit of each coefficient, best-fit rigid motion over the strokes removed, shape (m, 3, P)."""
         return unit_deviation(self.machine, self.terms, points_mm, None, volume_frame(self.machine))
 
     def part(self, motions: Iterable[str]) -> KnownField:
-        """Only some motions, with what is known of them; ValueError for one that is not there."""
+        """The same field with only some of its motions; ValueError for an unknown motion."""
         at = self.index(motions)
         terms = tuple(self.terms[k] for k in at)
         return KnownField(self.machine, terms, self.coefficients[at], self.covariance[np.ix_(at, at)], self.scatter_mm)
 
     def estimate_of(self, names: Iterable[str]) -> F1:
-        """The coefficients with all but those of these motions and parameters set to zero, shape (P,); ValueError as of `index`."""
+        """Coefficients of these motions and parameters, all others zero, shape (P,); ValueError as of `index`."""
         at = self.index(names)
         out = np.zeros_like(self.coefficients)
         out[at] = self.coefficients[at]
         return out
 
     def linear(self, values: Mapping[str, float]) -> F1:
-        """Coefficients of scales (``EXX``, mm/mm) and squareness (``C0Y``, rad) of these values and nothing else, shape (P,).
+        """Coefficients of these scale errors (``EXX``, mm/mm) and squareness errors (``C0Y``, rad), all others zero, shape (P,).
 
         Raises
         ------
@@ -84,12 +84,12 @@ class KnownField:
         for name, value in values.items():
             scale = name[0] == "E"
             [at] = self.index([f"{name}.1" if scale else name])
-            # The function of Legendre order 1 is twice the share of the stroke (`abbe.models.geometry.bases.term_values`).
+            # The function of Legendre order 1 is twice the fraction of the stroke (`abbe.models.geometry.bases.term_values`).
             out[at] = value * self.machine.length_mm["XYZ".index(name[2])] / 2.0 if scale else value
         return out
 
     def root(self) -> F2:
-        """Factor R of the nearest covariance without negative variances, R R^T, shape (P, P): for draws."""
+        """Factor R, for random draws: R R^T is the covariance with negative eigenvalues set to zero, shape (P, P)."""
         values, vectors = np.linalg.eigh(self.covariance)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -104,14 +104,14 @@ class FieldMap:
 
 
 def field_map(known: KnownField, points_mm: F2, motions: Iterable[str] | None = None) -> FieldMap:
-    """Deviation at commanded positions, mean of both directions of motion, as `abbe.models.uncertainty.prediction` has it.
+    """Deviation at commanded positions, mean of both directions of motion, with covariance.
 
     Parameters
     ----------
     known : KnownField
     points_mm : array, shape (m, 3)
     motions : iterable of str, optional
-        Only what these motions make together; None: all of them.
+        Only the joint effect of these motions; None: of all.
 
     Raises
     ------

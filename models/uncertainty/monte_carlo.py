@@ -1,5 +1,7 @@
-"""Propagation of distributions by Monte Carlo, with as many trials as the wanted digits need (GUM-S1 7), and the test of the GUM by it
-(8)."""
+"""Propagation of distributions by Monte Carlo with as many trials as the wanted digits need (GUM-S1 7).
+
+`validate` checks the GUM's law of propagation against it (GUM-S1 8).
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,10 @@ Draw = Callable[[np.random.Generator, int], F2]
 BATCH = 10_000
 """Fewest trials of one batch; 100 / (1 - p) where that is more (GUM-S1 7.9.4)."""
 FEWEST_BATCHES = 10
-"""The spread of two batches is useless: in one case of twelve it is below a tenth of its true size. Of ten it is known to a quarter."""
+"""The spread of two batches is below a tenth of its true size in one case of twelve; that of ten is known to a quarter."""
 LARGEST = 1_000_000
 VALIDATION_SHARE = 0.2
-"""The trials that judge the law of propagation must be known this much better than what they judge (GUM-S1 8.2)."""
+"""Trials that check the law of propagation must be known to this fraction of the check's tolerance (GUM-S1 8.2)."""
 COLUMNS = 300
 """Results whose trials are sorted together."""
 
@@ -34,13 +36,13 @@ class MonteCarlo:
     mean, u : array, shape (m,)
     covariance : array, shape (m, m)
     symmetric, shortest : Interval
-        Coverage intervals: as much outside below as above; the shortest of all. Each is the mean over batches, so that no trial is kept.
+        Coverage intervals: probabilistically symmetric, and shortest. Each is a mean over batches, so that no trial is kept.
     probability : float
     trials : int
     tolerance : array, shape (m,)
-        Numerical tolerance that was asked for: half a unit of the last wanted digit of u, times the share.
+        Requested numerical tolerance: half a unit of the last wanted digit of u, times ``share`` of `adaptive`.
     settled : array of bool, shape (m,)
-        Whether mean, u and both ends of the shortest and the symmetric interval are known that well, at 95 %.
+        Whether mean, u and the ends of both intervals are known to this tolerance, at 95 %.
     ends_known : array, shape (m,)
         Half-width at 95 % of the ends of the symmetric interval; inf from fewer than `FEWEST_BATCHES` batches.
     """
@@ -71,13 +73,13 @@ def adaptive(
     Parameters
     ----------
     draw : callable
-        Gives the results of one batch. Memory is one batch of all results, 0.24 MB per point, some three times.
+        Returns the results of one batch. Memory is about three times one batch of results, which takes 0.24 MB per point.
     rng : Generator
         Seeded by the caller; the same seed gives the same figures.
     digits : int
-        How many digits of u shall be right: 1 or 2 (GUM-S1 7.9.2).
+        Significant digits of u that must be right: 1 or 2 (GUM-S1 7.9.2).
     share : float
-        Tolerance as a share of half a unit of the last digit; `VALIDATION_SHARE` for trials passed to `validate`.
+        Tolerance as a fraction of half a unit of the last digit; `VALIDATION_SHARE` for trials passed to `validate`.
     largest : int
         Most trials; results that have not settled by then are marked in ``settled``.
 
@@ -125,7 +127,7 @@ def batch_size(probability: float) -> int:
 
 
 def _figures(results: F2, probability: float) -> F2:
-    """Mean, u and the ends of both intervals of one batch, shape (6, m); sorted in parts, which keeps the copies small."""
+    """Mean, u and the ends of both intervals of one batch, shape (6, m); sorted in parts to save memory."""
     out = np.empty((6, results.shape[1]))
     for i in range(0, results.shape[1], COLUMNS):
         part = results[:, i : i + COLUMNS]
@@ -135,14 +137,14 @@ def _figures(results: F2, probability: float) -> F2:
 
 
 def _known(figures: list[F2]) -> F2:
-    """Numerical uncertainty of every figure, (6, m): twice the standard deviation of its mean over the batches; inf from too few."""
+    """Numerical uncertainty of every figure, (6, m): twice the standard deviation of its mean over batches; inf if these are too few."""
     if len(figures) < FEWEST_BATCHES:
         return np.full(figures[0].shape, np.inf)
     return np.asarray(2.0 * np.std(figures, axis=0, ddof=1) / np.sqrt(len(figures)))
 
 
 def numerical_tolerance(u: F1, digits: int) -> F1:
-    """Half a unit in the last of ``digits`` significant digits of u (GUM-S1 7.9.2); infinite where u is zero: nothing to be resolved."""
+    """Half a unit in the last of ``digits`` significant digits of u (GUM-S1 7.9.2); infinite where u is zero."""
     size = np.where(u > 0, u, 1.0)
     exponent = np.floor(np.log10(size)) - (digits - 1)
     return np.where(u > 0, 0.5 * 10.0**exponent, np.inf)
@@ -161,7 +163,7 @@ class Validation:
 
     @property
     def valid(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Both ends agree within the tolerance, per result (GUM-S1 8.1)."""
+        """Whether both ends agree within the tolerance, for each result (GUM-S1 8.1)."""
         return np.asarray((self.low <= self.tolerance) & (self.high <= self.tolerance))
 
 
@@ -172,20 +174,20 @@ def validate(value: F1, expanded: F1, found: MonteCarlo, *, digits: int = 1) -> 
     ----------
     value, expanded : array, shape (m,)
     found : MonteCarlo
-        Of the same results and probability, ends known to a fifth of the tolerance meant here (GUM-S1 8.2): ``adaptive(...,
-        digits=digits, share=VALIDATION_SHARE)``.
+        Of the same results and probability, from ``adaptive(..., digits=digits, share=VALIDATION_SHARE)``: interval ends known to a fifth
+        of the tolerance of this check (GUM-S1 8.2).
     digits : int
-        Of u that are taken to be meaningful.
+        Significant digits of u; the tolerance is half a unit of the last.
 
     Raises
     ------
     ValueError
-        The trials are not known well enough to judge by.
+        The interval ends of the trials are not known well enough.
     """
     tolerance = numerical_tolerance(found.u, digits)
     if not (found.ends_known <= VALIDATION_SHARE * tolerance).all():
         raise ValueError(
-            f"Monte Carlo: {found.trials} trials do not know the ends of the interval to a fifth of half a unit in {digits} digits of u, "
-            f"so they cannot validate the law of propagation: run adaptive(..., digits={digits}, share={VALIDATION_SHARE}) with more trials"
+            f"Monte Carlo: {found.trials} trials cannot validate the law of propagation, because they do not give the interval's ends to a "
+            f"fifth of half a unit in the last of {digits} digits of u; run adaptive(..., digits={digits}, share={VALIDATION_SHARE})"
         )
     return Validation(np.abs(value - expanded - found.symmetric.low), np.abs(value + expanded - found.symmetric.high), tolerance)

@@ -1,7 +1,6 @@
 """Predicted volumetric error with its uncertainty at any point and for any tool, by the law of propagation (GUM 5).
 
-Its uncertainty decides what is compensated (`compensable_mask`), and a part of the error may have left no trace in any reading
-(`unobserved_mm`).
+The uncertainty decides what may be compensated (`compensable_mask`). `unobserved_mm` estimates the error that no reading shows.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from abbe.models.uncertainty.coverage import PROBABILITY, coverage_factor, effec
 from abbe.models.uncertainty.sources import SOURCE_TEXTS, ErrorSources
 
 NO_TRACE_SIGMA = 0.3
-"""A direction of typical size that changes all readings together by less than this many standard deviations leaves no trace."""
+"""A change of the terms leaves no trace if, at typical size, it moves all readings together by less than this many standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
 class BudgetLine:
-    """One source: the rms length of the error vector it makes, mm, and its share of the total variance (all shares: 1)."""
+    """One source: rms length of the error vector that it causes, mm, and its share of the total variance, 0 to 1."""
 
     name: str
     text: str
@@ -35,10 +34,10 @@ class BudgetLine:
 
 @dataclass(frozen=True)
 class Budget:
-    """Lines, largest first, and the total: root of the sum of their squares.
+    """Uncertainty budget of one or more points: lines, largest first, and their total.
 
-    ``u_mm`` is the rms length of the error of the predicted vector: root of the sum of the three variances.
-    ``expanded_mm``: largest expanded uncertainty of a component at these points, with its coverage factor.
+    ``u_mm``: rms length of the error of the predicted vector, the root sum of squares of the lines. ``expanded_mm``: largest expanded
+    uncertainty of a component at these points, with its coverage factor.
     """
 
     lines: tuple[BudgetLine, ...]
@@ -48,7 +47,7 @@ class Budget:
     probability: float
 
     def line(self, name: str) -> BudgetLine:
-        """A line by the name of its source; KeyError where the budget does not have it."""
+        """Return the line of a source by name; KeyError if there is none."""
         for line in self.lines:
             if line.name == name:
                 return line
@@ -103,7 +102,7 @@ def _budget(prediction: Prediction, points: np.ndarray[tuple[int, ...], np.dtype
 
 
 CHUNK_POINTS = 2000
-"""Points worked at once: 3 x 300 coefficients of each are then below 15 MB."""
+"""Points processed at once: their design (3 x 300 numbers a point) stays below 15 MB."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class Prediction:
     names : tuple of str
         The sources (`abbe.models.uncertainty.sources.SOURCE_TEXTS`).
     variance_mm2 : array, shape (sources, m, 3)
-        What each source adds to the variance of each component: they sum up to the diagonal of ``covariance_mm2``.
+        Contribution of each source to the variance of each component; they sum to the diagonal of ``covariance_mm2``.
     dof : array, shape (m, 3)
         Effective degrees of freedom (Welch-Satterthwaite).
     probability : float
@@ -156,7 +155,7 @@ class Prediction:
     def expanded_vector_mm(self) -> F1:
         """Longest half-axis of the ellipsoid that holds the whole vector with the coverage probability, shape (m,).
 
-        For many degrees of freedom; it is larger than the expanded uncertainty of any component.
+        It assumes many degrees of freedom, and is then larger than the expanded uncertainty of any component.
         """
         widest = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance_mm2)[:, -1], 0.0))
         return np.asarray(vector_factor(3, self.probability) * widest)
@@ -184,10 +183,10 @@ def predict_deviation(
         Of the campaign's solution (`abbe.models.uncertainty.sources.error_sources`).
     points_mm : array, shape (m, 3)
     tool_mm : array, shape (3,), optional
-        Spindle reference to functional point; None: the machine's own tool.
+        Vector from the spindle reference to the functional point; None: the machine's own tool.
     frame : RigidFree, optional
         None: the machine's own frame, where positioning and angles are zero at the start of the strokes (docs/explanation/conventions.md).
-        Compare maps, or a map with what a part shows, in the rigid-free frame.
+        To compare maps with each other or with a measured part, use a rigid-free frame.
     probability : float
 
     Raises
@@ -207,7 +206,7 @@ def predict_deviation(
 
 
 def propagated_covariance(per_unit: F3, factor: F2) -> F3:
-    """Covariance of vectors that depend linearly on coefficients of covariance factor factor^T (GUM eq 13), shape (m, 3, 3).
+    """Covariance of vectors that depend linearly on coefficients with covariance ``factor factor^T`` (GUM eq 13), shape (m, 3, 3).
 
     Parameters
     ----------
@@ -234,7 +233,7 @@ def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFre
 
 
 def _not_negative(covariance: F3) -> F3:
-    """The nearest covariance without negative variances, (m, 3, 3): uncertain prior sizes must never make a prediction better."""
+    """Set negative eigenvalues to zero, (m, 3, 3): the uncertainty of the prior sizes must never make a prediction more certain."""
     value, vector = np.linalg.eigh(covariance)
     return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))
 
@@ -242,7 +241,7 @@ def _not_negative(covariance: F3) -> F3:
 def unobserved_directions(solution: JointSolution) -> F2:
     """Changes of the smooth terms, each of typical size, that leave no trace in any reading, shape (terms, q), mm and rad.
 
-    Lost motion and set-up unknowns take their part first, within what is known of them.
+    Lost motion and set-up unknowns are marginalised first, with their priors.
     """
     n = len(solution.terms)
     typical = term_prior_sd(solution.machine, solution.terms, Priors())
@@ -255,7 +254,7 @@ def unobserved_directions(solution: JointSolution) -> F2:
 
 
 def unobserved_mm(solution: JointSolution, points_mm: F2, frame: RigidFree, tool_mm: F1 | None = None) -> F1:
-    """Rms length of the deviation that no reading shows, if errors have their typical sizes, at points, shape (m,), mm."""
+    """Rms length at points (m, 3) of the deviation that no reading shows, if errors have their typical sizes, shape (m,), mm."""
     hidden = unobserved_directions(solution)
     if not hidden.shape[1]:
         return np.zeros(len(points_mm))
@@ -265,14 +264,14 @@ def unobserved_mm(solution: JointSolution, points_mm: F2, frame: RigidFree, tool
 
 @dataclass(frozen=True)
 class CompensableMask:
-    """What may be compensated.
+    """Components and points whose predicted deviation may be compensated (`compensable_mask`).
 
     Attributes
     ----------
     components : array of bool, shape (m, 3)
     points : array of bool, shape (m,)
     coverage_factor : array, shape (m,)
-        k that the points were judged with.
+        Coverage factor k used for each point.
     """
 
     components: NDArray[np.bool_]
@@ -290,7 +289,7 @@ class CompensableMask:
         if left == 0:
             return "The deviation is larger than its uncertainty everywhere."
         k = np.median(self.coverage_factor)
-        return f"At {left} of {self.points.size} points the uncertainty (k = {k:.2f}) is larger than the error: not compensated."
+        return f"At {left} of {self.points.size} points the uncertainty (k = {k:.2f}) exceeds the error; these are not compensated."
 
 
 def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest_mm: float = 0.0) -> CompensableMask:
@@ -303,8 +302,8 @@ def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest
     Parameters
     ----------
     prediction : Prediction
-        In the frame that the correction is made in; rigid-free for a map (`abbe.models.geometry.volume`), or a displacement of the whole
-        workpiece, which is not an error, decides.
+        In the frame of the correction. For a map this is the rigid-free frame (`abbe.models.geometry.volume`); otherwise a displacement of
+        the whole workpiece, which is no error, would decide.
     k : float, optional
         Coverage factor; default: that of the prediction's own probability and degrees of freedom.
     smallest_mm : float

@@ -1,8 +1,8 @@
 """Inputs of a campaign's solution and their influence on it: one error source per input (GUM 5.1).
 
 The estimate is linear in its inputs, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
-posterior covariance C. So the covariance splits exactly, C = C A^T W A C + C P^-1 C: noise per instrument, and the prior of every single
-unknown (the bar's calibrated length, the set-ups, the typical size of errors). Inputs unknown to the solver are added.
+posterior covariance C. So the covariance splits exactly, C = C A^T W A C + C P^-1 C: into the noise of each instrument and the prior of
+each unknown (the bar's calibrated length, the set-ups, the typical size of errors). Inputs that the solver does not know are added.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def variances(sources: ErrorSources, per_unit: F2) -> F1:
     ----------
     sources : ErrorSources
     per_unit : array, shape (m, len(sources.terms))
-        Result per unit of each coefficient, those of the orders above the solution's included.
+        Result per unit of each coefficient, orders above the solution's included.
     """
     total = np.zeros(len(per_unit))
     for s in sources.sources:
@@ -43,7 +43,7 @@ def variances(sources: ErrorSources, per_unit: F2) -> F1:
 
 
 def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
-    """Factor F of the covariance F F^T of m results together, shape (m, q), for draws that keep them in step.
+    """Factor F of the joint covariance F F^T of m results, shape (m, q), for correlated draws.
 
     The contribution of the estimated sizes is clipped so that it never makes a combination of these results more certain.
     """
@@ -62,26 +62,26 @@ def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
 
 
 def approach_variance_mm2(sources: ErrorSources) -> float:
-    """Variance per component that a single approach of a point adds (`Inputs.single_approach`), else 0."""
+    """Variance per component that a single approach of a point adds; 0 without `StatedInputs.single_approach`."""
     return float(sum(s.scatter_mm**2 for s in sources.sources))
 
 
 def _root(covariance: F2) -> F2:
-    """Factor of the nearest matrix without negative variances."""
+    """Factor of the covariance with negative eigenvalues set to zero."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 @dataclass(frozen=True)
 class Response:
-    """Design, weights and covariance of one solution, for the sizes of noise and priors that the solver settled on.
+    """Design, weights and covariance of one solution, for the solver's final sizes of noise and priors.
 
     Attributes
     ----------
     design : array, shape (n, p)
         Reading per unit of each unknown, all runs.
     weight : array, shape (n,)
-        Weight of each reading, 1/mm^2: one over its variance, times what robustness and alike neighbours leave of it; 0 for a rejected one.
+        Weight of each reading, 1/mm^2: one over its variance, reduced for outliers and correlated neighbours; 0 for a rejected reading.
     kind : array of str, shape (n,)
         Instrument of each reading.
     covariance : array, shape (p, p)
@@ -90,7 +90,7 @@ class Response:
         Change of every unknown per standard deviation of each independent part of the prior (`prior_factor`): pull pull^T is the prior's
         share C P^-1 C.
     widening : array, shape (p, p)
-        What the solution's covariance holds on top because the sizes were estimated too. Not positive in every direction.
+        What the solution's covariance has in addition because the sizes are estimated too; it can be negative in some directions.
     dof : float
         Degrees of freedom of all residuals together.
     """
@@ -104,20 +104,20 @@ class Response:
     dof: float
 
     def of_readings(self, error_mm: F1) -> F1:
-        """Change of every unknown when each reading is wrong by ``error_mm`` (n,): C A^T W e, shape (p,)."""
+        """Change of every unknown if each reading is wrong by ``error_mm`` (n,): C A^T W e, shape (p,)."""
         return np.asarray(self.covariance @ (self.design.T @ (error_mm * self.weight)))
 
     def noise_factor(self, variance_mm2: F1 | None, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> F2:
         """Factor of the covariance that independent errors of some readings give the unknowns, shape (p, p).
 
-        ``variance_mm2``: of each reading (n,); None: what its weight stands for. ``mask``: which readings have them.
+        ``variance_mm2``: of each reading (n,); None: one over its weight. ``mask``: the readings with errors.
         """
         size = np.sqrt(self.weight) if variance_mm2 is None else np.sqrt(variance_mm2) * self.weight
         r = scipy.linalg.qr(self.design[mask] * size[mask, None], mode="r")[0][: self.design.shape[1]]
         return np.asarray(self.covariance @ r.T)
 
     def dof_of(self, kind: str) -> float:
-        """Degrees of freedom of the residuals of one instrument, from which its noise was estimated: its part of `dof`, at least 1.
+        """Degrees of freedom of one instrument's noise, estimated from its residuals: its part of `dof`, at least 1.
 
         Each reading contributes one minus its leverage.
         """
@@ -159,20 +159,20 @@ def prior_factor(root: F2) -> F2:
     return np.asarray(scale[:, None] * scipy.linalg.qr((root / scale[:, None]).T, mode="r")[0].T)
 
 
-# What error motions of higher order than the chosen one may still do: the price of a smooth model.
+# Uncertainty from error motions above the solution's order.
 #
-# A campaign is solved up to some Legendre order. Higher orders are small, but not zero; they disturb the estimate through the readings and
-# are missing at the point. Both at once: with phi the omitted coefficients (prior S of the same family as the solution's), B their design
-# at the readings and G at the point, the prediction is off by (D K B - G) phi. What the residuals of the campaign say of phi counts:
-# its covariance is (S^-1 + B^T (W - W A C A^T W) B)^-1 about the value the residuals ask for, not S.
+# A campaign is solved up to some Legendre order. Higher orders are small, but not zero: they disturb the estimate through the readings, and
+# the prediction at a point lacks them. With phi the omitted coefficients (prior S of the same family as the solution's), B their design at
+# the readings and G at the point, and D the solved terms' design at the point, the prediction is off by (D K B - G) phi. The residuals of
+# the campaign constrain phi: its covariance is not S but (S^-1 + B^T (W - W A C A^T W) B)^-1, about the value that the residuals suggest.
 
 
 @kept
 def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term, ...], F2]:
-    """Terms of the solution and of the orders above it, and the factor of what the latter do to all of them, shape (P, q).
+    """Terms of the solution and of the orders above it, and the factor of the latter's effect on all coefficients, shape (P, q).
 
-    The prediction stays that of the chosen order, so what the residuals ask of the higher orders is not a correction: it counts as one more
-    column, in full.
+    The prediction keeps the chosen order. The value that the residuals suggest for the higher orders is therefore no correction: it counts
+    in full, as one more column of the factor.
     """
     above = omitted_terms(max((t.order for t in solution.terms), default=0), orders_above)
     terms = (*solution.terms, *above)
@@ -194,7 +194,7 @@ def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term
 
 
 def chosen_order(solution: JointSolution) -> int:
-    """Legendre order that the data support; terms of the solution above it only contribute uncertainty."""
+    """Legendre order that the data support; the solution's terms above it contribute only uncertainty."""
     return solution.order
 
 
@@ -206,8 +206,8 @@ def omitted_terms(order: int, orders_above: int) -> tuple[Term, ...]:
 def omitted_prior_sd(solution: JointSolution, above: tuple[Term, ...]) -> F1:
     """Prior standard deviation of the omitted terms, shape (len(above),): the documented value times the solver's scale for that motion.
 
-    The solver may have found that this machine's errors are larger or smaller than the documented priors; the omitted orders of a motion
-    follow its highest order that was kept.
+    The solver may have found this machine's errors larger or smaller than the documented priors. The omitted orders of a motion take the
+    scale of its highest solved order.
     """
     documented = Priors()
     kept = term_prior_sd(solution.machine, solution.terms, documented)
@@ -233,18 +233,18 @@ SOURCE_TEXTS = {
     "wavelength": "calibration of the laser's wavelength (stated)",
     "setup": "set-up: cup, mirror, zero and drift, where the data leave them open",
     "scale_temperature": "temperature of the scales (assumed)",
-    "model_order": "what orders above the chosen one may still do",
+    "model_order": "error motions of orders above the chosen one",
     "prior": "typical size of errors, where the data leave them open (assumed)",
     "estimated_sizes": "noise and typical sizes are themselves estimated",
 }
-"""Every source of a budget in the user's words."""
+"""Text of every source of a budget."""
 
 FROM_READINGS = frozenset({"bar_noise", "laser_noise", "estimated_sizes"})
 """Sources whose size the campaign's own readings gave: type A evaluation (GUM 4.2)."""
 
 
 LASER_SCALE = "laser_scale"
-"""Unknown of the solution that stands for the wavelength, held by its prior; a solution without it gets `StatedInputs.u_wavelength`."""
+"""The solution's unknown for the wavelength, held by its prior; for a solution without it, `StatedInputs.u_wavelength` counts."""
 
 
 @dataclass(frozen=True)
@@ -256,15 +256,15 @@ class Source:
     name : str
         A key of `SOURCE_TEXTS`.
     factor : array, shape (P, q)
-        What q independent inputs of unit variance do to the coefficients of `ErrorSources.terms`: the source's covariance is factor
-        factor^T.
+        Effect of q independent inputs of unit variance on the coefficients of `ErrorSources.terms`: the source's covariance is
+        ``factor factor^T``.
     dof : float
-        Degrees of freedom of its size; inf where it is stated.
+        Degrees of freedom of its size; inf if it is stated.
     scatter_mm : float
-        Standard deviation that comes on top at each point, per component.
-    less : array, shape (P, r), optional
-        Factor of what is to be taken off: only for `estimated_sizes`, which may never make a prediction better
-        (`abbe.models.uncertainty.prediction`).
+        Further standard deviation at each point, per component.
+    subtracted : array, shape (P, r), optional
+        Factor of a covariance to be subtracted, only for ``estimated_sizes``. The difference is clipped so that it never makes a prediction
+        more certain (`abbe.models.uncertainty.prediction`).
     """
 
     name: str
@@ -275,7 +275,7 @@ class Source:
 
     @property
     def evaluation(self) -> Literal["A", "B"]:
-        """How its size was found: A from readings (of the campaign, or repeats with so many degrees of freedom), B stated or assumed."""
+        """Type of evaluation (GUM 4.2, 4.3): A from readings of the campaign or from repeats, B stated or assumed."""
         return "A" if self.name in FROM_READINGS or (self.name == "repeatability" and np.isfinite(self.dof)) else "B"
 
 
@@ -294,7 +294,7 @@ class ErrorSources:
     sources: tuple[Source, ...]
 
     def source(self, name: str) -> Source:
-        """A source by name; KeyError for one that the campaign does not have."""
+        """Return a source by name; KeyError if the campaign does not have it."""
         for s in self.sources:
             if s.name == name:
                 return s
@@ -302,7 +302,7 @@ class ErrorSources:
 
 
 def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -> ErrorSources:
-    """The sources of uncertainty of a solution.
+    """Return the sources of uncertainty of a solution.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -
     Returns
     -------
     ErrorSources
-        Without the stated inputs (`StatedInputs.without_stated_inputs`) the sources add up to ``solution.term_covariance``.
+        With all stated inputs zero (`StatedInputs.without_stated_inputs`) the sources add up to ``solution.term_covariance``.
     """
     inputs = inputs or StatedInputs()
     terms, sources = _sources(solution, inputs)
@@ -323,7 +323,7 @@ def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -
 
 @kept
 def _sources(solution: JointSolution, inputs: StatedInputs) -> tuple[tuple[Term, ...], tuple[Source, ...]]:
-    """All terms, and the sources as factors of theirs."""
+    """All terms, and the sources as factors on their coefficients."""
     r = response(solution)
     n = len(solution.terms)
     found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
@@ -339,12 +339,12 @@ def _sources(solution: JointSolution, inputs: StatedInputs) -> tuple[tuple[Term,
 
 
 def _padded(factor: F2, above: int) -> F2:
-    """With rows of zeros for the terms above."""
+    """Append rows of zeros for the terms above."""
     return np.pad(factor, ((0, above), (0, 0)))
 
 
 def _merged(sources: list[Source]) -> list[Source]:
-    """One source per name, in order; the narrowest degrees of freedom count."""
+    """Merge sources of the same name; the fewest degrees of freedom count."""
     out: dict[str, Source] = {}
     for s in sources:
         have = out.get(s.name)
@@ -370,7 +370,7 @@ def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
     out = []
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
-    share = np.minimum(inputs.repeatability_mm**2, variance)  # never more than the readings scatter: that would count it twice
+    share = np.minimum(inputs.repeatability_mm**2, variance)  # at most the readings' own variance
     for kind in ("bar", "laser"):
         mask = r.kind == kind
         if mask.any():
@@ -384,7 +384,7 @@ def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
 def _widening(r: Response, n: int) -> tuple[F2, F2]:
     """Uncertainty of the estimated sizes: covariance beyond that for fixed sizes, split into a positive and a negative part.
 
-    It is itself the allowance for their few degrees of freedom, so it has none of its own: they would count twice.
+    It already allows for the few degrees of freedom of the sizes; its own are infinite, so that they do not count twice.
     """
     whole = r.widening[:n, :n]
     scale = np.sqrt(np.diag(r.covariance)[:n])
@@ -394,7 +394,7 @@ def _widening(r: Response, n: int) -> tuple[F2, F2]:
 
 
 def _priors(solution: JointSolution, r: Response) -> list[Source]:
-    """Influence of the prior of every unknown on the estimate; for correlated unknowns, of the part independent of earlier ones."""
+    """Influence of the prior of every unknown on the estimate; of correlated unknowns, each counts with its independent part."""
     order = chosen_order(solution)
     above = {t.name for t in solution.terms if t.order > order}
     terms = {t.name for t in solution.terms}
@@ -426,7 +426,7 @@ def _calibration(solution: JointSolution, r: Response, inputs: StatedInputs) -> 
 
 
 def _travel(run: RunData) -> F1:
-    """Distance along the beam since the first record, mm: what a wrong wavelength scales; zero for the ball-bar."""
+    """Distance along the beam from the first record, mm, which a wrong wavelength scales; zero for the ball-bar."""
     if run.beam is None:
         return np.zeros(run.deviation_mm.size)
     return np.asarray((run.axes_mm - run.axes_mm[0]) @ run.beam)
@@ -435,7 +435,7 @@ def _travel(run: RunData) -> F1:
 def _temperature(solution: JointSolution, inputs: StatedInputs) -> list[Source]:
     """Uncertain scale temperature: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
 
-    Written as the term of Legendre order 1, whose function is twice the share of the stroke (`abbe.models.geometry.bases.term_values`).
+    It is written as the term of Legendre order 1, twice the fraction of the stroke (`abbe.models.geometry.bases.term_values`).
     """
     slope = inputs.u_scale_temperature_k * inputs.scale_expansion_per_k
     if slope == 0.0:

@@ -1,10 +1,10 @@
 """Forecast of the residual errors after a partial correction, with the solution's whole uncertainty.
 
-A correction removes the estimate, not the truth: the uncertainty stays in the machine. With coefficients theta of the truth,
-estimate t and a correction c made from the estimate, theta - c is normal about t - c with the whole covariance of the solution. Every
-figure is taken from draws of it (GUM Supplement 1), because the largest error, the range of a diagonal and an rms are not linear functions,
-and near zero their linear uncertainty is wrong. Before and after come from the same draws, so their difference has its own uncertainty. A
-figure that is never negative is expected larger than that of the mean map alone: the unknown part adds to it.
+A correction removes the estimate, not the truth: the uncertainty stays in the machine. With true coefficients theta, estimate t and a
+correction c made from it, theta - c is normal about t - c with the whole covariance of the solution. Every figure comes from draws of theta
+(GUM Supplement 1), because the largest error, the range along a diagonal and the rms are not linear, and near zero their linear
+uncertainty is wrong. Before and after use the same draws, so their difference has its own uncertainty. A figure that cannot be negative is
+on average larger than that of the mean map, because the unknown part adds to it.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Kind = Literal["rms", "largest", "range"]
 
 @dataclass(frozen=True)
 class ForecastFigure:
-    """A figure of the deviation.
+    """Definition of a figure of the deviation.
 
-    ``per_unit``: what it is made of, per unit of each coefficient, shape (m, k, P) with k components a place. ``kind``: root mean square
-    or largest length over the places, or range of the (one) component.
+    ``per_unit``: deviation at m points in k components per unit of each coefficient, shape (m, k, P). ``kind``: root mean square or largest
+    length over the points, or range of the only component.
     """
 
     name: str
@@ -41,7 +41,7 @@ class ForecastFigure:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """A figure before and after, and the gain: mean over the draws and standard uncertainty, mm."""
+    """A figure before and after the correction, and the gain (before minus after): mean over the draws and standard uncertainty, mm."""
 
     name: str
     before_mm: float
@@ -61,7 +61,8 @@ def volume_figures(known: KnownField, nodes: int = 6) -> list[ForecastFigure]:
 def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
     """Expected rms length of the deviation over an even grid, unknown part included, and its standard uncertainty, mm.
 
-    The square is a quadratic form of a normal vector, so both have a closed form; the same as the first of `volume_figures` by draws.
+    The squared rms is a quadratic form of a normal vector, so both figures have a closed form. They agree with ``volume_rms`` of
+    `volume_figures`, which `what_if` gets by draws.
     """
     d = known.per_unit(volume_grid(known.machine.stroke_mm, nodes))
     flat = d.reshape(-1, d.shape[2])
@@ -76,7 +77,7 @@ def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
 
 
 def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions: int = 11) -> list[ForecastFigure]:
-    """Range of the deviation along each of the four body diagonals, so far from the ends of the strokes (ISO 230-6 style)."""
+    """Range of the deviation along each of the four body diagonals of the strokes less a clearance (as in ISO 230-6)."""
     box = known.machine.stroke_mm + np.array([clearance_mm, -clearance_mm])
     out = []
     for name in DIAGONALS:
@@ -88,7 +89,7 @@ def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions
 
 
 def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: float = 3.0, positions: int = 180) -> ForecastFigure:
-    """Rms reading of a ball-bar along the helix about a cup, fitted centre and bar length removed."""
+    """Rms reading of a ball-bar along a helix about a cup, after a fit of centre and bar length."""
     at = helix_points(centre_mm, radius_mm, turns=turns, n=positions, law="area", axis=2)
     n = (at - centre_mm) / radius_mm
     reading = np.einsum("mi,mip->mp", n, known.per_unit(at))
@@ -105,7 +106,7 @@ def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure],
     known : KnownField
         The solution.
     taken_off : array, shape (P,)
-        Coefficients of the correction: the estimate of some motions (`KnownField.estimate_of`), mean linear errors (`KnownField.linear`).
+        Coefficients of the correction: the estimate of some motions (`KnownField.estimate_of`) or mean linear errors (`KnownField.linear`).
     figures : sequence of ForecastFigure
         Quantities to forecast.
     draws, seed : int
@@ -135,6 +136,6 @@ def _sizes(figure: ForecastFigure, coefficients: F2) -> F1:
 
 
 def check_figures(known: KnownField, cup: tuple[F1, float] | None = None) -> list[ForecastFigure]:
-    """Everything that a check measures and a map shows: volume, body diagonals, helix about ``cup`` (centre, radius) where there is one."""
+    """Figures that a check measures or a map shows: volume, body diagonals and, given ``cup`` (centre, radius), the helix about it."""
     out = [*volume_figures(known), *diagonal_figures(known)]
     return out if cup is None else [*out, helix_figure(known, *cup)]
