@@ -43,7 +43,7 @@ class BarSample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BarBatch:
-    """Samples that arrived together. ``missing``: number of samples lost just before this batch, by the sequence numbers.
+    """Samples that arrived together. ``missing``: number of samples lost just before this batch, found by the sequence numbers.
 
     ``boot_id``: of the box that sent them. ``overran``: bytes were lost before these samples because this computer did not keep up.
     """
@@ -56,14 +56,14 @@ class BarBatch:
 
 
 class BarTap(Protocol):
-    """Takes every sample of a stream before all consumers, in a thread of the driver, for recording."""
+    """Recorder of a stream: a thread of the driver passes it every sample before any consumer gets the sample."""
 
     def take(self, batch: BarBatch) -> None:
-        """Take a batch, in order and exactly once. May block while the disk is slow: the ring buffers the samples. Never raises."""
+        """Take a batch, in order and exactly once. May block while the disk is slow: the driver buffers later samples. Never raises."""
         ...
 
     def warn(self, text: str) -> None:
-        """Receive a warning that the ring fills. Must not block."""
+        """Receive a warning that the driver's buffer fills up. Must not block."""
         ...
 
 
@@ -71,7 +71,7 @@ class BarTap(Protocol):
 class LaserReading:
     """One coherent output sample of the laser (docs/protocols/laser.md).
 
-    ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument translates its own.
+    ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument translates its own. ``refractivity``: n - 1 of air.
     """
 
     host_s: float
@@ -109,10 +109,10 @@ NOTHING_HOLDS = Condition(0)
 
 @dataclass(frozen=True, slots=True)
 class ControllerStatus:
-    """One coherent status of a controller. ``_us``: its own clock, in microseconds.
+    """One coherent status of a controller. Times ``_us`` are microseconds of its own clock.
 
-    ``path_start_us`` and ``path_end_us``: of the last path; the end is the smaller one while a path runs. ``in_position_us``: when the axes
-    last came to a stop.
+    ``path_start_us``, ``path_end_us``: start and end of the last path; while a path runs, the end is smaller than the start.
+    ``in_position_us``: when the axes last came to a stop.
     """
 
     host_s: float
@@ -165,9 +165,10 @@ class BankState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CompStatus:
-    """One coherent status of the compensation banks, with the generation counter and boot id read around it (seqlock).
+    """One coherent status of the compensation banks: generation and boot id were the same before and after the read (seqlock).
 
-    ``bank_crc`` is 0 for a bank that is not sealed.
+    ``gen``: generation, a counter of all changes of the banks. ``bank_crc``: 0 for a bank that is not sealed. ``lease_owner``: 0 if there
+    is no lease.
     """
 
     boot_id: int
@@ -241,7 +242,7 @@ class Paths(Motion, Protocol):
 class Tables(Protocol):
     """Two banks for compensation tables, and the lease that allows changing them.
 
-    A bank holds an image (`abbe.drivers.tables`); ``first`` and sizes count its 16-bit words.
+    A bank holds an image (`abbe.drivers.tables`); ``first`` counts its 16-bit words from 0.
     """
 
     async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None: ...
@@ -253,7 +254,7 @@ class Tables(Protocol):
 
 
 class TableController(Identity, Tables, Protocol):
-    """The part of a controller that a push needs: status and banks, but no motion."""
+    """The part of a controller that writing compensation tables needs: status and banks, but no motion."""
 
 
 class Controller(Identity, Paths, Tables, Protocol):
@@ -330,7 +331,7 @@ def overran(status: int) -> bool:
 
 
 def beam_is_good(status: int) -> bool:
-    """Whether the laser's count is valid: beam never lost since the zero, strong enough, a reflector present."""
+    """Whether the laser's reading is valid: the beam was not lost since the last zero, is strong enough, and has a reflector."""
     return not status & _BEAM_BAD
 
 

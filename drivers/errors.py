@@ -1,4 +1,4 @@
-"""Errors of devices and links, each with the device, the operation, what happened and a remedy; and clean-up that ends in spite of them."""
+"""Errors of devices and links: each names device, operation, what happened, and a remedy. Also clean-up that no cancellation stops."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _RUN: ContextVar[str] = ContextVar("run", default=NO_RUN)
 
 @contextmanager
 def on_behalf_of(run: str) -> Iterator[None]:
-    """Attach a run's name to all errors and records in this block, including tasks started in it."""
+    """Attach a run's name to all driver errors created in this block, including those of tasks started in it."""
     token = _RUN.set(run)
     try:
         yield
@@ -25,8 +25,8 @@ def on_behalf_of(run: str) -> Iterator[None]:
 class DriverError(Exception):
     """A device operation failed.
 
-    ``device``: name or URL as the user wrote it; ``operation``: e.g. ``"read status"``; ``detail``: what happened; ``remedy``: for
-    a person; ``run``: the affected run (``on_behalf_of``).
+    ``device``: its name or URL; ``operation``: e.g. ``"read status"``; ``detail``: what happened; ``remedy``: what a person should do;
+    ``run``: the affected run (`on_behalf_of`).
     """
 
     code = "DRV-000"

@@ -1,6 +1,6 @@
-"""Opens devices by URL: returns a connected driver that has verified the kind of its device.
+"""Open devices by URL: each function returns a connected driver that has verified the kind of its device.
 
-A package adds another protocol by an entry point named like its URL scheme::
+A package adds another protocol with an entry point named like its URL scheme::
 
     [project.entry-points."abbe.cnc"]
     "acme+tcp" = "acme_driver:open_controller"      # async def open_controller(url: str) -> abbe.drivers.api.Controller
@@ -26,7 +26,7 @@ HEARTBEAT_S = 1.0
 
 
 async def open_ballbar(url: str) -> BallBar:
-    """Open the ball-bar behind a ``serial://`` or ``socket://`` URL, or one of an installed driver.
+    """Open the ball-bar behind a ``serial://`` or ``socket://`` URL, or behind a URL of an installed driver.
 
     Raises
     ------
@@ -46,7 +46,7 @@ async def open_ballbar(url: str) -> BallBar:
 
 
 async def open_laser(url: str) -> DisplacementMeter:
-    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, or one of an installed driver.
+    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, or behind a URL of an installed driver.
 
     Raises
     ------
@@ -55,7 +55,7 @@ async def open_laser(url: str) -> DisplacementMeter:
     WrongDevice
         Something else answers there.
     LinkDown, ReplyTimeout, BadFrame
-        The wire.
+        Communication failed.
     """
     if (entry := installed("laser", url)) is not None:
         return cast(DisplacementMeter, await _opened(entry, url))
@@ -65,7 +65,7 @@ async def open_laser(url: str) -> DisplacementMeter:
 
 
 async def open_controller(url: str) -> Controller:
-    """Open the controller behind a ``modbus+tcp://`` (or ``modbus+rtu://``) URL, or one of an installed driver.
+    """Open the controller behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, or behind a URL of an installed driver.
 
     Raises
     ------
@@ -74,7 +74,7 @@ async def open_controller(url: str) -> Controller:
     WrongDevice
         Something else answers there.
     LinkDown, ReplyTimeout, BadFrame
-        The wire.
+        Communication failed.
     """
     if (entry := installed("cnc", url)) is not None:
         controller = cast(Controller, await _opened(entry, url))
@@ -87,7 +87,7 @@ async def open_controller(url: str) -> Controller:
 async def open_fixture(url: str, ask: Ask) -> Fixture:
     """Open the fixture behind a ``fixture+tcp://`` or ``fixture+console:`` URL.
 
-    ``await ask(text)`` asks the operator and returns when confirmed; only the console uses it.
+    ``await ask(text)`` asks the operator and returns after the confirmation; only the console uses it.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """A second, independent decoder of compensation images, for the read-back before activation.
 
 Written from docs/protocols/cnc.md independently of ``tables.py`` and deliberately in another way (register by register, plain arithmetic,
-no struct, no zlib): a sign, unit or order mistake in one of the two does not cancel in the other.
+no struct, no zlib): a mistake in sign, unit or order in one decoder shows as a difference between the two.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ AxisTables = dict[tuple[str, str], list[tuple[float, float]]]
 
 
 class UnreadableImage(ValueError):  # noqa: N818 - reads as what it is
-    """The registers are not an image of the protocol."""
+    """The bytes are not an image as docs/protocols/cnc.md defines it."""
 
 
 def read_axis_tables(data: bytes) -> AxisTables:
@@ -22,7 +22,7 @@ def read_axis_tables(data: bytes) -> AxisTables:
     Returns
     -------
     dict
-        (input axis, corrected axis) -> list of (position in mm, correction in mm added to the command). Empty for kind 0.
+        (input axis, corrected axis) -> list of (position in mm, correction in mm added to the command). Empty for kind 0 (no correction).
 
     Raises
     ------
@@ -84,7 +84,7 @@ def plain_crc32(data: bytes) -> int:
 
 def _register(data: bytes, number: int) -> int:
     if 2 * number + 1 >= len(data):
-        raise UnreadableImage(f"register {number} is beyond the end")
+        raise UnreadableImage(f"register {number} is beyond the end of the image")
     return data[2 * number] * 256 + data[2 * number + 1]
 
 

@@ -1,4 +1,4 @@
-"""Compensation images <-> bytes (docs/protocols/cnc.md, "Banks"). Pure; refuses inexact values, never rounds or clips them."""
+"""Encode and decode compensation images (docs/protocols/cnc.md, "Banks"). Values that do not fit exactly are refused, never rounded."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from abbe.drivers.api import Point
 
 FORMAT_VERSION = 1
-"""Part of the signed content of a table."""
+"""Version of this encoding; part of the signed content of a table."""
 MAGIC = 0xABBE
 FORMAT = 1
 NO_CORRECTION, NINE_TABLES, GRID_3D = 0, 1, 2
@@ -42,7 +42,7 @@ class TableImage:
     counts : tuple of three int
         Grid points of X, Y, Z.
     values : tuple of int
-        Corrections in LSB, added to the command, in body order (kind 1: input axis, output, index; kind 2: z, y, x, output).
+        Corrections in LSB, added to the command, ordered by input axis, corrected axis, index (kind 1) or z, y, x, corrected axis (kind 2).
     """
 
     kind: int
@@ -72,7 +72,7 @@ def encode(image: TableImage) -> bytes:
     Raises
     ------
     TableCodecError
-        A correction exceeds 16 bits, the number of values is wrong, a position is off the 10 nm grid, too many registers, ...
+        For example, a correction exceeds 16 bits, a position is not a multiple of 10 nm, or the image exceeds the bank.
     """
     _check(image)
     n_words = _HEADER.size // 2 + len(image.values)
@@ -88,7 +88,7 @@ def encode(image: TableImage) -> bytes:
 
 
 def decode(data: bytes) -> TableImage:
-    """Decode exactly the LENGTH registers of an image.
+    """Decode the bytes of one image, without the unused rest of its bank.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def decode(data: bytes) -> TableImage:
 
 
 def crc32(data: bytes) -> int:
-    """CRC-32 (IEEE 802.3) of an image's bytes, as the controller computes it when sealing."""
+    """Return the CRC-32 (IEEE 802.3) of an image's bytes, as the controller computes it when sealing."""
     return zlib.crc32(data)
 
 
@@ -127,7 +127,7 @@ def _check(image: TableImage) -> None:
         raise TableCodecError(f"{_HEADER.size // 2 + expected} registers do not fit a bank of {MAX_WORDS}")
     if image.kind == NO_CORRECTION:
         if any(image.counts):
-            raise TableCodecError(f"no correction has no grid points, not {image.counts}")
+            raise TableCodecError(f"an image of kind 0 (no correction) must have no grid points, not {image.counts}")
     elif min(image.counts) < 2:
         raise TableCodecError(f"{image.counts} points: each axis needs 2 or more")
     if image.lsb_nm <= 0:

@@ -35,11 +35,11 @@ _DRAIN_S = 10.0
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
 _MAX_RATE_HZ = 1000
 _SETTINGS_FIRMWARE = 0x0101
-_RESTORE = "the box's settings were changed: set them back (restore_settings), then measure this test again"
+_RESTORE = "set unit, range and zero of the box back, then measure this test again"
 
 
 class Box:
-    """Identity and settings of the box, which must not change. Accepts only ``serial_no``; None: the first box that answers."""
+    """Identity and settings of the box, which must not change. Accepts only the box ``serial_no``, or if None the first that answers."""
 
     def __init__(self, name: str, talk: Conversation, serial_no: int | None) -> None:
         self.boot_id: int | None = None
@@ -59,9 +59,9 @@ class Box:
         Raises
         ------
         WrongDevice
-            Another box.
+            Another box answers.
         LinkDown, ReplyTimeout, BadFrame
-            The wire.
+            Communication failed.
         """
         info = await self._talk.identify()
         if self._serial_no not in (None, info.serial_no):
@@ -74,7 +74,7 @@ class Box:
         return info
 
     async def peek(self) -> int:
-        """Read the boot id without accepting it; errors of the wire as for `accept`."""
+        """Read the boot id without accepting it; failed communication raises as in `accept`."""
         return (await self._talk.identify()).boot_id
 
     async def check_boot(self) -> None:
@@ -86,7 +86,7 @@ class Box:
             raise self.rebooted(f"boot id {info.boot_id:#x} instead of {known:#x}")
 
     def check_settings(self) -> None:
-        """Raise ``SettingsChanged`` if unit, range or zero differ from the first ones, or the unit is inches."""
+        """Raise ``SettingsChanged`` if unit, range or zero changed since the first identification, or if the unit is inches."""
         now, first = self.settings, self._first
         if now is None or first is None:
             return
@@ -94,19 +94,21 @@ class Box:
             detail = f"the box is set to {frames.reading_text(now)} instead of {frames.reading_text(first)}"
             raise SettingsChanged(self._name, "start stream", detail, _RESTORE)
         if now.unit != frames.NANOMETRE:
-            raise SettingsChanged(self._name, "start stream", "the box shows inches", "switch it to millimetres, then open it anew")
+            raise SettingsChanged(
+                self._name, "start stream", "the box reads in inches", "switch it to millimetres, then connect to it again"
+            )
 
     def check_can(self, rate_hz: int, range_mm: float) -> None:
-        """Raise ``Refused`` if rate or stroke exceed the box's; limits that the box does not report are not checked."""
+        """Raise ``Refused`` if rate or stroke exceed those of the box, as far as it reports them."""
         if 0 < self._max_rate_hz < rate_hz:
-            detail = f"{rate_hz} Hz are wanted, the box sends at most {self._max_rate_hz}"
+            detail = f"{rate_hz} Hz requested, but the box sends at most {self._max_rate_hz} Hz"
             raise Refused(self._name, "check", detail, "choose a lower rate")
         if self.settings is not None and self.settings.range_nm < range_mm * 1e6:
-            detail = f"its range is set to +-{self.settings.range_nm * 1e-6:g} mm, needed are {range_mm:g}"
+            detail = f"its range is set to +-{self.settings.range_nm * 1e-6:g} mm, but +-{range_mm:g} mm are needed"
             raise Refused(self._name, "check", detail, "set a larger range at the box")
 
     async def restore(self) -> None:
-        """Restore the first unit, range and zero; raises as `accept`, and ``Refused``."""
+        """Restore unit, range and zero of the first identification; raises as `accept`, and ``Refused``."""
         first = self._first
         if first is not None:
             await self._talk.command(frames.CONFIGURE, lambda tag: frames.configure_command(tag, first.unit, first.range_nm, first.zero_nm))
@@ -117,19 +119,19 @@ class Box:
         if isinstance(end, OtherSettings):
             return SettingsChanged(self._name, "stream", str(end), _RESTORE)
         if isinstance(end, OtherPace):
-            return DeviceFault(self._name, "stream", str(end), "did another program set or restart the box? then measure this test again")
+            return DeviceFault(self._name, "stream", str(end), "did another program start the box? end it, then measure this test again")
         return self.rebooted(str(end))
 
     def rebooted(self, detail: str) -> Rebooted:
         """Return the error of a box that restarted."""
-        return Rebooted(self._name, "stream", detail, "the box restarted: call identify, then measure this test again")
+        return Rebooted(self._name, "stream", detail, "the box restarted: connect to it again, then measure this test again")
 
 
 class SerialBallBar:
     """A telescoping ball-bar on a serial line or a serial device server (docs/protocols/ballbar.md).
 
     The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else that of the
-    first box that answers, and refuses all others. ``ring_s``: capacity of the ring for framing and storing, seconds at full rate.
+    first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer between reading and framing, s at 1000 Hz.
     """
 
     def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:
@@ -174,7 +176,7 @@ class SerialBallBar:
         Raises
         ------
         WrongDevice
-            Another box than before, or than the URL names.
+            Not the same box as before, or not the one in the URL.
         LinkDown, ReplyTimeout, BadFrame
             No connection, no reply, or an invalid one.
         """
@@ -195,16 +197,16 @@ class SerialBallBar:
             return None
 
     async def recover(self, *, within_s: float) -> DeviceInfo:
-        """Retry until the same box answers again, for example after its cable was pulled; reopens the line as often as needed.
+        """Retry until the same box answers again, for example after its cable was pulled; reopen the line as often as needed.
 
         The waits between attempts grow from 0.1 to 2 s.
 
         Raises
         ------
         WrongDevice
-            Another box answers: refused at once.
+            Another box answers: no further attempt.
         LinkDown, ReplyTimeout, BadFrame
-            Error of the last attempt within ``within_s``.
+            Error of the last attempt within ``within_s`` seconds.
         """
         clock = asyncio.get_running_loop().time
         until_s, backoff = clock() + within_s, Backoff(_FIRST_WAIT_S, _LONGEST_WAIT_S)
@@ -223,12 +225,12 @@ class SerialBallBar:
     async def make_ready(self, *, within_s: float) -> DeviceInfo:
         """Prepare a new stream: recover the same box if necessary, and restore its first settings after a restart.
 
-        Streams before and after are never joined.
+        The new stream must not be joined to earlier ones.
 
         Raises
         ------
         Rebooted
-            The box restarted and does not report its settings (firmware 1.0): a person has to look.
+            The box restarted and does not report its settings (firmware 1.0): a person must check them.
         WrongDevice, Refused, LinkDown, ReplyTimeout, BadFrame
             As for ``recover`` and ``restore_settings``.
         """
@@ -253,12 +255,12 @@ class SerialBallBar:
         rate_hz : int
             Samples per second; 0: any.
         range_mm : float
-            Needed stroke to either side; not checked for firmware 1.0, which does not report its own.
+            Needed stroke to either side, mm; not checked for firmware 1.0, which does not report its range.
 
         Raises
         ------
         Refused
-            Rate or stroke exceed the box's.
+            Rate or stroke exceed those of the box.
         SettingsChanged, Rebooted, LinkDown, ReplyTimeout, BadFrame, WrongDevice
             As for ``stream``.
         """
@@ -292,10 +294,11 @@ class SerialBallBar:
         Yields
         ------
         AsyncIterator of BarBatch
-            ``missing`` counts samples lost on the wire, or dropped because the consumer was more than 30 s behind. The iterator raises
-            ``Rebooted`` after a restart of the box, ``ReplyTimeout`` after max(1 s, 50 periods) of silence, ``LinkDown``; with a tap
-            ``Backpressure`` as soon as the ring, or the consumer's buffer, is 80 % full. ``SettingsChanged`` after a change of unit, range
-            or zero, ``LossyLine`` after too many losses.
+            ``missing`` counts samples lost on the wire, or (without a tap) dropped because the consumer was more than 30 s behind. The
+            iterator raises ``Rebooted`` after a restart of the box, ``SettingsChanged`` after a change of unit, range or zero,
+            ``DeviceFault`` if sample numbers and device clock disagree, ``LossyLine`` after too many losses, ``ReplyTimeout`` after
+            max(1 s, 50 periods) without a sample, ``LinkDown`` after a loss of the connection, and with a tap ``Backpressure`` as soon as
+            the ring buffer or the consumer's buffer is 80 % full.
 
         Raises
         ------
@@ -313,7 +316,7 @@ class SerialBallBar:
         if rate_hz <= 0 or 1000 % rate_hz:
             raise Refused(self.name, "start stream", f"{rate_hz} Hz does not divide 1000", "choose 1000, 500, 250, 200, 125, 100 ...")
         if self._streaming:
-            raise Refused(self.name, "start stream", "a stream is already running", "leave it first")
+            raise Refused(self.name, "start stream", "a stream is already running", "end it first")
         self._streaming = through = True
         try:
             await self._ready()
@@ -340,12 +343,12 @@ class SerialBallBar:
                 self._attach(None)
                 self._streaming = False
         if not through:  # another error already marks the run as incomplete
-            waited = Backpressure(self.name, "end stream", f"samples still waited {_DRAIN_S:g} s after the box had stopped", SLOW)
+            waited = Backpressure(self.name, "end stream", f"samples are not stored {_DRAIN_S:g} s after the box stopped", SLOW)
             self.incidents.note(waited)
             raise waited
 
     async def _delivered(self) -> bool:
-        """Wait until the tap has all received samples; after a reply to STOP it already has."""
+        """Wait until the tap has all received samples, as it has already after a reply to STOP."""
         return self._framing is None or self._stream is None or self._stream.tap is None or await self._framing.drained(_DRAIN_S)
 
     async def close(self) -> None:
@@ -355,7 +358,7 @@ class SerialBallBar:
 
     async def _hang_up(self) -> None:
         framing, self._framing = self._framing, None
-        await self._link.close()  # reads the kernel's rest first; everything read is still framed and delivered
+        await self._link.close()  # reads first what the kernel still holds; all of it is framed and delivered
         if framing is not None:
             await framing.ended()
 
@@ -366,7 +369,7 @@ class SerialBallBar:
 
     @property
     def state(self) -> str:
-        """``ready``, ``streaming``, ``down`` (the next call opens the line), ``aborted: CODE`` until the next stream or identification."""
+        """``ready``, ``streaming``, ``down`` (the next call opens the line) or ``aborted: CODE`` until the next stream or identify."""
         if self.incidents.open is not None:
             return f"aborted: {self.incidents.open.code}"
         if not self._link.is_open:
@@ -432,7 +435,7 @@ class SerialBallBar:
         stream.fail(self._box.error_of(why))
 
     def _broken(self, error: Exception) -> None:
-        self._fail(LinkDown(self.name, "read", f"the framing thread failed: {error!r}", "report this"))
+        self._fail(LinkDown(self.name, "read", f"the framing thread failed: {error!r}", "this is a defect of Abbe: report it"))
 
     def _fail(self, error: LinkDown) -> None:
         self.incidents.note(error)

@@ -1,4 +1,4 @@
-"""Ball-bar frames <-> bytes (docs/protocols/ballbar.md), the thread that makes frames of bytes, and requests with their replies.
+"""Encode and decode ball-bar frames (docs/protocols/ballbar.md), frame received bytes in a thread, and match requests with replies.
 
 Decoding is pure and total: any bytes give frames or counted bad bytes, never an exception. Replies are matched by tag, so that a late reply
 never passes for that of another request.
@@ -127,7 +127,7 @@ def configure_command(tag: int, unit: int, range_nm: int, zero_nm: int) -> bytes
 
 
 def reading_text(settings: BoxSettings) -> str:
-    """Describe settings for errors."""
+    """Describe unit, range and zero for error messages."""
     unit = "nm" if settings.unit == NANOMETRE else "0.1 microinch"
     return f"unit {unit}, range {settings.range_nm / 1e6:g} mm, zero {settings.zero_nm} nm"
 
@@ -151,7 +151,7 @@ class FrameDecoder:
 
         Returns
         -------
-        list of BarSample, Info, Ack, Settings or Bad
+        list of BarSample, Info, Ack, BoxSettings or Bad
             In order of arrival. Every byte ends in exactly one of them or in ``pending``.
         """
         data = self._rest + chunk if self._rest else chunk
@@ -188,7 +188,7 @@ class FrameDecoder:
 
 
 def _samples(data: bytes, at: int, out: list[Frame]) -> int:
-    """Decode the consecutive whole SAMPLE frames from ``at`` on, and return their end: the fast path of a good line."""
+    """Append the consecutive whole SAMPLE frames from ``at`` on to ``out`` and return their end: the fast path of a good line."""
     view = memoryview(data)
     whole = at + (len(data) - at) // _SAMPLE_BYTES * _SAMPLE_BYTES
     for head, seq, device_us, reading_nm, status, crc in _WHOLE_SAMPLE.iter_unpack(view[at:whole]):
@@ -199,7 +199,7 @@ def _samples(data: bytes, at: int, out: list[Frame]) -> int:
     return at
 
 
-_new = tuple.__new__  # half the time of calling the class, which is most of what framing takes
+_new = tuple.__new__  # takes half as long as calling the class, which dominates the time of framing
 
 
 def _frame(kind: int, data: bytes, payload_at: int, n_bytes: int) -> Frame:
@@ -221,10 +221,10 @@ _STOP_S = 2.0
 
 @dataclass(slots=True)
 class BarCounters:
-    """Diagnostic counters of the wire: whole frames, and errors, none of which reach the data.
+    """Diagnostic counters of the wire: valid frames, and errors, which never reach the data.
 
     ``bad_frames``: with a wrong check sum. ``strays``: impossible samples (see `abbe.drivers.ballbar.stream`). ``lost``: samples missing
-    between others. ``overflow``: samples dropped by a slow consumer without a tap.
+    between others. ``overflow``: samples dropped because the consumer of a stream without a tap was too slow.
     """
 
     frames: int = 0
@@ -264,15 +264,15 @@ class Framing:
 
     @property
     def runs(self) -> bool:
-        """Whether the line has not ended."""
+        """Whether the thread is alive."""
         return self._thread.is_alive()
 
     async def drained(self, within_s: float) -> bool:
-        """Wait until everything read so far is framed and delivered; False if that took too long, or the thread has died."""
+        """Wait until all bytes read so far are framed and delivered; return False if they are not within ``within_s`` seconds."""
         return await asyncio.to_thread(self.ring.drained, within_s) if self.runs else not self.ring.fill
 
     async def ended(self) -> None:
-        """Wait until everything read is framed, at most two seconds (a hanging disk may block the tap)."""
+        """Wait until all bytes read are framed, for at most two seconds: a hanging disk may block the tap."""
         await asyncio.to_thread(self._thread.join, _STOP_S)
 
     def _run(self) -> None:
@@ -342,11 +342,11 @@ class Conversation:
     send : callable
         Opens the line if necessary, and sends the bytes.
     counters : BarCounters
-        Of the line: whether any frame was valid distinguishes a silent box from a wrong baud rate.
+        Counters of the line. Bytes without a valid frame mean a wrong baud rate; no bytes mean a silent box.
     answer_s : callable
-        Longest time of a reply, s.
+        Returns the longest wait for a reply, s.
     backlog : callable
-        Fill of the ring between reading and framing: a reply may wait behind samples for a slow disk.
+        Returns the fill (0 to 1) of the ring buffer between reading and framing: above 0, a reply may still wait behind samples.
     """
 
     def __init__(
@@ -394,9 +394,9 @@ class Conversation:
         operation = _OPERATION[kind]
         answer = await self._ask(make, operation)
         if not isinstance(answer, Ack) or answer.command != kind:
-            raise BadFrame(self._name, operation, "the answer belongs to another command", "is another program talking to this box?")
+            raise BadFrame(self._name, operation, "the reply belongs to another command", "is another program talking to this box?")
         if answer.result:
-            remedy = "is the rate one the box can do?" if kind == START else "look at the box"
+            remedy = "does the box support this rate?" if kind == START else "check the settings at the box"
             raise Refused(self._name, operation, ACK_TEXT.get(answer.result, f"result {answer.result}"), remedy)
 
     def answered(self, frame: Answer) -> None:
@@ -427,7 +427,7 @@ class Conversation:
             if isinstance(error, DriverError):
                 raise
             if self._counters.bad_bytes > bad and self._counters.frames == understood:
-                detail = f"{self._counters.bad_bytes - bad} bytes came, but not one frame of a ball-bar box"
+                detail = f"{self._counters.bad_bytes - bad} bytes came, but no valid frame of a ball-bar box"
                 raise BadFrame(self._name, operation, detail, "baud rate and parity as on the box? is it a ball-bar box at all?") from None
             detail = f"no answer within {self._answer_s():g} s"
             raise ReplyTimeout(self._name, operation, detail, "box on? baud rate and port right?") from None

@@ -20,8 +20,8 @@ _WRAP = 1 << 32
 _HALF = _WRAP // 2
 _LATE_WINDOW = 128
 _Runs = list[tuple[int, list[BarSample]]]
-_SLEW_NM_S = 100_000_000  # 100 mm/s: faster than any axis changes a bar's length, and a bar pushed in by hand stays there
-_JITTER = 0.05  # of a period, between the number and the clock of a sample
+_SLEW_NM_S = 100_000_000  # 100 mm/s: no axis changes the bar's length faster; a bar pushed by hand does, but then keeps its new length
+_JITTER = 0.05  # of a period: by how much a sample's device time may differ from its number
 _MAX_LOSS = 0.001
 _LOSS_FLOOR = 10_000  # samples: an early burst is judged as if the run were this long; the whole run is judged at its end
 
@@ -36,7 +36,7 @@ class SampleRun:
 
 @dataclass(frozen=True, slots=True)
 class Reads:
-    """Known settings of the box: their number (bits 8 to 15 of every status) and the stroke."""
+    """Known settings of the box: their number (bits 8 to 15 of every status) and the stroke to either side."""
 
     number: int
     range_nm: int
@@ -101,7 +101,7 @@ class SequenceTracker:
         SequenceRestart
             The stream began anew: samples before and after must not be joined.
         OtherPace
-            Two consecutive samples do not fit number and clock.
+            Sequence number and device clock disagree in two consecutive samples.
         OtherSettings
             The box's settings changed since the stream began.
         """
@@ -121,7 +121,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def rest(self) -> list[SampleRun]:
-        """Deliver the sample still on trial at the end of the stream: no further sample can confirm or refute it."""
+        """Return the sample that is still a candidate (see `_weighed`) at the end of the stream: no further sample can judge it."""
         candidate, self._candidate = self._candidate, None
         runs: _Runs = []
         if candidate is not None:
@@ -129,7 +129,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def _plain(self, samples: Sequence[BarSample], at: int) -> int:
-        """Return the end of the samples that need no check: the fast path of a good line."""
+        """Return the end of the samples from ``at`` on that pass all simple checks: the fast path of a good line."""
         if self._candidate is not None or self._last_us < 0:
             return at
         expected, last_us, last_nm = self._next, self._last_us, self._last_nm
@@ -211,12 +211,12 @@ class SequenceTracker:
         )
 
     def _weighed(self, sample: BarSample) -> tuple[BarSample, ...]:
-        """Keep a reading that jumps until the next one shows whether it was a step or a single false value."""
+        """Keep a reading that jumps as a candidate until the next one shows whether it was a step or a single false value."""
         candidate = self._candidate
         if candidate is None:
             self._candidate = sample
             return ()
-        if (sample.seq - candidate.seq) % _WRAP >= _HALF:  # it belongs before the one that is kept
+        if (sample.seq - candidate.seq) % _WRAP >= _HALF:  # a late sample from before the candidate
             return (sample,)
         if sample.seq == candidate.seq:
             self.duplicates += 1
@@ -239,8 +239,8 @@ STOP_FILL = 0.8
 class Stream:
     """Sorts samples, passes each to the tap in the framing thread, and buffers ``buffer_s`` seconds of them for a slow consumer.
 
-    Without a tap, samples that do not fit are reported as missing. With a tap they are recorded already, and the stream fails: the consumer
-    watches the machine and must not be that far behind.
+    Without a tap, samples that do not fit into the buffer are reported as missing. With a tap all samples are recorded, but the stream
+    fails at 80 % of the buffer: the consumer watches the machine and must not be that far behind.
     """
 
     def __init__(self, device: str, rate_hz: int, buffer_s: float, tap: BarTap | None, boot_id: int, *, reads: Reads | None = None) -> None:
@@ -266,7 +266,7 @@ class Stream:
         Raises
         ------
         SegmentEnd
-            The stream began anew, or the box's settings changed; the samples before that are taken, none after it.
+            The stream began anew, its pace changed, or the box's settings did. Only the samples before that are taken.
         """
         with self._putting:
             if self._finished:
@@ -295,7 +295,7 @@ class Stream:
         if not bad_bytes and not tracker.lost and not tracker.strays and not tracker.duplicates:
             return None
         detail = (
-            f"{bad_bytes} bad bytes; of {tracker.lost + tracker.accepted} samples {tracker.lost} were lost, {tracker.strays} could not be, "
+            f"{bad_bytes} bad bytes; of {tracker.lost + tracker.accepted} samples {tracker.lost} were lost, {tracker.strays} impossible, "
             f"{tracker.duplicates} came twice or late"
         )
         return BadFrame(
@@ -334,11 +334,11 @@ class Stream:
                 self._batches.append(BarBatch(batch.host_s, batch.samples, missing, batch.boot_id, batch.overran))
             behind = 1.0 - self._room / self._size
         if self.tap is not None and behind >= STOP_FILL:
-            self.fail(Backpressure(self._device, "watch the samples", f"the program is {behind:.0%} of its buffer behind", SLOW))
+            self.fail(Backpressure(self._device, "watch the samples", f"the buffer of samples to watch is {behind:.0%} full", SLOW))
         self._wake()
 
     def mark(self, fill: float) -> None:
-        """Handle that the ring between reading and framing has filled to this mark; called in the reading thread."""
+        """Warn the tap that the ring buffer has reached this fill (0 to 1), and fail from 80 % on; called in the reading thread."""
         text = f"the ring between reading and storing is {fill:.0%} full"
         if self.tap is not None:
             self.tap.warn(text)

@@ -1,4 +1,4 @@
-"""A controller as a push needs it: identity, coherent status, detection of a restart, and the compensation banks.
+"""The part of the controller's driver for writing tables: identity, coherent status, detection of a restart, compensation banks.
 
 Each command to the banks (lease, seal, activate) is sent once, and the controller's status decides its outcome.
 """
@@ -46,7 +46,7 @@ class ControllerSession:
         WrongDevice
             Canary registers or register map are not those of docs/protocols/cnc.md.
         LinkDown, ReplyTimeout, BadFrame
-            The wire.
+            Communication failed.
         """
         self._map = ""
         counts = await self._identity()
@@ -69,7 +69,7 @@ class ControllerSession:
             self._boot_id = counts["BOOT_ID"]
         if counts["BOOT_ID"] != self._boot_id:
             detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
-            remedy = "the controller restarted: call identify, check its tables, measure again"
+            remedy = "the controller restarted: check its tables, connect to it again, then measure again"
             error = Rebooted(self.name, "check boot id", detail, remedy)
             self.incidents.note(error, latched=True)
             raise error
@@ -88,7 +88,7 @@ class ControllerSession:
         Rebooted
             The controller restarted since ``identify``.
         LinkDown, ReplyTimeout, BadFrame
-            The wire.
+            Communication failed.
         """
         words = await self.link.read_block(reg.STATUS)
         block = reg.decode_status(words, time.monotonic())
@@ -152,7 +152,7 @@ class Banks(ControllerSession):
             if await self._seqlock() == before:
                 boot_id, gen = before
                 return reg.decode_comp_status(words, boot_id=boot_id, gen=gen)
-        detail = f"the generation changed during each of {_SEQLOCK_TRIES} reads"
+        detail = f"the tables changed during each of {_SEQLOCK_TRIES} reads"
         raise DeviceFault(self.name, "read compensation status", detail, "is another program or the operator editing tables?")
 
     async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
@@ -195,7 +195,7 @@ class Banks(ControllerSession):
     async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
         """Take (or extend) the lease for changing banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
 
-        If the status shows another owner, nothing is sent, unless ``anyway``, which tests whether the controller refuses.
+        If the status shows another owner, nothing is sent; with ``anyway`` it is sent, to test whether the controller refuses.
 
         Raises
         ------
@@ -239,9 +239,9 @@ class Banks(ControllerSession):
     async def _bank_command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
         """Send a command and determine its outcome.
 
-        Two programs can use the same number: the controller executes the first command and skips the second, and both see the same
-        acknowledge. Therefore the acknowledge is compared with the owner of the lease. A skipped command never executes; it is sent again
-        under another number, except ACTIVATE, where the caller decides.
+        If two programs use the same command number, the controller executes only the first command, but both programs see its acknowledge.
+        The owner of the lease shows whose command it was. A skipped command is sent again under another number, except ACTIVATE, where the
+        caller decides.
         """
         async with self._bank_commands:
             for _ in range(1 if command == reg.ACTIVATE else _TRIES):
@@ -249,8 +249,8 @@ class Banks(ControllerSession):
                 if not _passed_over(command, result, counts, fields):
                     break
             else:
-                detail = "another program's command took its number: it was not executed"
-                raise DeviceFault(self.name, operation, detail, "let one program at a time push; read the status again, then decide")
+                detail = "another program used the same command number: this command was not executed"
+                raise DeviceFault(self.name, operation, detail, "let only one program write tables; read the status again, then decide")
         if command == reg.RELEASE and result == _LEASED and counts["LEASE_OWNER"] == 0:
             return  # some controls refuse to release a free lease
         if result:
@@ -296,7 +296,7 @@ class Banks(ControllerSession):
         return length
 
     def _within(self, operation: str, first: int, n_bytes: int) -> None:
-        """Refuse ranges beyond the registers of a bank, or that split a 32-bit value."""
+        """Refuse a range that exceeds the bank, or that may split a 32-bit value."""
         if n_bytes % 2 or n_bytes <= 0 or first % 2 or not 0 <= first <= reg.BANK_REGISTERS - n_bytes // 2:
             detail = f"{n_bytes} bytes from register {first} on are not within the {reg.BANK_REGISTERS} registers of a bank"
             raise Refused(self.name, operation, detail)

@@ -1,4 +1,4 @@
-"""Driver of a CNC controller: moves, paths, feed hold, and by `Banks` its tables. A move that fails leaves the machine in feed hold."""
+"""Driver of a CNC controller: moves, paths, feed hold, and tables (from `Banks`). A move that fails leaves the machine in feed hold."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _STOP_S = 5.0
 class ModbusController(Banks):
     """A CNC controller with the register map of docs/protocols/cnc.md.
 
-    Every method may raise ``LinkDown``, ``ReplyTimeout`` or ``BadFrame`` (the wire) and ``Rebooted`` (the controller restarted since
-    ``identify``; call ``identify`` again to accept that). Several tasks may call methods concurrently: only single requests exclude each
-    other, so ``hold``, ``abort``, ``resume`` and ``status`` work while a move is pending.
+    Every method may raise ``LinkDown``, ``ReplyTimeout`` or ``BadFrame`` (communication failed) and ``Rebooted`` (the controller restarted
+    since ``identify``; call ``identify`` again to accept that). Several tasks may call methods concurrently: only single requests exclude
+    each other, so ``hold``, ``abort``, ``resume`` and ``status`` work while a move is pending.
     """
 
     def __init__(self, link: ModbusLink) -> None:
@@ -35,8 +35,8 @@ class ModbusController(Banks):
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
         """Move straight to a target (commanded X, Y, Z in mm), wait until the axes stand there, and return that status.
 
-        On cancellation, timeout (``timeout_s`` host seconds for the whole move) or failure while the axes move, a feed hold is sent before
-        the error leaves.
+        On cancellation, timeout (``timeout_s`` host seconds for the whole move) or failure while the axes move, it sends a feed hold before
+        it raises the error.
 
         Raises
         ------
@@ -74,7 +74,7 @@ class ModbusController(Banks):
         """
         points = [self._counts(point, "load path") for point in points_mm]
         if len(points) > self.fifo_size:
-            detail = f"{len(points)} points, the controller holds {self.fifo_size}"
+            detail = f"{len(points)} points, but the controller holds at most {self.fifo_size}"
             raise Refused(self.name, "load path", detail, "use fewer points")
         await self._command(reg.PATH_CLEAR, "clear path")
         for first in range(0, len(points), reg.MAX_CHUNK):
@@ -96,7 +96,7 @@ class ModbusController(Banks):
             await self._command(reg.PATH_START, "start path", feed_mm_min=feed_mm_min)
 
     async def hold(self) -> None:
-        """Stop the axes on their path; ``resume`` continues, ``abort`` gives up. Works at any time."""
+        """Stop the axes on their path; ``resume`` continues the motion, ``abort`` discards it. Works at any time."""
         await self.request_hold(reg.HOLD)
 
     async def resume(self) -> None:
@@ -104,11 +104,11 @@ class ModbusController(Banks):
         await self.request_hold(reg.RUN)
 
     async def reset_alarm(self) -> None:
-        """Reset the controller's alarm. Raises ``Refused`` while its cause persists."""
+        """Reset the controller's alarm. Raises ``Refused`` while the cause of the alarm persists."""
         await self._command(reg.RESET_ALARM, "reset alarm")
 
     async def request_hold(self, level: int) -> None:
-        """Write HOLD_REQUEST. It is a level, not an event, so the link may repeat the write."""
+        """Write register HOLD_REQUEST: RUN, HOLD or ABORT. This is a level, not an event, so the link may repeat the write."""
         await self.link.write(reg.HOLD_ADDRESS, (level,), ModbusOperation.LEVEL)
 
     async def abort(self) -> None:
@@ -117,7 +117,7 @@ class ModbusController(Banks):
         Raises
         ------
         ReplyTimeout
-            The axes still move seconds later.
+            The axes still move after 5 s.
         """
         await self.request_hold(reg.ABORT)
         try:
@@ -172,7 +172,7 @@ class ModbusController(Banks):
             block = await self.block()
             reasons = reg.interlocks(block.status.conditions)  # an open door may also show as feed hold: report the door
             if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
-                raise Refused(self.name, operation, "feed hold is on", "call resume or abort first, when it is safe")
+                raise Refused(self.name, operation, "feed hold is on", "release it or abort the motion, when it is safe")
             number = next_number(block.motion_ack_seq)
             try:
                 words = reg.encode_motion(number, command, target, feed_mm_min)
@@ -190,7 +190,7 @@ class ModbusController(Banks):
         if result:
             detail = reg.MOTION_RESULT.get(result, f"result {result}") + (f": {', '.join(reasons)}" if reasons else "")
             # HOLD_REQUEST at 2 forbids motion without showing in the status
-            unseen = "was an abort not finished? call abort again; else " if result == _INTERLOCK and not reasons else ""
+            unseen = "was an abort not finished? abort again; else " if result == _INTERLOCK and not reasons else ""
             raise Refused(self.name, operation, detail, f"{unseen}look at the machine, then try again")
         return number
 
@@ -202,7 +202,7 @@ class ModbusController(Banks):
             if block.motion_done_seq == number:
                 return block.status
             if Condition.FEED_HOLD in block.status.conditions:
-                raise _MotionStopped(self.name, "move", "stopped by feed hold", "resume or abort when it is safe")
+                raise _MotionStopped(self.name, "move", "stopped by feed hold", "release it or abort the motion, when it is safe")
             if block.motion_ack_seq != number:
                 detail = f"command {number} was overtaken by {block.motion_ack_seq}"
                 raise DeviceFault(self.name, "move", detail, "is another program moving this machine?")

@@ -137,7 +137,7 @@ _MUST_BE_SET = {
 
 
 def fingerprint(counts: Mapping[str, int]) -> str:
-    """Describe the register map by the decoded identity block; any change means another map."""
+    """Describe the register map from the decoded identity block; another text means another map."""
     return (
         f"map {counts['MAP_VER']}, {counts['N_AXES']} axes, table unit {counts['TABLE_LSB_NM']} nm, "
         f"bank of {counts['BANK_SIZE']} registers, FIFO of {counts['FIFO_SIZE']} points"
@@ -145,7 +145,7 @@ def fingerprint(counts: Mapping[str, int]) -> str:
 
 
 def conditions_of(bits: int) -> Condition:
-    """Convert STATUS_BITS; bits unknown to this map are left out."""
+    """Convert STATUS_BITS to conditions; ignore bits unknown to this map."""
     found = NOTHING_HOLDS
     for bit, condition in _CONDITIONS.items():
         if bits & bit:

@@ -93,7 +93,7 @@ class ModbusLaser:
         WrongDevice
             Canary registers or map version are not those of docs/protocols/laser.md.
         LinkDown, ReplyTimeout, BadFrame
-            The wire.
+            Communication failed.
         """
         counts = await self._identity()
         clock_us = decode_reading(await self._link.read_block(READING), time.monotonic()).device_us
@@ -117,7 +117,7 @@ class ModbusLaser:
         Refused
             The beam is blocked, or its loss was not cleared.
         Rebooted, LinkDown, ReplyTimeout, BadFrame
-            The meter restarted, or the wire.
+            The meter restarted, or communication failed.
         """
         await self._command(ZERO, 0, "zero")
 
@@ -129,12 +129,12 @@ class ModbusLaser:
         Refused
             The beam is still blocked.
         Rebooted, LinkDown, ReplyTimeout, BadFrame
-            The meter restarted, or the wire.
+            The meter restarted, or communication failed.
         """
         await self._command(CLEAR_BEAM, 0, "clear beam-lost latch")
 
     async def set_environment_compensation(self, on: bool) -> None:
-        """Switch the compensation of the wavelength in air on or off (without it the meter reads about 270 ppm more).
+        """Switch the compensation for the refractive index of air on or off (without it the meter reads about 270 ppm more).
 
         Raises
         ------
@@ -144,16 +144,16 @@ class ModbusLaser:
         await self._command(ENVIRONMENT, int(on), "switch environmental compensation")
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
-        """Read the current output sample, or wait for one newer than ``after_count`` (a ``sample_count``) and than the last command.
+        """Wait for an output sample newer than ``after_count`` (a ``sample_count``; None: any) and than the last command, and return it.
 
         Raises
         ------
         DeviceFault
-            The beam is or was lost, or was not zeroed since: the displacement is not valid.
+            The beam is or was lost, or the meter was not zeroed since: the displacement is not valid.
         ReplyTimeout
             No new sample in time.
         Rebooted, LinkDown, BadFrame
-            The meter restarted, or the wire.
+            The meter restarted, or communication failed.
         """
         try:
             async with asyncio.timeout(self._read_timeout_s):
@@ -173,12 +173,12 @@ class ModbusLaser:
         return reading
 
     async def peek(self) -> LaserReading:
-        """Read the current output sample without waiting for a newer one and without checking its beam, for watchers.
+        """Read the current output sample without waiting for a newer one and without checking the beam, for monitoring.
 
         Raises
         ------
         Rebooted, LinkDown, ReplyTimeout, BadFrame
-            The meter restarted, or the wire.
+            The meter restarted, or communication failed.
         """
         return await self._read_once()
 
@@ -200,7 +200,7 @@ class ModbusLaser:
             self._boot_id = counts["BOOT_ID"]
         if counts["BOOT_ID"] != self._boot_id:
             detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
-            error = Rebooted(self.name, "read", detail, "the meter restarted: call identify and zero, then measure this test again")
+            error = Rebooted(self.name, "read", detail, "the meter restarted: connect to it again, zero it, then measure this test again")
             self._link.incidents.note(error, latched=True)
             raise error
         self._connection = self._link.connections
@@ -218,7 +218,9 @@ class ModbusLaser:
     def _check_beam(self, status: int) -> None:
         if beam_is_gone(status):
             what = "no reflector in the beam" if status & LaserFlag.NO_REFLECTOR else "counts are lost"
-            raise DeviceFault(self.name, "read", f"beam lost ({what})", "free the beam, then clear_beam and zero, then repeat this test")
+            raise DeviceFault(
+                self.name, "read", f"beam lost ({what})", "free the beam, clear the loss, zero the meter, then repeat this test"
+            )
         if not is_zeroed(status):
             raise DeviceFault(self.name, "read", "not zeroed since it was switched on or lost the beam", "zero it, then repeat this test")
 
@@ -233,7 +235,7 @@ class ModbusLaser:
 
             result = await run_numbered(self.name, operation, number, write, self._read_ack)
         if result:
-            raise Refused(self.name, operation, RESULT_TEXT.get(result, f"result {result}"), "free the beam, or clear_beam first")
+            raise Refused(self.name, operation, RESULT_TEXT.get(result, f"result {result}"), "free the beam and clear its loss first")
         self._shown_at_command = (await self._read_once()).sample_count
 
     async def _read_ack(self) -> tuple[int, int]:

@@ -19,7 +19,7 @@ _KEPT = 256
 
 @dataclass(frozen=True, slots=True)
 class Incident:
-    """One entry.
+    """One entry in the list of incidents.
 
     ``kind``: ``detected`` or ``outcome``; ``code``, ``device``, ``run``, ``text``: of the first error; ``host_s``: monotonic host
     seconds; ``state`` of an outcome: ``recovered`` (the device answers again), ``accepted`` (identified anew), ``closed``; ``times`` of an

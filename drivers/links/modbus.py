@@ -1,7 +1,7 @@
-"""One Modbus connection, TCP or RTU: open, send one request, drop. The only file that uses pymodbus.
+"""One Modbus connection, TCP or RTU: open it, send one request at a time, close it. The only file that uses pymodbus.
 
-This file adds to the library (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
-(`tcp_mismatch`, `rtu_mismatch`) before the library gets it, closing of the old socket before a new one opens, and detection of unsolicited
+This file adds to pymodbus (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
+(`tcp_mismatch`, `rtu_mismatch`) before pymodbus gets it, closing of the old socket before a new one opens, and detection of unsolicited
 bytes.
 """
 
@@ -100,7 +100,7 @@ def _pdu_mismatch(asked: bytes, heard: bytes) -> str:
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 READ_HOLDING, READ_INPUT, WRITE = 3, 4, 16
-# The kernel, too, detects a peer that vanished, within 3 s.
+# With these options the kernel, too, detects within 3 s that a peer has vanished.
 _KEEPALIVE = (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 2), ("TCP_USER_TIMEOUT", 2500))
 _BITS_PER_BYTE = 11
 _TURNS = 20
@@ -129,7 +129,7 @@ class ModbusReply:
 
 
 class ModbusWire:
-    """At most one connection at a time to one unit."""
+    """The connection to one Modbus unit, at most one at a time."""
 
     def __init__(self, url: ModbusTcpUrl | ModbusRtuUrl) -> None:
         self._url = url
@@ -148,7 +148,7 @@ class ModbusWire:
 
     @property
     def up(self) -> bool:
-        """Whether the system knows of a working connection."""
+        """Whether there is a connection that is not known to be lost."""
         return self._client is not None and self._client.connected and not self._lost
 
     async def open(self, timeout_s: float) -> None:
@@ -157,7 +157,7 @@ class ModbusWire:
         Raises
         ------
         LinkDown
-            No answer there, or the port cannot be opened.
+            No answer at the address, or the serial port cannot be opened.
         """
         await self.drop()
         client, self._lost, self.strays = self._new_client(timeout_s), False, 0
@@ -181,7 +181,7 @@ class ModbusWire:
         Raises
         ------
         ReplyTimeout, LinkDown, BadFrame
-            No reply, the connection went, or a reply that does not answer the request.
+            No reply, a lost connection, or a reply that does not answer the request.
         """
         client, unit = self._client, self._url.unit
         if client is None:
@@ -229,13 +229,13 @@ class ModbusWire:
             self._deadline.reschedule(asyncio.get_running_loop().time())
 
     async def gap(self) -> None:
-        """On RTU: wait until 3.5 characters have passed since the last byte. Whatever was sent twice shows itself in it, as strays."""
+        """On RTU, wait until 3.5 characters have passed since the last byte. A second reply that comes meanwhile counts as strays."""
         if self.rtu:
             gap_s = max(_SHORTEST_GAP_S, 3.5 * _BITS_PER_BYTE / self._baud)
             await asyncio.sleep(max(0.0, self.heard_at + gap_s - asyncio.get_running_loop().time()))
 
     def forget(self) -> None:
-        """The strays so far are dealt with."""
+        """Reset the count of strays."""
         self.strays = 0
 
     @property
@@ -244,7 +244,7 @@ class ModbusWire:
 
     def _why(self, request: Request, timeout_s: float) -> DriverError:
         if self._complaint:
-            detail = f"the reply does not fit: {self._complaint} [{self._heard[:40].hex(' ')}]"
+            detail = f"the reply does not fit the request: {self._complaint} [{self._heard[:40].hex(' ')}]"
             return BadFrame(self.name, str(request), detail, "line noise, a second master, or another device than expected?")
         if self._lost or not self.up:
             return LinkDown(self.name, str(request), "the connection was closed", "device restarted, or cable unplugged?")
@@ -291,12 +291,14 @@ class ModbusWire:
 
     def _remedy(self) -> str:
         if isinstance(self._url, ModbusTcpUrl):
-            return "address and port right? device on? only one connection allowed and another program has it?"
+            return "address and port right? device on? does another program hold the only connection it allows?"
         path = self._url.path
         if not os.path.exists(path):
             return "adapter plugged in? device path right?"
         return (
-            "another program holds the port?" if os.access(path, os.R_OK | os.W_OK) else "no permission: add this user to the port's group"
+            "does another program hold the port?"
+            if os.access(path, os.R_OK | os.W_OK)
+            else "no permission: add this user to the port's group"
         )
 
     def _trace(self, sending: bool, data: bytes) -> bytes:

@@ -1,7 +1,7 @@
 """Modbus TCP and RTU behind four calls: connect, read, write, close. Decides on retries, waits and the validity of replies.
 
-TCP numbers its transactions; an RTU line must prove that replies match requests (`ModbusLine`). Two tables define which requests may be
-repeated, and the meaning of exception codes.
+TCP numbers its transactions; RTU does not, so `ModbusLine` verifies that replies match requests. `POLICY` defines which requests may be
+repeated, `EXCEPTIONS` the meaning of exception codes.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class ModbusOperation(Enum):
 class RetryRule:
     """Retries of one kind of request.
 
-    ``repeats``: number of retries, over a new or verified line, without a valid reply; ``after_busy``: retry after exception 6 (busy: not
-    accepted), ``after_acknowledge``: after exception 5 (accepted, still working), both for at most ``BUSY_S``.
+    ``repeats``: number of retries after a missing or invalid reply, each over a new or verified line; ``after_busy``: retry after exception
+    6 (busy: not accepted); ``after_acknowledge``: retry after exception 5 (accepted, still working), both for at most ``BUSY_S``.
     """
 
     repeats: int
@@ -48,7 +48,7 @@ class RetryRule:
 POLICY = {
     ModbusOperation.READ: RetryRule(repeats=1, after_busy=True, after_acknowledge=True),
     ModbusOperation.LEVEL: RetryRule(repeats=1, after_busy=True, after_acknowledge=True),
-    # 6 means that nothing was executed. 5 means that the command may still execute: only the acknowledge register decides.
+    # Exception 6: nothing was executed. Exception 5: the command may still execute, and only the acknowledge register tells.
     ModbusOperation.NUMBERED: RetryRule(repeats=0, after_busy=True, after_acknowledge=False),
     ModbusOperation.TRIGGER: RetryRule(repeats=0, after_busy=False, after_acknowledge=False),
 }
@@ -101,7 +101,7 @@ def waits(op: ModbusOperation, code: int) -> bool:
 _BABBLE_LIMIT = 5
 _PROOFS = 5
 _CONNECT = 3
-"""Reply timeouts that a TCP connection may take: a lost first packet is sent again after a second."""
+"""Longest time for a TCP connection, in reply timeouts: a lost first packet is sent again only after a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +118,11 @@ class Canary:
 
 
 class ModbusLine:
-    """A wire that tracks disturbances.
+    """A Modbus wire that is verified after every disturbance.
 
-    On RTU a missing or wrong reply is followed by silence for a whole reply timeout and a read of the canary before the next request. The
-    canary is also read after every reply: if a stale reply passed for the answer, the true one arrives now and does not match. Without a
-    canary a disturbed RTU line gets only the silence. ``timeout_s``: longest wait for one reply.
+    After a missing or wrong reply on RTU, the line waits for silence of a whole reply timeout and reads the canary before the next request.
+    It also reads the canary after every reply: if that reply was a stale one, the true one arrives now and does not match. Without a canary
+    a disturbed RTU line gets only the silence. ``timeout_s``: longest wait for one reply, s.
     """
 
     def __init__(self, wire: ModbusWire, timeout_s: float, canary: Canary | None) -> None:
@@ -132,14 +132,14 @@ class ModbusLine:
         self._known: tuple[int, ...] | None = None
         self._turn = 0
         self.closing = False
-        """Stop waiting for silence."""
+        """Whether a wait for silence must end, because the link closes."""
         self.dirty = False
         """Whether the line must be verified before the next request."""
         self.foreign_bytes = 0
         """Number of unsolicited bytes: noise, late replies, or a second master."""
 
     async def open(self) -> None:
-        """Make a new connection; raises as ``ModbusWire.open``."""
+        """Open a new connection; raises as ``ModbusWire.open``."""
         self._known = None
         await self._wire.open(self._timeout_s if self._wire.rtu else _CONNECT * self._timeout_s)
 
@@ -246,12 +246,12 @@ class ModbusLink:
     Parameters
     ----------
     timeout_s : float
-        Longest wait for one reply, and for one connection.
+        Longest wait for one reply; a TCP connection may take three times as long.
     canary : Canary, optional
-        Of devices that have one and answer function 4 like function 3 (docs/protocols). Without it a disturbed RTU line gets silence but no
-        verification, and there is no heartbeat.
+        For devices that have one and answer function 4 like function 3 (docs/protocols). Without it a disturbed RTU line gets silence but
+        no verification, and there is no heartbeat.
     heartbeat_s : float, optional
-        Read the canary after this idle time: this detects a vanished peer within the same time plus one timeout, and reconnects a lost one.
+        Read the canary after this idle time. This detects a vanished peer within ``heartbeat_s + timeout_s``, and reconnects a lost one.
     """
 
     def __init__(
@@ -295,7 +295,7 @@ class ModbusLink:
         Raises
         ------
         LinkDown
-            No answer there, or the port cannot be opened.
+            No answer at the address, or the serial port cannot be opened.
         """
         link = cls(url, timeout_s=timeout_s, canary=canary, backoff=backoff, heartbeat_s=heartbeat_s)
         await link._ready(_PATIENCE_S)

@@ -38,7 +38,7 @@ class Ring:
         self.lost_bytes = 0
         self.highest = 0.0
         self.on_mark: Callable[[float], None] = lambda mark: None
-        """Called in the reading thread when the fill rises to a mark of ``MARKS``; again only after the ring was nearly empty."""
+        """Called in the reading thread when the fill rises to a mark of ``MARKS``; again only after the fill was below 0.25."""
         self._pieces: deque[ReadPiece] = deque()
         self._bytes = 0
         self._lost = 0
@@ -71,7 +71,7 @@ class Ring:
             self.on_mark(mark)
 
     def take(self, timeout_s: float) -> list[ReadPiece] | None:
-        """Wait for and return the oldest pieces, about 64 KiB. Empty after ``timeout_s``, None after the end."""
+        """Wait for the oldest pieces, about 64 KiB, and return them: an empty list after ``timeout_s``, None after the end."""
         with self._news:
             if not self._pieces:
                 self._idle = True  # the taker returns only after processing what it took before
@@ -88,7 +88,7 @@ class Ring:
             return pieces if pieces or not self._ended else None
 
     def drained(self, timeout_s: float) -> bool:
-        """Wait until everything put so far is taken and processed; False on timeout."""
+        """Wait until everything put so far is taken and processed; return False on timeout."""
         with self._news:
             return self._news.wait_for(lambda: self._idle and not self._pieces, timeout_s)
 

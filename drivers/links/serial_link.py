@@ -44,7 +44,7 @@ def adapter_at(path: str, listed: Sequence[Adapter]) -> Adapter | None:
 
 
 def path_to_open(device: str, path: str, known: Adapter | None, listed: Sequence[Adapter]) -> str:
-    """Return the current path of the adapter that was opened last (``known``), or the configured one if there is none.
+    """Return the current path of the adapter that was opened last (``known``), or the configured path if ``known`` is None.
 
     Raises
     ------
@@ -111,7 +111,7 @@ class ByteLink:
     """A byte pipe to one device, which may return at another port.
 
     A serial port is locked: no second program (or link) can open it. An adapter with a serial number is found again at any port, and no
-    other one is taken for it; ``adapters`` lists those plugged in.
+    other adapter is accepted instead; ``adapters`` returns the adapters now plugged in.
     """
 
     def __init__(self, url: SerialUrl | SocketUrl, adapters: Callable[[], list[Adapter]] | None = None) -> None:
@@ -141,7 +141,7 @@ class ByteLink:
         LinkDown
             The port is missing, forbidden, busy or unreachable.
         WrongDevice
-            Another adapter has the path of the one opened before.
+            Another adapter now has the path of the one opened before.
         """
         if self._port is None:
             self._port = self._open_serial(self._url) if isinstance(self._url, SerialUrl) else await connected(self._url)
@@ -225,7 +225,9 @@ class ByteLink:
                     except BlockingIOError:
                         await self._ready(descriptor, loop.add_writer, loop.remove_writer)
         except TimeoutError:
-            raise ReplyTimeout(self.name, "write", f"line takes no bytes for {timeout_s:g} s", "flow control or adapter stuck?") from None
+            raise ReplyTimeout(
+                self.name, "write", f"the line accepted no bytes for {timeout_s:g} s", "flow control or adapter stuck?"
+            ) from None
         except OSError as error:
             raise self._lost("write", error) from error
 
@@ -293,7 +295,7 @@ class ByteLink:
 
     def _lost(self, operation: str, error: Exception | None) -> LinkDown:
         self._release()
-        return LinkDown(self.name, operation, f"the device has gone ({'end of file' if error is None else error})", _UNPLUGGED)
+        return LinkDown(self.name, operation, f"the device is gone ({'end of file' if error is None else error})", _UNPLUGGED)
 
     def _release(self) -> None:
         port, self._port = self._port, None
@@ -334,4 +336,4 @@ def serial_remedy(path: str, error: Exception) -> str:
         return "no permission: add this user to the group that owns the port (often dialout)"
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error):
         return "another program holds the port: close it"
-    return "is this really a serial port, and is the baud rate one it can do?"
+    return "is this really a serial port, and does it support this baud rate?"

@@ -32,9 +32,9 @@ PARITIES = ("none", "even", "odd")
 
 @dataclass(frozen=True, slots=True)
 class SerialUrl:
-    """A serial port by its device path; ``baud`` in bit/s, 8 bits, 1 stop bit; ``parity`` none, even or odd.
+    """A serial port by its device path, 8 data bits, 1 stop bit; ``baud`` in bit/s; ``parity`` none, even or odd.
 
-    ``serial_no``: the only accepted device.
+    ``serial_no``: serial number of the only accepted device; None: any.
     """
 
     path: str
@@ -50,7 +50,7 @@ class SerialUrl:
 
 @dataclass(frozen=True, slots=True)
 class SocketUrl:
-    """Raw bytes over TCP; ``serial_no`` as of a serial port."""
+    """Raw bytes over TCP; ``serial_no`` as in `SerialUrl`."""
 
     host: str
     port: int
@@ -108,7 +108,7 @@ DeviceUrl = SerialUrl | SocketUrl | ModbusTcpUrl | ModbusRtuUrl | FixtureTcpUrl 
 
 
 def parse_url(text: str) -> DeviceUrl:
-    """Understand a device URL.
+    """Parse a device URL.
 
     Parameters
     ----------
@@ -118,12 +118,12 @@ def parse_url(text: str) -> DeviceUrl:
     Returns
     -------
     DeviceUrl
-        One of the frozen URL classes of this module; ``str()`` of it gives the URL back in its full form.
+        One of the frozen URL classes of this module; ``str()`` returns the URL in its full form.
 
     Raises
     ------
     BadUrl
-        Unknown scheme, missing host, port or path, a query key that means nothing here, or a number out of range.
+        Unknown scheme, missing host, port or path, unknown query key, or a number out of range.
     """
     if any(character <= " " or character == "\x7f" for character in text):
         raise _bad(text, "it contains blanks or control characters", "write blanks in a path as %20")
@@ -135,7 +135,7 @@ def parse_url(text: str) -> DeviceUrl:
     if builder is None:
         raise _bad(text, f"unknown scheme {parts.scheme!r}", f"use one of {', '.join(_BUILDERS)}")
     if parts.fragment or parts.username is not None or parts.password is not None:
-        raise _bad(text, "user names and #fragments mean nothing here")
+        raise _bad(text, "user names, passwords and #fragments are not allowed")
     return builder(text, parts)
 
 
@@ -222,7 +222,7 @@ def _netloc(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _bad(text: str, detail: str, remedy: str = "see docs of drivers/links/urls.py for the forms") -> BadUrl:
+def _bad(text: str, detail: str, remedy: str = "docs/reference/machine-file.md shows the forms") -> BadUrl:
     return BadUrl(ascii(text), "read device URL", detail, remedy)
 
 
@@ -236,13 +236,13 @@ def _address(text: str, parts: SplitResult) -> tuple[str, int]:
     if not port:
         raise _bad(text, "the port is missing", f"write {parts.scheme}://{parts.hostname}:port")
     if parts.path not in ("", "/"):
-        raise _bad(text, f"a path ({parts.path}) means nothing here")
+        raise _bad(text, f"a path ({parts.path}) is not allowed with this scheme")
     return parts.hostname, port
 
 
 def _path(text: str, parts: SplitResult) -> str:
     if parts.netloc:
-        raise _bad(text, f"a host ({parts.netloc}) means nothing here", f"write three slashes: {parts.scheme}:///dev/...")
+        raise _bad(text, f"a host ({parts.netloc}) is not allowed with this scheme", f"write three slashes: {parts.scheme}:///dev/...")
     path = unquote(parts.path)
     if not path.startswith("/") or path.endswith("/") or "\x00" in path:
         raise _bad(text, "the device path is missing or not absolute", f"write {parts.scheme}:///dev/ttyUSB0")

@@ -1,6 +1,6 @@
 """Register maps as data, and the pure conversion from 16-bit words to integers (big-endian, high word first).
 
-Also common to all devices with such a map: registers that identify the map, and numbered commands with an acknowledge.
+Also what all devices with such a map share: registers that identify the map, and numbered commands with an acknowledge.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ CANARY_WORDS = (0x0102, 0x0304, 0x449A, 0x5000)
 class Register:
     """One value of a register map.
 
-    ``address``: of its first register, from 0; ``name``: as in docs/protocols; ``per_unit``: counts per unit, so that the physical value is
-    count / per_unit (a division keeps 0.01 steps exact to the last bit).
+    ``address``: its first register, from 0; ``name``: as in docs/protocols; ``per_unit``: counts per ``unit``, so that the physical value
+    is count / per_unit (a division keeps 0.01 steps exact to the last bit).
     """
 
     address: int
@@ -42,8 +42,8 @@ class Register:
 class RegisterBlock:
     """Registers read in one request, which makes them coherent.
 
-    ``base``, ``count``: first register and number of registers of the request; ``registers``: its values; ``lead``: registers before
-    ``base`` that the same request may read (see ModbusLink.read).
+    ``base``, ``count``: first register and number of registers of the request; ``registers``: the values in them; ``lead``: number of
+    registers before ``base`` that the same request may read, too (see ``ModbusLink.read``).
     """
 
     base: int
@@ -97,7 +97,7 @@ _ORDER_NAMES = {
     "DCBA": "registers and bytes are swapped (DCBA)",
 }
 _SET_ORDER = "set the device to big-endian, high word first (ABCD)"
-_WHO = "is this address and unit number really that device?"
+_WHO = "do address and unit number really belong to this device?"
 _LONGEST_US = 100 * 365 * 86400 * 10**6
 
 
@@ -131,7 +131,7 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
 def check_clock(device: str, device_us: int) -> None:
     """Raise WrongDevice for a device time since power-on of more than 100 years: its four registers must be in the wrong order."""
     if device_us > _LONGEST_US:
-        detail = f"its clock reads {device_us:#018x} us since it was switched on: int64: the registers of 64-bit values are swapped"
+        detail = f"its clock reads {device_us:#018x} us since it was switched on: the registers of 64-bit values are swapped"
         raise WrongDevice(device, "identify", detail, _SET_ORDER)
 
 
@@ -159,9 +159,9 @@ async def run_numbered(
     number : int
         The number in the command, ``next_number(last acknowledged)``.
     write, read_ack : callable
-        Sends the command (called exactly once); reads (acknowledged number, result code).
+        ``write`` sends the command (called exactly once); ``read_ack`` returns (acknowledged number, result code).
     settle_s : float
-        Longest time of an acknowledge.
+        Longest wait for the acknowledge.
 
     Raises
     ------

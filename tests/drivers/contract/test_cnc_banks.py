@@ -130,7 +130,7 @@ async def test_comp_status_gives_up_when_somebody_keeps_editing(controller, cnc)
         cnc.peer.put(7, "I", reads)
 
     cnc.peer.on_read = edit
-    with pytest.raises(DeviceFault, match="generation changed"):
+    with pytest.raises(DeviceFault, match="tables changed"):
         await controller.comp_status()
     assert reads == banks_module._SEQLOCK_TRIES
 
@@ -232,14 +232,14 @@ async def test_releasing_a_free_lease_is_done_at_once_whatever_the_control_calls
 
 async def test_a_lease_that_is_free_and_refused_is_not_taken_for_given(controller, cnc):
     cnc.comp_result = 7
-    with pytest.raises(DeviceFault, match="took its number"):
+    with pytest.raises(DeviceFault, match="used the same command number"):
         await controller.lease(7, 60_000)
     assert cnc.log == [("comp", 3)] * banks_module._TRIES
 
 
 async def test_an_activation_that_was_passed_over_is_told_and_never_sent_again(controller, cnc):
     cnc.comp = Another(cnc, 7, 7)
-    with pytest.raises(DeviceFault, match="took its number: it was not executed"):
+    with pytest.raises(DeviceFault, match="used the same command number: this command was not executed"):
         await controller.activate(1, expect_crc=1, expect_gen=1, owner=7)
     assert (cnc.comp.passed_over, cnc.log) == ([2], [])
 
