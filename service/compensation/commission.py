@@ -1,8 +1,8 @@
 """Commissioning of a control's tables: write a known step, measure it with the ball-bar, and infer sign, axis and unit.
 
 A first step of half a micrometre shows a wrong unit while it is harmless (taken for millimetres it is half a millimetre, within the
-bar's stroke). Then each axis gets 10 µm, rolled back before the next. The bar stays mounted throughout; every table goes through the push
-machine like any other, and any failure rolls back.
+bar's stroke). Then each axis gets a step of 10 µm, which is rolled back before the next one. The bar stays mounted throughout. Every table
+goes through the push machine like any other, and any failure rolls back.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SignCommissioning:
 
 @dataclass
 class CommissioningContext:
-    """What a commissioning works with."""
+    """Open devices, database, machine and places of the ball-bar for one commissioning."""
 
     session: Session
     store: Store
@@ -121,8 +121,8 @@ def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
     small_mm, step_mm = (max(round(s / lsb_mm), 1) * lsb_mm for s in (FIRST_MM, STEP_MM))
     if small_mm * LARGEST_RATIO > STROKE_MM:
         raise TableRefused(
-            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: its least step, taken for millimetres, is beyond the bar's stroke",
-            "prove sign and unit with an indicator and the axis clear of everything; nothing was written",
+            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: its smallest step, taken for millimetres, exceeds the bar's stroke",
+            "prove sign and unit with a dial indicator, with the axis clear of all obstacles; nothing was written",
         )
     tables = _base_tables(context.site, base)
     x, y, z = (quantise(_stepped(context, tables, (axis,), step_mm), lsb_mm) for axis in range(3))
@@ -133,17 +133,17 @@ def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
 
 
 async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> SignProof:
-    """Read all passes and infer the proof; a wrong unit is stored before the error is raised."""
+    """Read the places with each table and infer the proof; store a wrong unit before raising its error."""
     before = await context.bar.read("before")
     first = await context.read_with_table("first", steps.small, base, steps.lsb_nm)
     moved_mm = float(np.abs(first.deviation_mm - before.deviation_mm).max())
     if moved_mm > HARMLESS * max(steps.small_mm, FIRST_MM):
         moved = f"a step of {steps.small_mm * 1e3:g} µm moved the tool by {moved_mm * 1e3:.1f} µm"
-        what = f"{moved}: the control takes the numbers for another unit"
+        what = f"{moved}: the control takes the values of its tables for another unit"
         campaign = await asyncio.to_thread(context.store.campaigns.find, f"{context.bar.name} before")
         doc = {"step_mm": steps.small_mm, "faults": [what], "proved": False}
         await context.store.write(context.store.solutions.add, campaign.id, KIND, context.bar.run_ids, doc)
-        raise TableRefused(what, "the old table is in force; look up the unit of the control's table and its entry in the machine file")
+        raise TableRefused(what, "the old table is in force; look up the unit of the control's tables")
     read = [await context.read_with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
     after = await context.bar.read("after")
     return sign_proof(steps.step_mm, _shifts(context.bar.directions(before), before, read, after))
@@ -224,6 +224,6 @@ async def check_commissioned(controller: Identity, store: Store, site: Site) -> 
         )
     if found is None:
         raise TableRefused(
-            "sign, axis and unit of this control's tables were never proved: a whole table could move the axes by another unit",
-            "abbe comp commission proves them with a small step, about ten minutes; nothing was written",
+            "sign, axis and unit of this control's tables were never proved: with a wrong unit a table could move the axes too far",
+            "run abbe comp commission, which proves them with small steps in about ten minutes; nothing was written",
         )

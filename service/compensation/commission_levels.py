@@ -1,11 +1,11 @@
-"""Commissioning of a controller's capabilities: each flag is proved by attempts that must be refused and attempts that must be accepted.
+"""Commissioning of a controller's capabilities: attempts that it must refuse, and attempts that it must accept, prove each flag.
 
-Every attempt uses an exact copy of the table in force in the inactive bank. Whatever the controller wrongly accepts, and wherever this is
-interrupted, the same corrections act as before. No person opens, presses or restarts anything: what only that could show is reported as
-not shown.
+The inactive bank holds a copy of the table in force for every attempt. So the same corrections act as before, whatever the controller
+wrongly accepts and wherever the test is interrupted. Nobody has to open, press or restart anything; properties that only this could show
+are reported as not shown.
 
 `Trial` attempts one operation and records whether it was refused. `while_moving` checks that an activation is refused while an axis moves:
-one slow move of a few millimetres, up if there is room, and back.
+it moves one axis slowly by a few millimetres, up if there is room, and back.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Trial:
     controller : Controller
         Identified.
     base : Base
-        The table in force when the test began; every copy is one of it.
+        The table in force when the test began, of which the test writes copies.
     owner, stranger : int
         Owner ids of the lease: this test, and a second owner that must be shut out.
     """
@@ -172,7 +172,7 @@ async def while_moving(t: Trial, site: Site) -> None:
 
 
 async def _on_the_way(t: Trial, target: Point) -> str:
-    """Move slowly and attempt an activation meanwhile; return why this showed nothing, empty if it did."""
+    """Move slowly and attempt an activation meanwhile; return why this showed nothing, or an empty text if it showed something."""
     now = await t.seal_copy()
     move = asyncio.ensure_future(t.controller.move(target, feed_mm_min=FEED_MM_MIN, timeout_s=MOVE_LIMIT_S))
     try:
@@ -221,8 +221,8 @@ async def _stop(t: Trial, move: asyncio.Future[ControllerStatus]) -> None:
 
 RESTART = "that a restart changes the boot id, and what it leaves in the banks: this test restarts nothing"
 NOT_SHOWN = (
-    "that an open door, an e-stop or drives that are off refuse an activation: this test asks no person to open or press anything",
-    "that a command repeated with its old number does nothing: the driver never repeats one",
+    "that the controller refuses an activation with the door open, with an e-stop or with drives off: this test asks nobody to cause these",
+    "that a command repeated with its old number has no effect: the driver never repeats a command",
 )
 SHORT_LEASE_MS, RUNS_OUT_S, POLL_S = 300, 5.0, 0.05
 
@@ -238,7 +238,7 @@ class ProvedLevels:
     solution_id: int
 
     def rows(self) -> list[tuple[str, bool, str]]:
-        """For people: flag, whether it is proved, how (or the reason against it)."""
+        """Return for each flag its name, whether it is proved, and the observations for or against it as text."""
         found = flags_of(self.capabilities)
         return [(name, ok, how(self.shown, name)) for name, ok in found.items() if name != "can_disable"]
 
@@ -253,7 +253,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
     StillActive
         An interrupted push could not be finished (yet).
     TableMismatch
-        The table in force does not match its CRC, or is not the one from before this test.
+        The table in force does not match its CRC, or differs from the table before this test.
     DriverError
         The link failed, or the controller restarted meanwhile: begin again.
     """
@@ -272,7 +272,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
     await _boot_id(trial)
     other_boots = earlier - {info.boot_id}
     if other_boots:
-        trial.note("boot_id", "it is another one than an earlier run of this controller had")
+        trial.note("boot_id", "it differs from the boot id of an earlier start")
     capabilities = Capabilities(**{f.name: trial.is_proved(f.name) for f in fields(Capabilities)})
     not_shown = (*(() if other_boots else (RESTART,)), *NOT_SHOWN)
     doc = {
@@ -327,7 +327,10 @@ async def _boot_id(t: Trial) -> None:
 
 
 async def _two_banks(t: Trial) -> bool:
-    """Check that there are two banks and that the active one refuses writes. Only the table's number differs meanwhile: without effect."""
+    """Check that there are two banks and that the active one refuses writes.
+
+    The copy is marked by another table number, which does not change the corrections.
+    """
     image, c = t.base.image, t.controller
     now = await t.status()
     begin, end = 2 * ID_WORD, 2 * ID_WORD + 4
@@ -338,11 +341,9 @@ async def _two_banks(t: Trial) -> bool:
         t.fail("two_banks", f"the inactive bank refuses writes: {why}")
         return False
     apart = await c.read_bank(1 - now.active_bank, len(image)) == marked and await c.read_bank(now.active_bank, len(image)) == image
-    t.judge(
-        "two_banks", apart, "a write into the bank at rest is read from there and nowhere else", "a write into one bank is not kept apart"
-    )
+    t.judge("two_banks", apart, "a write into the inactive bank changes only that bank", "a write does not change the inactive bank alone")
     why = await t.refusal_of(c.write_bank(now.active_bank, number, first=ID_WORD))
-    t.judge("two_banks", bool(why), "the bank in force takes no writes", "the bank in force takes writes")
+    t.judge("two_banks", bool(why), "the active bank refuses writes", "the active bank accepts writes")
     if not apart:  # restore the number wherever it was written
         await t.refusal_of(c.write_bank(now.active_bank, number, first=ID_WORD))
     why = await t.refusal_of(c.write_bank(1 - now.active_bank, image))
@@ -351,7 +352,7 @@ async def _two_banks(t: Trial) -> bool:
 
 async def _generation(t: Trial) -> None:
     one, two = await t.status(), await t.status()
-    t.judge("generation", one.gen == two.gen, "it stands while nothing changes", "it changes although nothing was changed")
+    t.judge("generation", one.gen == two.gen, "it stays the same while no bank changes", "it changes although no bank was changed")
     for _ in range(2):
         gen = (await t.status()).gen
         await t.refusal_of(t.rewrite())
@@ -362,19 +363,19 @@ async def _lease(t: Trial) -> None:
     c = t.controller
     await t.refusal_of(c.release(t.owner))
     other = 1 - (await t.status()).active_bank
-    t.expect_refusal("lease", await t.refusal_of(c.seal(other, t.owner)), "to seal without the lease")
+    t.expect_refusal("lease", await t.refusal_of(c.seal(other, t.owner)), "a seal without the lease")
     await t.refusal_of(t.rewrite())
     await t.take_lease()
     mine = (await t.status()).lease_owner == t.owner
     t.judge("lease", mine, "the status names its owner", "the status does not name its owner")
-    t.expect_refusal("lease", await t.refusal_of(c.lease(t.stranger, 60_000, anyway=True)), "that a second owner takes it")
-    t.expect_refusal("lease", await t.refusal_of(c.release(t.stranger, anyway=True)), "that a second owner gives it away")
-    t.expect_refusal("lease", await t.refusal_of(c.seal(1 - (await t.status()).active_bank, t.stranger)), "that a second owner seals")
+    t.expect_refusal("lease", await t.refusal_of(c.lease(t.stranger, 60_000, anyway=True)), "a lease for a second owner")
+    t.expect_refusal("lease", await t.refusal_of(c.release(t.stranger, anyway=True)), "a release by a second owner")
+    t.expect_refusal("lease", await t.refusal_of(c.seal(1 - (await t.status()).active_bank, t.stranger)), "a seal by a second owner")
     now = await t.seal_copy()
-    t.expect_refusal("lease", await t.activate(now, owner=t.stranger), "that a second owner activates")
+    t.expect_refusal("lease", await t.activate(now, owner=t.stranger), "an activation by a second owner")
     now = await t.seal_copy()
     await t.refusal_of(c.release(t.owner))
-    t.expect_refusal("lease", await t.activate(now), "to activate without the lease")
+    t.expect_refusal("lease", await t.activate(now), "an activation without the lease")
     await t.refusal_of(c.lease(t.owner, SHORT_LEASE_MS))
     end_s = t.clock.monotonic_s() + RUNS_OUT_S
     while (await t.status()).lease_owner and t.clock.monotonic_s() < end_s:
@@ -410,10 +411,10 @@ async def _right(t: Trial) -> None:
 
 
 async def _put_back(t: Trial) -> None:
-    """Activate the original bank, or at least the same table. The copy stays in the inactive bank; the lease is free."""
+    """Activate the original bank, or at least the same table, and release the lease. The copy stays in the inactive bank."""
     now = await t.status()
     if now.active_bank != t.base.status.active_bank or now.bank_crc[now.active_bank] != t.base.crc:
-        with suppress(Refused):  # the same table acts from the other bank
+        with suppress(Refused):  # if refused, the same table acts from the other bank
             await t.activate(await t.seal_copy())
     await t.refusal_of(t.controller.release(t.owner))
     now = await t.status()
@@ -421,4 +422,4 @@ async def _put_back(t: Trial) -> None:
         await t.refusal_of(t.controller.release(now.lease_owner))
     in_force = await t.controller.read_bank(now.active_bank, len(t.base.image))
     if in_force != t.base.image:
-        raise TableMismatch("the table in force is not what it was before this test", "look at the controller; write the table again")
+        raise TableMismatch("the table in force differs from the one before this test", "look at the controller; write the table again")

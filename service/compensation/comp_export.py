@@ -1,5 +1,6 @@
-"""Export a stored solution as a control's table files, and read such files back; sign the files, and judge imported ones: signed for this
-machine, or a candidate only.
+"""Export a stored solution as a control's table files, sign them, and read such files back.
+
+An imported file either has a valid signature for this machine, or is only a candidate.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedCont
 from abbe.service.site import machine_from_doc, site_of
 
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
-ONLY_FRESH = "the tables hold for a machine that was measured without any: what was active while measuring has to be added"
+ONLY_FRESH = "the tables assume that no table was active during the measurement: if one was, add it to them"
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def identified(doc: dict[str, Any]) -> Identified:
 
 
 def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> dict[str, Any]:
-    """A solution by its number in the database, or by a JSON file (`abbe solve --json`).
+    """Read a solution: by its number from the database (``stored``), or from a JSON file (`abbe solve --json`).
 
     Raises
     ------
@@ -85,9 +86,9 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read: {error.strerror}", "give the number of a solution or a file") from None
     except ValueError as error:
-        raise FileFormatError(f"{source}: no JSON: {error}", "give a file of `abbe solve --json`") from None
+        raise FileFormatError(f"{source}: is not JSON: {error}", "give a file of `abbe solve --json`") from None
     if not isinstance(doc, dict):
-        raise FileFormatError(f"{source}: not an object", "give a file of `abbe solve --json`")
+        raise FileFormatError(f"{source}: is not a JSON object", "give a file of `abbe solve --json`")
     return doc
 
 
@@ -199,7 +200,7 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[s
 
 
 def expected(known: Identified, control: ControlModel, reference_mm: F1 | None = None) -> Compensation:
-    """What an export to this control would write, rounded alike; tables only."""
+    """Return the tables that an export to this control would write, rounded in the same way, without lost motion."""
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     comp = best_of(choices(known, control, reference)).compensation
     return replace(rounded(comp, control.unit_mm), lost_motion_mm={})
@@ -211,7 +212,7 @@ def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings) ->
     Raises
     ------
     TableFileError
-        The control would not read a file as a whole, or a file belongs to none of its formats.
+        The control could not read some part of a file, or no file has one of its formats.
     """
     control = control_for(key)
     tables: list[Any] = []
@@ -251,7 +252,7 @@ def formats_in(control: ControlModel) -> tuple[str, ...]:
 
 
 def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False) -> list[Path]:
-    """Write one file to ``out``; several, or with ``folder``, into a new folder ``out``: all of them or, after any error, none.
+    """Write one file to ``out``, or several (with ``folder`` also one) into a new folder ``out``. After an error there is no folder.
 
     Raises
     ------
@@ -262,7 +263,7 @@ def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False)
         write_page(files[0].text, out)
         return [out]
     if out.exists():
-        raise FileFormatError(f"{out}: is there already, and the files need a new folder", "give another name")
+        raise FileFormatError(f"{out}: exists already, and the files need a new folder", "give another name")
     aside: Path | None = None
     try:
         aside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
@@ -341,7 +342,11 @@ class SealStatus:
 
 @dataclass(frozen=True, slots=True)
 class SigningRequest:
-    """What an import states: the format, trusted keys besides the machine file's, the base in force."""
+    """What an import expects of a signature.
+
+    ``form``: format of the files; ``trusted``: public keys besides those of the machine file; ``base``: fingerprint of the table that was
+    active while measuring, None: any.
+    """
 
     form: str
     trusted: tuple[str, ...] = ()
@@ -355,7 +360,7 @@ def signature_file(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class TableSeal:
-    """How a person signs: key, days of validity from now, base."""
+    """How a person signs: file of the key, days of validity, and fingerprint of the table that was active while measuring."""
 
     key: Path
     days: float
@@ -363,7 +368,7 @@ class TableSeal:
 
 
 def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSeal) -> MachineFile:
-    """Check everything that can prevent signing before any file is written.
+    """Check, before any file is written, everything that can prevent signing; return the machine file.
 
     Raises
     ------
@@ -374,11 +379,11 @@ def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSe
     if config is None:
         raise SignatureRefused("a signature needs a machine, and none is given", "give --machine FILE; nothing was written")
     if not 0 < seal.days <= LONGEST_DAYS:
-        raise SignatureRefused(f"a signature cannot hold for {seal.days:g} days", f"more than 0, at most {LONGEST_DAYS:g}")
+        raise SignatureRefused(f"a signature cannot hold for {seal.days:g} days", f"give more than 0 and at most {LONGEST_DAYS:g} days")
     name = doc["machine"].get("name")
     if name != config.name:
         raise SignatureRefused(
-            f"the solution is of machine {name!r}, the machine file of {config.name!r}", "give the solution's machine file"
+            f"the solution is of machine {name!r}, but the machine file is of {config.name!r}", "give the solution's machine file"
         )
     return config
 
@@ -404,7 +409,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     Raises
     ------
     SignatureRefused
-        There is a signature and it does not hold: that is worse than none.
+        There is a signature and it is not valid: that is worse than none.
     """
     seal = signature_file(path)
     if not seal.exists():
@@ -417,7 +422,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
         raise SignatureRefused(f"{seal}: {error.strerror}", "remove it: then the files are a candidate") from None
     except OSError as error:
         raise FileFormatError(
-            f"{seal}: cannot be read: {error.strerror}", "make it readable, or remove it: then it is a candidate"
+            f"{seal}: cannot be read: {error.strerror}", "make it readable, or remove it: then the files are a candidate"
         ) from None
     expected = ExpectedContent(config.name, site_of(config).limits.digest(), ask.form, [*ask.trusted, *config.signatures.trusted], ask.base)
     found = contents(path)

@@ -1,6 +1,6 @@
 """From an identification campaign, or a stored proposal, to a verified table: push, probe the sign, measure again, keep or roll back.
 
-`correct` is `proposals.make` followed by `push`; both use the same push machine with the same questions.
+`correct` makes a proposal and pushes it; `push` pushes a stored one. Both run the same push machine with the same checks.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from abbe.service.sequences.control import Suspending
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.verification.verify import VerificationDecision, VerificationFigures, check_before, decide, figure_rows, figures
 
-NO_NEWER_RUN = "DRIFT: no ball-bar run that the solution has not seen shows whether the machine still is what was measured"
+NO_NEWER_RUN = "DRIFT: no newer ball-bar run, outside the solution, shows whether the machine has changed since"
 VERIFY, SIGN = "verify-after-push-", "sign-check"
 PLACES = 12
 """Places that the ball-bar reads before and after a new table comes into force."""
@@ -47,7 +47,7 @@ PLACES = 12
 
 @dataclass(frozen=True)
 class Correction:
-    """What was solved, pushed and measured. ``bank`` and ``image``: active in the controller at the end.
+    """Everything that was solved, pushed and measured. ``bank`` and ``image``: active in the controller at the end.
 
     ``not_for_tables``: known effects that no table corrects, each with its remedy. ``proposal``: its number in the store.
     """
@@ -74,8 +74,8 @@ async def correct(context: PushContext, campaign: str | int, before: list[Run], 
     ----------
     campaign : str or int
         Identification campaign in the store.
-    before : list of dict
-        Verification runs measured with the present table, as ``abbe-run/1``.
+    before : list of Run
+        Verification runs measured with the present table.
     control : LevelStatus, optional
         Result of an earlier `abbe.service.compensation.gate.check_preconditions`. Default: it is called now.
 
@@ -101,7 +101,7 @@ async def correct(context: PushContext, campaign: str | int, before: list[Run], 
 async def push(context: PushContext, admission: Admission, before: list[Run]) -> Correction:
     """Push an admitted proposal (`abbe.service.compensation.gate.admit`), then verify as `correct` does.
 
-    ``before``: verification runs measured with the present table, as ``abbe-run/1``.
+    ``before``: verification runs measured with the present table.
 
     Raises
     ------
@@ -159,12 +159,12 @@ def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
 
 @dataclass
 class _PushQuestions:
-    """Answers the push machine's questions on one proposal: reasons against it, sign probe, verification."""
+    """Answers the push machine's questions on one proposal: what speaks against it, and the results of sign probe and verification."""
 
     context: PushContext
     admission: Admission
     drift_mm: float | None
-    """Residual of the solution in the newest run, from which it was not solved."""
+    """Rms residual of the solution in a newer run that it was not solved from, mm; None without such a run."""
     bar: BarPlaces | None
     before: VerificationFigures
     read_before: PlaceReadings | None = None
@@ -179,7 +179,7 @@ class _PushQuestions:
         return self.admission.precheck
 
     def drift_reasons(self) -> list[str]:
-        """Why the machine has drifted since it was measured, by a run that is newer than the admission."""
+        """Return the reason if a newer run shows drift, or if there is no newer run; else nothing."""
         if self.drift_mm is None:
             return [NO_NEWER_RUN]
         return [reason] if (reason := drift_reason(self.drift_mm, self.context.site.limits)) else []
@@ -232,11 +232,11 @@ async def _push_and_verify(work: _PushQuestions, wanted: WantedTable) -> tuple[P
             context.progress(Progress("push", 0.0, 1.0, None, "nine tables to the inactive bank, read back twice, activate"))
             pushed = await pushing.bring(wanted, questions)
     if work.after is None or work.decision is None:
-        raise TakenBack(f"the table was rolled back: {pushed.why}", "look at the control's convention: abbe comp commission")
+        raise TakenBack(f"the table was rolled back: {pushed.why}", "prove sign, axis and unit of the control again: abbe comp commission")
     decision = work.decision if pushed.kept == work.decision.keep else VerificationDecision(pushed.kept, pushed.why)
     try:
         await _store_verification(context, work.verified_as, pushed, work.after, decision)
-    except AbbeError as error:  # the table is decided and acts; only the record is missing
+    except AbbeError as error:  # the decision stands; only its record is missing
         error.add_note(f"the table is {'kept and in force' if decision.keep else 'rolled back'}: {decision.text}")
         raise
     return pushed, work.after, decision

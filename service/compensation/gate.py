@@ -1,9 +1,9 @@
 """The one gate in front of every push: it reports all reasons against a table at once.
 
-`check_preconditions` asks what holds for any table of this control, `admit` everything about one proposal. A push takes the `Admission`
-and cannot begin without it; only `admit` makes one.
+`check_preconditions` checks what concerns any table for this control, `admit` also one proposal. A push needs an `Admission`, which only
+`admit` makes.
 
-Everything that held when a proposal was made is checked again before a register is written (`PushPrecheck`).
+`PushPrecheck` checks everything that was checked for the proposal again, before a register is written.
 """
 
 from __future__ import annotations
@@ -64,13 +64,16 @@ class PushPrecheck:
         return by_whom() if self.attended else f"{login()}, by the service"
 
     def reasons(self, drift_mm: float | None = None) -> list[str]:
-        """All reasons against pushing it now. ``drift_mm``: residual of its solution in a newer run that it was not solved from."""
+        """All reasons against pushing the proposal now.
+
+        ``drift_mm``: rms residual of its solution in a newer run, which the solution did not use, mm.
+        """
         candidate = self.proposed.candidate
         if drift_mm is not None and candidate.digest == content_digest(candidate):
             candidate = _drifted(candidate, drift_mm)
         found = [*self._bound(), *self._rejected(), *reasons_against(candidate, self.context, self.site.limits), *self._approved()]
         if self.proposed.reasons and not found:
-            found = [f"PROPOSED: with {len(self.proposed.reasons)} reasons against it, which no longer hold: propose again"]
+            found = [f"PROPOSED: {len(self.proposed.reasons)} reasons were against it, which no longer hold: propose again"]
         return found
 
     def renewed(self, store: Store, now_s: float) -> PushPrecheck:
@@ -83,15 +86,16 @@ class PushPrecheck:
         if p.machine != self.site.doc:
             yield "MACHINE: the machine file differs from the one at the proposal (name, chain, strokes, pivots or tool)"
         if now.crc == p.candidate.base_crc and now.image != p.base.image:
-            yield "BASE: the table in force has the CRC of the one that it was proposed on, and another content"
+            yield "BASE: the table in force has the same CRC as the one at the proposal, but other content"
         if now.status.boot_id != p.base.boot:
-            yield f"RESTART: the controller restarted since (boot {p.base.boot:08X} then, {now.status.boot_id:08X} now): measure again"
+            boots = f"boot {p.base.boot:08X} then, {now.status.boot_id:08X} now"
+            yield f"RESTART: the controller restarted since the proposal ({boots}): measure again"
         if now.status.gen != p.base.gen:
-            yield f"GENERATION: a bank was written since (generation {p.base.gen} then, {now.status.gen} now): propose again"
+            yield f"GENERATION: a bank was written since the proposal (generation {p.base.gen} then, {now.status.gen} now): propose again"
         if not set(p.candidate.evidence.calibrated_until_s) <= {until_s(day) for day in self.site.calibrated_until.values()}:
-            yield "CERTIFICATE: the certificates in the machine file have changed since it was proposed: propose again"
+            yield "CERTIFICATE: the certificates in the machine file have changed since the proposal: propose again"
         if self.site.limits != p.limits:
-            yield f"LIMITS: changed since it was proposed ({_changed(asdict(p.limits), asdict(self.site.limits))}): propose again"
+            yield f"LIMITS: they have changed since the proposal ({_changed(asdict(p.limits), asdict(self.site.limits))}): propose again"
 
     def _rejected(self) -> Iterator[str]:
         for row in self.rejections[-1:]:
@@ -100,7 +104,7 @@ class PushPrecheck:
     def _approved(self) -> Iterator[str]:
         found, why = valid_approval(self.proposed, self.approvals, self.context.now_s, two_people=self.site.two_people)
         if self.site.two_people != self.proposed.two_people:
-            yield "APPROVAL: the machine file has changed two_people since it was proposed: propose again"
+            yield "APPROVAL: two_people in the machine file has changed since the proposal: propose again"
         elif self._needs_approval and found is None:
             yield f"APPROVAL: {why}"
 
@@ -142,11 +146,11 @@ def _formatted(value: object) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PushContext:
-    """What a push works with.
+    """Open devices, database, machine and options of a push.
 
-    ``rate_hz``: of the ball-bar, in verifications. ``attended``: a person orders the push; otherwise the limits of unattended pushes hold
-    as well, and an approval is always needed. ``control``: stops or pauses the push; while an unverified table is in force the push cannot
-    be paused, and a stop rolls it back.
+    ``rate_hz``: readings of the ball-bar per second in verifications. ``attended``: a person orders the push; otherwise the limits of
+    unattended pushes hold as well, and an approval is always needed. ``control``: stops or pauses the push; while an unverified table is in
+    force the push cannot be paused, and a stop rolls the table back.
     """
 
     session: Session
@@ -161,7 +165,7 @@ class PushContext:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """The token of a push: a proposal with no reason against it, and the readings and decisions that this rests on.
+    """The token that a push needs: a proposal with no reason against it, and the readings and decisions that prove this.
 
     ``level``: capability level of the controller (`abbe.service.push.limits`). ``hint``: a warning about the control for people, or empty.
     """
@@ -172,7 +176,7 @@ class Admission:
 
 
 async def check_preconditions(context: PushContext) -> LevelStatus:
-    """Check that this control can take a table and that the table could be verified; return its proved level.
+    """Check that this control can take a table and that the table could be verified; return the control's proved level.
 
     Raises
     ------
@@ -203,7 +207,7 @@ async def admit(context: PushContext, number: int, control: LevelStatus | None =
     Raises
     ------
     TableRefused
-        With all reasons against it.
+        With all reasons against the proposal.
     StoreError
         There is no such proposal, or its row was changed.
     AbbeError, DriverError

@@ -54,7 +54,7 @@ def status_of_proposal(
         return ProposalStatus("refused", f"{len(proposed.reasons)} reasons against it when it was proposed")
     wrote = [e.push for e in journal.entries if e.state is PushState.STAGING and e.utc > proposed.utc]
     if wrote:
-        return ProposalStatus("superseded", f"push {wrote[-1]} wrote into the controller since it was proposed")
+        return ProposalStatus("superseded", f"push {wrote[-1]} has written into the controller since the proposal")
     if now_s >= proposed.valid_until_s:
         return ProposalStatus("expired", f"its measurement is older than {proposed.limits.age_h:g} h")
     approval, why = valid_approval(proposed, approvals, now_s, two_people=proposed.two_people)
@@ -93,7 +93,7 @@ def valid_approval(
         if two_people and same_person(row.name, proposed.by):
             why = f"{row.name} proposed it and cannot approve it"
         elif row.digest != proposed.binding(row.expiry):
-            why = f"what {row.name} approved is not this table on this base under these limits"
+            why = f"{row.name} approved another table, base, machine or limits"
         elif now_s >= _utc_s(row.expiry):
             why = f"the approval of {row.name} expired at {row.expiry}"
         else:
@@ -123,8 +123,8 @@ def approve(store: Store, number: int, name: str, hours: float, clock: Clock, ac
     Raises
     ------
     TableRefused
-        With all reasons: it does not wait for a push, it was proposed with reasons against it, its measurement is too old, or the approver
-        is the proposer where two people are needed.
+        With all reasons: the proposal does not wait for a push or had reasons against it from the start, its measurement is too old, or the
+        approver is the proposer where two people are needed.
     StoreError
         There is no such proposal, or its row was changed.
     """
@@ -158,13 +158,13 @@ def reject(store: Store, number: int, name: str, reason: str, clock: Clock, acco
     Raises
     ------
     TableRefused
-        No reason is given, or it does not wait for a push.
+        No reason is given, or the proposal does not wait for a push.
     StoreError
         There is no such proposal, or its row was changed.
     """
     check_waiting(store, number, load(store, number), clock.utc().timestamp())
     if not reason.strip():
-        raise TableRefused(f"proposal {number} is not rejected without a reason", "say why; the proposer has to know")
+        raise TableRefused(f"proposal {number} cannot be rejected without a reason", "say why; the proposer has to know")
     store.proposals.reject(ProposalRejection(proposal_id=number, name=name, login=account or login(), reason=reason.strip()))
     return store.proposals.rejections(number)[-1]
 

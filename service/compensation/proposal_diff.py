@@ -94,7 +94,7 @@ def diff_report(found: TableDifference, proposed: Proposed) -> Document:
     )
     title = f"{found.new} against {found.old.split(' (')[0]}"
     caption = (
-        "Corrections are added to the command. Band: expanded uncertainty (k = 2) of the new entries against the first one of their table."
+        "Corrections are added to the command. Band: expanded uncertainty (k = 2) of each new entry relative to the first of its table."
     )
     sections = (
         Section("What changes", [*lead, Picture(caption, [change_plot(found.curves)], "wide")]),

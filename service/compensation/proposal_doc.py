@@ -46,15 +46,15 @@ class Proposed:
     Parameters
     ----------
     machine : dict
-        The machine object (run-format.md 1).
+        The ``machine`` object of the exchange format (docs/schemas/machine.schema.json).
     campaign, solution_id : str, int
         Source of the tables.
     candidate : Candidate
-        The absolute tables in whole units of the controller (mm), their change, evidence, digest.
+        The absolute tables, mm, rounded to whole units of the controller, with residuals, evidence and digest.
     u_mm : tuple of three arrays
         Standard uncertainty of every entry, as in `NineTables`.
     image_id : int
-        Number inside the image: an approval binds its bytes.
+        Number inside the image. It stays the same because an approval binds the bytes of the image.
     limits : PushLimits
         Limits of the check that gave ``reasons``.
     two_people : bool
@@ -97,7 +97,7 @@ class Proposed:
 
     @property
     def predicted(self) -> Predicted:
-        """What the model promises."""
+        """The model's prediction: rms without and with the tables, and its uncertainty."""
         e = self.candidate.evidence
         return Predicted(e.before_mm, e.after_mm, e.u_mm)
 

@@ -1,8 +1,8 @@
 """From an identification campaign to a stored proposal: solve the runs, add the tables in force, collect the reasons against it.
 
-A machine that is measured with a table active shows the errors that this table leaves. The active table is therefore read from the
-controller, must be the one of all runs, and the new table is the old one plus what the runs still show. Nothing is written to the
-controller.
+A machine that is measured with a table active shows the errors that this table leaves. Therefore the active table is read from the
+controller, every run must have been measured with it, and the new table is the old one plus the errors that the runs still show. Nothing
+is written to the controller.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ MONTH = timedelta(days=30)
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """Computed tables and what the model promises of them.
+    """Computed tables and the model's prediction for them.
 
-    ``tables``: absolute, in the controller's unit; ``change``: what they add to those in force, as computed. ``drift_mm``: residual of the
-    solution in the newest unused run; None without one. ``ended_s``, ``last_s``: end of the oldest and of the newest identifying run,
-    seconds UTC.
+    ``tables``: absolute, rounded to the controller's unit; ``change``: their change of the tables in force, before rounding. ``drift_mm``:
+    rms residual of the solution in the newest run that it did not use, None without one. ``ended_s``, ``last_s``: end of the oldest and of
+    the newest identifying run, seconds UTC.
     """
 
     tables: NineTables
@@ -62,7 +62,7 @@ class Promise:
 
 
 def candidate_of(site: Site, promise: Promise, base: Base, runs: list[Run], form: TableFormat) -> Candidate:
-    """Make a signed candidate of computed tables; ``runs``: the solved runs, ``abbe-run/1``."""
+    """Make a signed candidate of computed tables; ``runs``: those that were solved."""
     columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
     blank = Candidate(site.name, FORMAT_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
     digest = content_digest(blank)
@@ -125,7 +125,7 @@ async def candidate_context(
 
 
 def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
-    """The tables that were in force `MONTH` ago by the journal: before the first push its base, without any push the present ones."""
+    """The tables in force `MONTH` ago by the journal: the base of the first kept push if it came later, the present ones without a push."""
     kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
     if not kept:
         return base.tables
@@ -148,7 +148,7 @@ GRID = (25, 21, 19)
 
 @dataclass(frozen=True)
 class Proposal:
-    """Tables that follow from a campaign, absolute and quantised, and the model's prediction."""
+    """Tables from a campaign: absolute and rounded (``tables``), their unrounded ``change`` of those in force, and the prediction."""
 
     solved: Solved
     tables: NineTables
@@ -242,7 +242,7 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
 
 
 def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int) -> Proposal:
-    """Absolute tables from runs that were measured while ``base`` was active (`remove_table`)."""
+    """Solve runs that were measured while ``base`` was active, and add their correction to it. ``lsb_nm``: the controller's unit, nm."""
     solved = solve_runs(site, runs)
     change = nine_tables(solved.joint, GRID)
     predicted = predict_residual(solved.joint, change)
@@ -274,11 +274,11 @@ def check_same_table(base: Base, runs: list[Run]) -> None:
             raise TableMismatch(f"run {run.run_id} {with_what}; active is {base.crc:08X}", "measure again with the present table")
         if base.tables is not None and run.table.acting is False:
             why = f"run {run.run_id} was measured while table {base.crc:08X} did not act: the compensation was switched off"
-            raise TableMismatch(why, "switch it on at the control and measure again")
+            raise TableMismatch(why, "switch the compensation on at the control and measure again")
 
 
 def check_temperature(site: Site, runs: list[Run]) -> None:
-    """Check that every run was measured inside the allowed air temperatures: tables hold only near their own.
+    """Check that every run was measured inside the allowed air temperatures: tables hold only near the temperature of their measurement.
 
     Raises
     ------
@@ -296,7 +296,7 @@ def check_temperature(site: Site, runs: list[Run]) -> None:
 
 
 def check_certificates(site: Site) -> None:
-    """Check that an instrument has a certificate, before an hour is spent on measuring: without any, nothing can be pushed.
+    """Check that an instrument has a certificate, before time is spent on measuring: without one, nothing can be pushed.
 
     Raises
     ------
@@ -351,5 +351,5 @@ def check_before_runs(site: Site, base: Base, runs: list[Run], since_s: float, n
         )  # fmt: skip
         if why:
             raise TableRefused(
-                f"nothing can be compared with run {run.run_id}: it {why}", "measure the verification before anew; nothing was written"
+                f"nothing can be compared with run {run.run_id}: it {why}", "measure the verification before again; nothing was written"
             )

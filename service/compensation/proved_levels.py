@@ -34,7 +34,7 @@ class LevelStatus:
 
 
 def identity(info: DeviceInfo) -> Doc:
-    """What a proof is bound to beside the machine's name. Without the boot id: a restart invalidates no proof."""
+    """The controller's identity, for which a proof holds. It has no boot id, because a restart invalidates no proof."""
     return {"model": info.model, "serial": info.serial_no, "firmware": info.firmware}
 
 
@@ -67,12 +67,12 @@ async def _visible(controller: Identity) -> Capabilities:
 
 
 async def check_level(controller: Identity, store: Store, site: Site, *, attended: bool = True) -> LevelStatus:
-    """Refuse a controller that allows no such push, before anything is measured for it; return its level.
+    """Refuse a controller that allows no (attended or unattended) push, before anything is measured for it; return its level.
 
     Raises
     ------
     TableRefused
-        This controller allows no such push.
+        The controller's level is too low.
     """
     found = await level_status(controller, store, site)
     no = objection(found.level, attended=attended)

@@ -50,7 +50,7 @@ class ApprovedProposal:
 
 @dataclass(frozen=True, slots=True)
 class PushOrder:
-    """One attempt: proposal number, callbacks for its begin and its progress, and the control that may stop it."""
+    """One attempt: proposal number, callbacks for its begin and its progress, and the `Control` by which a person may stop it."""
 
     proposal: int
     begun: Begun
@@ -139,5 +139,5 @@ async def _finish_when_safe(context: PushContext, order: PushOrder, error: Still
     try:
         done = await order.control.unless_aborted(finish)
     except (AbbeError, DriverError, OSError) as again:
-        return JobOutcome("failed", f"{with_notes(error)}; {with_notes(again)}; it will be rolled back as soon as possible")
+        return JobOutcome("failed", f"{with_notes(error)}; {with_notes(again)}; the table will be rolled back as soon as possible")
     return JobOutcome("rolled back", f"{with_notes(error)}; {done or 'nothing was left to roll back'}")

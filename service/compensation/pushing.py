@@ -32,8 +32,8 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed
 
-MAKE_READY = "make the machine ready (interlocks, link); the next abbe command rolls it back before anything else"
-UNTRUSTED_CONTROL = "move nothing; make the table from before active at the control, and commission it anew: it does not do what it answers"
+MAKE_READY = "make the machine ready (interlocks, link); the next abbe command rolls the table back before anything else"
+UNTRUSTED_CONTROL = "move nothing; activate the old table at the control, and commission the control again: it does not do what it answers"
 MAY_BE_ACTIVE = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
 RECHECK_S = 2.0
@@ -62,7 +62,7 @@ class WantedTable:
 
 @dataclass(frozen=True, slots=True)
 class RestoredTable:
-    """A table to restore, byte for byte. ``semantic_digest``: of its meaning when it was read or written."""
+    """A table to restore, byte for byte. ``semantic_digest``: digest of its corrections when it was read or written."""
 
     image: bytes
     semantic_digest: str
@@ -134,8 +134,7 @@ class Pushing:
         StillActive
             The old table could not be made active again (yet).
         TableMismatch
-            The controller holds a table unknown to the journal, or activated one after refusing it; or the image does not mean what the
-            tables do.
+            The controller holds a table unknown to the journal, or has activated the new one after refusing it.
         MachineInUse, UnsafeToMove
             Another push on this machine is under way or unfinished.
         Stopped, Aborted
@@ -179,7 +178,7 @@ class Pushing:
         )  # fmt: skip
 
     async def _wait_for_standstill(self) -> None:
-        """Wait until the axes have stood long enough; the push machine decides, this only avoids a premature refusal."""
+        """Wait until the axes have stood long enough. This only avoids an early refusal: the push machine checks it again."""
         end_s = self.clock.monotonic_s() + STILL_LIMIT_S
         while self.clock.monotonic_s() < end_s:
             status = await self.controller.status()
@@ -247,7 +246,7 @@ class Pushing:
         async def validate(journal: Journal) -> list[str]:
             known = facts(journal)
             if known.base_crc != wanted.base.crc or known.base_image != wanted.base.image:
-                return ["BASE: the active table is not the one that was in force while this one was made"]
+                return ["BASE: the active table is not the one that this table was made for"]
             if (known.boot, known.gen) != (wanted.base.status.boot_id, wanted.base.status.gen):
                 return ["GENERATION: the controller restarted, or a bank was changed, since the base was read"]
             return questions.validate()

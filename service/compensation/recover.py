@@ -1,8 +1,8 @@
 """Recovery before anything moves: finish an interrupted push. An unverified table does not stay active (unconfirmed means rollback).
 
-`recovered_session` opens a machine's devices: the controller first, then recovery, and only then the instruments: a missing or silent one
-must not keep an unverified table in force (tests/service/devices/test_every_session.py). `finish_when_safe` waits where the machine is not
-safe, and rolls back at once when it is.
+`recovered_session` opens the controller, recovers, and only then opens the instruments, because a missing or silent instrument must not
+keep an unverified table in force (tests/service/devices/test_every_session.py). `finish_when_safe` waits until the machine is safe and then
+rolls back at once.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ READY = "make the machine ready (interlocks, link), then start again"
 
 
 async def recover(controller: TableController, store: Store, site: Site, *, accept_by: str = "") -> str | None:
-    """Finish the last push and ingest what interrupted runs left; return what was done in a sentence or two, or None.
+    """Finish the last push and store the samples that interrupted runs left on disk; return what was done, or None.
 
     Everything that moves the machine, or relies on its table, calls this first (tests/service/devices/test_every_session.py).
 
@@ -50,7 +50,7 @@ async def recover(controller: TableController, store: Store, site: Site, *, acce
     StillActive
         The unverified table is still active, because the controller refuses or does not answer.
     TableMismatch
-        The controller holds an unverified table, whatever machine name it was pushed under, or one that this database did not push: a
+        The controller holds an unverified table, under whatever machine name it was pushed, or a table that this database did not push: a
         person must look (`abbe accept-table`).
     StoreError, CaptureFault
         The database refuses the samples of interrupted runs, or their folder cannot be used. A single bad segment is only reported.
@@ -155,7 +155,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
     if now.bank_state[other] is BankState.LAID_ASIDE and now.bank_crc[other] != crc:
         raise TableMismatch(
             f"the control has another table laid aside (bank {other}, CRC {now.bank_crc[other]:08X}) and uses it after its next start",
-            "take that one away at the control first; nothing was accepted",
+            "remove the laid-aside table at the control first; nothing was accepted",
         )
     known = await asyncio.to_thread(known_tables, store)
     chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
@@ -173,7 +173,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
 
 
 def _open_with(crc: int, known: KnownTables) -> set[str]:
-    """Journal of the last push of this table, if that push is still open: recovery under another name or address would roll it back."""
+    """Journal of the last push of this table, if that push is open: a recovery under another name or address would roll the table back."""
     push = known.pushed.get(crc)
     return {push.chain} if push is not None and push.may_be_active else set()
 

@@ -81,7 +81,7 @@ async def rollback(
     Raises
     ------
     TableRefused
-        The journal knows no such table.
+        The journal knows no such table, or the push that restores it was rolled back.
     TableMismatch
         The journal does not know the table in force: a person must look first.
     StoreError
@@ -131,7 +131,7 @@ def _left(journal: Journal) -> KnownTable:
         return KnownTable(f.image, f.semantic_digest, f"the table that push {number} brought and kept")
     if state in TERMINAL - {PushState.OPERATOR, PushState.ACCEPTED}:
         return _base(journal, f"the table that was in force before and after push {number}")
-    raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another")
+    raise TableRefused(f"push {number} ended {state}: the journal does not hold the table that was in force then", "name another push")
 
 
 def known_images(journal: JournalView) -> set[bytes]:
@@ -236,7 +236,7 @@ def check_unchanged(store: Store, machine: str, order: RollbackOrder, control: s
     now = JournalView.read(store, machine, control).offer()
     if (now.push, now.crc) != (order.push, order.crc):
         raise TableRefused(
-            f"the table in force is {now.crc:08X} of push {now.push}, ordered back was {order.crc:08X} of push {order.push}",
+            f"the table in force is {now.crc:08X} of push {now.push}, but the order was to roll back {order.crc:08X} of push {order.push}",
             "look at the table in force again; nothing was written",
         )
 
@@ -244,7 +244,7 @@ def check_unchanged(store: Store, machine: str, order: RollbackOrder, control: s
 async def _finish_when_safe(
     controller: TableController, store: Store, site: Site, order: RollbackOrder, error: StillActive, clock: Clock
 ) -> JobOutcome:
-    """The rollback broke off and the machine is not safe: finish it as soon as it is."""
+    """Finish an interrupted rollback as soon as the machine is safe."""
     finish = finish_when_safe(controller, store, site, limit_s=LIMIT_S, clock=clock, notify=lambda _: None)
     try:
         done = await order.request.control.unless_stopped(finish)

@@ -1,6 +1,6 @@
-"""Rollback to the table that was in force before, also after a crash during it: a pure function of journal and truth.
+"""Rollback to the table that was in force before the push, as a pure function of the journal and of what the controller reports.
 
-The process that began the push runs it, or any later one; it may be interrupted anywhere and run again.
+The process that began the push runs it, or any later process. It may be interrupted anywhere, also by a crash, and run again.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from abbe.service.push.operations import (
 MAX_UNANSWERED = 3
 BACKS = 3
 LEASES = 6
-"""Limit of lease commands since the last entry: a controller that answers and does nothing must not be asked for ever."""
+"""Limit of lease commands since the last journal entry: a controller may answer each of them and never give the lease."""
 OWNERS = 0xFFFF
-"""Owner ids of one push: the first for the push itself, a higher one for every lease of the rollback."""
+"""Number of owner ids of one push: the first is for the push itself, a higher one for each lease of the rollback."""
 
 
 def record(state: PushState, **doc: object) -> Operation:
@@ -38,7 +38,7 @@ def record(state: PushState, **doc: object) -> Operation:
 
 
 def in_force(f: PushFacts, truth: Truth) -> str:
-    """Which table is active: ``"base"``, ``"candidate"`` or ``"neither"``, by the CRC that the controller states."""
+    """Which table is active by the reported CRC: ``"base"`` (the old one), ``"candidate"`` (the new one) or ``"neither"``."""
     crc = truth.crc[truth.active]
     if truth.states[truth.active] is BankState.SEALED and crc in (f.base_crc, f.crc):
         return "base" if crc == f.base_crc else "candidate"
@@ -46,7 +46,7 @@ def in_force(f: PushFacts, truth: Truth) -> str:
 
 
 def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
-    """For a person to compare: what the journal expects and what the controller reports."""
+    """Expectation of the journal and report of the controller, for a person to compare."""
     reported = {"boot": truth.boot, "gen": truth.gen, "active": truth.active, "crc": list(truth.crc), "states": list(truth.states)}
     return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": reported}
 
@@ -54,8 +54,8 @@ def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
 def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
     """Next operation of a rollback.
 
-    ``state``: the last one, ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry; every lease of a
-    rollback gets a higher owner id than those before.
+    ``state``: of the last entry: ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry, from which
+    each lease of the rollback gets a higher owner id than the one before.
     """
     if known.rested:
         return Operation(OperationKind.END, text="the rollback is blocked now")
@@ -124,7 +124,7 @@ def _lease(f: PushFacts, known: Knowledge, truth: Truth, state: PushState, seq: 
 
 
 def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
-    """Activate the old table from its bank, or restore it from the journal if the controller lost it; never overwrite a person's work."""
+    """Activate the old table from its bank, or restore it from the journal if the controller lost it; never overwrite foreign content."""
     other, base = 1 - truth.active, f.base_image
     if truth.states[other] is BankState.SEALED and truth.crc[other] == f.base_crc:
         step = bracket(known, other, len(base) // 2, again=False)
@@ -136,7 +136,7 @@ def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
             return Operation(OperationKind.LOOK, mark=True)
     if truth.states[other] is BankState.EMPTY:  # the controller forgot it
         return _begin_restaging(truth, other)
-    if f.restaged:  # by this push, which was interrupted: the bank may hold our chunks
+    if f.restaged:  # an earlier rollback of this push was interrupted: the bank may hold its chunks
         step = bracket(known, other, len(base) // 2, again=False)
         if isinstance(step, Operation):
             return step

@@ -1,7 +1,7 @@
-"""Run the push machine: get the next operation, do it through a port, learn from its outcome. One loop for models and machines.
+"""Run the push machine: get the next operation, do it through a port, learn from its outcome. Tests run the same loop on a model.
 
-`ControllerPort` is the port to a real controller: one operation becomes one call of the driver, and its errors become outcomes. It decides
-nothing: Refused means that nothing changed, Doubt that the result is unknown. The machine decides.
+`ControllerPort` is the port to a real controller: it turns each operation into one call of the driver, and errors of the driver into
+outcomes: Refused, nothing changed; Doubt, the result is unknown. It decides nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Rows = list[tuple[str, str, list[tuple[int, int]]]]
 
 
 class Port(Protocol):
-    """Does one operation on a controller, or asks an actor. Raises nothing for what a controller or a link does."""
+    """Does one operation on a controller, or asks an actor. Faults of controller and link are outcomes, not exceptions."""
 
     async def execute(self, op: Operation, journal: Journal) -> Outcome:
         """Do the operation; ``journal`` is the push so far."""
@@ -49,13 +49,13 @@ class Book(Protocol):
         ...
 
     async def append(self, journal: Journal, state: PushState, doc: Doc) -> PushEntry:
-        """Write the next entry; on return it is on disk. Raises otherwise, or if another process wrote an entry meanwhile."""
+        """Write the next entry; on return it is on disk. Raises if it cannot be written, or if another process wrote one meanwhile."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """State of a push after this run. ``state`` None: nothing was begun. Not ``settled``: recovery has to continue it."""
+    """State of a push after this run of the loop. ``state`` None: nothing was begun. Not ``settled``: recovery has to continue the push."""
 
     state: PushState | None
     journal: Journal
@@ -80,7 +80,7 @@ async def push(port: Port, book: Book, order: OperationOrder, *, stop: Callable[
 
 
 async def recover(port: Port, book: Book) -> Ended:
-    """Finish an interrupted push from its journal and the controller's state. May be repeated at will."""
+    """Finish an interrupted push from its journal and the controller's state. May itself be interrupted and repeated."""
     return await _drive(port, book, await book.entries(), Knowledge(), None, _never_stop)
 
 
@@ -143,7 +143,7 @@ class ControllerPort:
         self._map = ""
 
     async def execute(self, op: Operation, journal: Journal) -> Outcome:
-        """Do one operation; raises nothing for what the controller or the link does."""
+        """Do one operation; faults of controller and link are outcomes, not exceptions."""
         try:
             return await self._execute(op, journal)
         except Refused as error:
@@ -225,12 +225,12 @@ class ControllerPort:
                     lost.set()
                     return
                 except (DriverError, TimeoutError):
-                    continue  # the measurement meets the same fault, and decides
+                    continue  # the measurement meets the same fault and reports it
         finally:
             ended.cancel()
 
     async def _look(self) -> Truth:
-        """One look. Only a look accepts a restart: the new boot id reports it to the machine."""
+        """One look. Only here is a restart of the controller no error: the new boot id tells the push machine."""
         if not self._map:
             self._map = (await self._c.identify()).firmware
         try:
@@ -254,8 +254,8 @@ class ControllerPort:
 def semantic_digest_of_tables(tables: NineTables) -> str:
     """Digest of corrections (added to the command): position in 10 nm and correction in nm, for each moved and each corrected axis.
 
-    It shares no code with `semantic_digest_of_image`: if the encoder gets a sign, an axis or a unit wrong, the two differ. Only the
-    physical probe shows what both get wrong.
+    It shares no code with `semantic_digest_of_image`: if the encoder gets a sign, an axis or a unit wrong, the two digests differ. Only the
+    physical probe shows a mistake that is in both.
     """
     rows: Rows = []
     for a, moved in enumerate("XYZ"):

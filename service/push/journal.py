@@ -1,7 +1,7 @@
 """The push journal: orders, one chained entry for every transition, the facts that entries state, and the journal in the database.
 
-The journal is also the audit trail: an entry that is changed, removed or swapped breaks the chain. An entry is on disk before what it
-permits.
+The journal is also the audit trail: an entry that is changed, removed or swapped breaks the chain. An entry is on disk before the operation
+that it permits is done.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class OperationOrder:
     image : bytes
         As the controller will hold it, with its CRC-32 ``crc``.
     semantic_digest : str
-        Semantic digest, computed from the tables and not from the image (`abbe.service.push.execute`).
+        Digest of the corrections, computed from the tables and not from the image (`abbe.service.push.execute`).
     limits : str
         Digest of the limits that it was checked against.
     owner : int
-        Owner id of the lease, u32, low 16 bits 0: those count the leases of one push.
+        Owner id of the lease, u32. Its low 16 bits are 0; later leases of the same push count in them.
     level : int
         Capability level of the controller (`abbe.service.push.limits`).
     attended : bool
@@ -84,7 +84,7 @@ NO_PUSH = 0
 """Push number of a person's acceptance in a journal that has no push yet."""
 
 
-class JournalBroken(ValueError):  # noqa: N818 - reads as what it is
+class JournalBroken(ValueError):  # noqa: N818 - the name says enough
     """An entry does not follow from the one before it: chain, order or transition are wrong."""
 
 
@@ -97,8 +97,9 @@ def digest_of(push: int, seq: int, state: PushState, doc: Doc, utc: str, prev: s
 
 
 def follow(journal: Journal, push: int, state: PushState, doc: Doc, *, utc: str, head: str, machine: str) -> PushEntry:
-    """Make the next entry of a push. ``head``: digest of the last entry of the machine, `GENESIS` if there is none; ``machine``: name of
-    its journal.
+    """Make the next entry of a push.
+
+    ``head``: digest of the last entry in the journal, `GENESIS` if there is none; ``machine``: name of the journal.
 
     Raises
     ------
@@ -118,7 +119,7 @@ def _may_follow(push: int, last: PushState | None, state: PushState) -> bool:
 
 
 def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
-    """Check all entries of a machine, in the order of writing.
+    """Check all entries of a journal, in the order of writing; ``head``: digest of the entry before the first.
 
     Raises
     ------
@@ -134,7 +135,7 @@ def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
         if entry.digest != digest_of(entry.push, entry.seq, entry.state, entry.doc, entry.utc, entry.prev):
             raise JournalBroken(f"{name}: was changed after it was written")
         if entry.seq != (before.seq + 1 if before else 0) or not _may_follow(entry.push, before.state if before else None, entry.state):
-            raise JournalBroken(f"{name}: {entry.state} cannot stand here")
+            raise JournalBroken(f"{name}: {entry.state} cannot follow the push's entry before it")
         last[entry.push], head = entry, entry.digest
 
 
@@ -228,7 +229,7 @@ _NO_ORDER: Doc = {
     "chunk_words": 0,
 }
 _KEYS = {"semantic_digest": "meaning", "base_semantic_digest": "base_meaning"}
-"""Keys of the journal's entries that have another name than the fact."""
+"""Facts whose key in the journal's entries has another name."""
 _FIELDS = tuple((one.name, _KEYS.get(one.name, one.name), _CONVERTED.get(one.name)) for one in fields(PushFacts))
 _SNAPSHOT = frozenset({
     "machine", "image", "crc", "meaning", "limits", "owner", "level", "attended", "chunk_words", "boot", "gen", "map",
@@ -277,7 +278,7 @@ def approval_digest(image: bytes, *, base_image: bytes, machine: str, limits: st
 
 
 class StoreBook:
-    """Journal of the last push into one control, or of its next one. Open it with `last`, `new` or `for_acceptance`.
+    """Journal of the last or of the next push into one control. Open it with `last`, `new` or `for_acceptance`.
 
     ``machine``: name of the journal (`Store.pushes.chain`): all pushes into one control share it, whatever the machine is called now.
     ``head``: digest of the last entry in it; ``journal``: entries of this push so far.

@@ -1,6 +1,6 @@
-"""Limits of a table to be pushed (reliability.md 3.3), and the pushes that a control's capabilities allow (3.1).
+"""Limits of a table to be pushed, and the pushes that a control's capabilities allow.
 
-Exceeding a limit rejects the table; nothing is ever clamped to a limit.
+A table beyond a limit is rejected; its values are never cut to the limit.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from abbe.service.domain.document import canonical
 
 @dataclass(frozen=True, slots=True)
 class PushLimits:
-    """Every limit that can reject a table. Lengths mm, times h, temperatures °C. Defaults are those of reliability.md 3.3.
+    """Every limit that can reject a table. Lengths mm, times h, temperatures °C.
 
     Parameters
     ----------
     value_mm, change_mm : float
         Largest absolute value, largest change against the table in force.
     step_mm, slope : float
-        Largest difference of neighbours; the same per mm of travel.
+        Largest difference of neighbouring values; the same per mm of travel.
     second_mm : float
         Largest second difference.
     gain, k : float
-        Least relative improvement of the residual; and by how many expanded uncertainties it has to exceed.
+        Smallest predicted improvement of the rms: relative; and as a multiple of the model's standard uncertainty.
     share : float
-        The uncertainty may be at most this share of the predicted improvement.
+        Largest standard uncertainty of the model as a share of the predicted improvement.
     age_h, temperature_c, drift_mm, runs : float, pair, float, int
-        Oldest measurement, window of the air, largest drift between its first and last run, fewest runs.
+        Largest age of the measurement, range of the air temperature, largest rms residual of the solution in a newer run, fewest runs.
     unattended_h, walk_mm : float
-        Unattended: hours between two pushes; largest change of the table over 30 days.
+        For unattended pushes: hours since the last kept push; largest change of a value over 30 days.
     """
 
     value_mm: float = 0.1
@@ -49,7 +49,7 @@ class PushLimits:
     walk_mm: float = 0.05
 
     def digest(self) -> str:
-        """SHA-256 that an approval binds: it does not hold under other limits."""
+        """SHA-256 of the limits. An approval binds it, and so does not hold under other limits."""
         return hashlib.sha256(canonical(asdict(self))).hexdigest()
 
 
@@ -59,18 +59,18 @@ class Capabilities:
 
     two_banks: bool = False
     swap_compares: bool = False
-    """Activation is refused when CRC or generation are not the expected ones."""
+    """The controller refuses an activation when CRC or generation are not the expected ones."""
     generation: bool = False
     boot_id: bool = False
     interlocks: bool = False
-    """Activation is refused by the controller itself when the machine moves or an interlock is open."""
+    """The controller itself refuses an activation while the machine moves or an interlock is open."""
     lease: bool = False
     can_disable: bool = False
     """One bank: compensation can be switched off, and drives-off is confirmed."""
 
     @property
     def level(self) -> int:
-        """L3: unattended by policy. L2: attended. L1: attended, drives off. L0: read and export only."""
+        """Allowed pushes. 3: unattended; 2: attended; 1: attended with drives off; 0: none, the controller can only be read."""
         flags = [getattr(self, f.name) for f in fields(self) if f.name != "can_disable"]
         if all(flags):
             return 3
@@ -80,7 +80,7 @@ class Capabilities:
 
 
 NEEDS_ATTENDANCE = (
-    "this controller was not proved to compare and swap, keep a lease and watch its axes: a person who approves has to be at the machine"
+    "this controller is not proved to compare and swap, keep a lease and watch its axes: a person who approves has to be at the machine"
 )
 
 

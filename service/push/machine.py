@@ -1,7 +1,7 @@
 """The push protocol: the next operation as a pure function of the journal and of what this process knows of the controller.
 
-The same function is the crash recovery: a process that did not begin a push knows nothing; therefore it activates nothing new and rolls
-back what was activated without being verified (reliability.md 3.2). Operations depend on nothing else.
+The same function is the crash recovery: a process that did not begin the push knows nothing about it, so it activates no new table and
+rolls back an unverified one.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ LEASE_LEFT_MS = 5000
 def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | None = None) -> Operation:
     """Decide what to do next.
 
-    ``journal``: all entries of one push, empty before its first; ``known``: what this process learned since its start, or since the last
-    entry; ``order``: needed only while the journal is empty. After the operation: `learn`, or for RECORD the entry and `after_record`
-    (`abbe.service.push.operations`).
+    ``journal``: all entries of one push, empty before the first; ``known``: everything that this process has learned since its start or
+    since the last entry; ``order``: needed only while the journal is empty. The caller does the operation and then calls `learn`; for
+    RECORD it writes the entry and calls `after_record` (`abbe.service.push.operations`).
     """
     if not journal:
         return _begin(known, order) if order is not None else Operation(OperationKind.END, text="nothing was begun")
@@ -96,7 +96,7 @@ def _begin(known: Knowledge, order: OperationOrder) -> Operation:
 
 
 def _abandon(f: PushFacts, known: Knowledge, state: PushState, why: str) -> Operation:
-    """Before activation: release the lease and end. The table in force was never touched."""
+    """Give up before activation: release the lease and end. The table in force was never touched."""
     if state not in (PushState.SNAPSHOT, PushState.VALIDATED) and not known.fenced and known.unanswered < 2 * MAX_UNANSWERED:
         return Operation(OperationKind.RELEASE, owner=f.owner, text=why)
     return record(PushState.ABORTED, why=why)
@@ -122,7 +122,7 @@ def _approve(f: PushFacts, known: Knowledge) -> Operation:
         return record(PushState.REJECTED, reasons=[f"not approved: {text}"])
     approval = known.verdict.value
     if approval.digest != f.binding(approval.expiry):
-        return record(PushState.REJECTED, reasons=["what was approved is not this table on this base under these limits"])
+        return record(PushState.REJECTED, reasons=["the approval is for another table, base, machine or limits"])
     return record(PushState.APPROVED, approval=approval.digest, approved_by=approval.by, expiry=approval.expiry)
 
 
@@ -130,7 +130,7 @@ def _lease(f: PushFacts, known: Knowledge) -> Operation:
     if known.verdict is None:
         return Operation(OperationKind.LEASE, owner=f.owner)
     if isinstance(known.verdict, Refused):
-        return _abandon(f, known, PushState.APPROVED, f"the lease is another's: {known.verdict.text}")
+        return _abandon(f, known, PushState.APPROVED, f"another owner has the lease: {known.verdict.text}")
     if isinstance(known.verdict, Done):
         return record(PushState.LEASED)
     if known.truth is None:
@@ -146,7 +146,7 @@ def _precheck(f: PushFacts, known: Knowledge) -> Operation:
         return Operation(OperationKind.LOOK)
     why = _changed(f, truth, f.gen) or ("the axes have not stood long enough" if truth.still_s < STILL_S else "")
     if not why and truth.states[f.target] is BankState.LAID_ASIDE:
-        why = "a table is laid aside for the control's next start: start it anew, or take that table away first"
+        why = "a table is laid aside for the control's next start: restart the control, or remove that table first"
     if why:
         return _abandon(f, known, PushState.LEASED, why)
     return record(PushState.STAGING, still_s=truth.still_s)
@@ -184,7 +184,7 @@ def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
     if truth.map != f.map:
         return "the controller's register map changed"
     if in_force(f, truth) != "base" or truth.active != f.base_bank:
-        return "the table in force is not the approved base any more"
+        return "the table in force is no longer the approved base"
     if truth.gen != gen:
         return "a bank was changed from outside"
     if truth.owner != f.owner:
@@ -193,7 +193,7 @@ def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
 
 
 def _activate(f: PushFacts, known: Knowledge) -> Operation:
-    """Send one command, never twice; its result is read from the controller, never guessed."""
+    """Send the activation once, never again; read its result from the controller."""
     if known.mine and known.wrote_last and not known.asked and not known.stop:
         return Operation(OperationKind.ACTIVATE, bank=f.target, crc=f.expect_crc, gen=f.expect_gen, owner=f.owner)
     if known.mine and known.asked and not known.fenced and not known.stop:
@@ -246,7 +246,7 @@ def _not_in_force(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
 def _forget(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
     """Make the control discard a laid-aside table by writing into its bank; only the holder of the lease may write."""
     if known.forgets >= MAX_UNANSWERED:
-        why = "the control has laid the new table aside, uses it after its next start, and does not forget it: do not start it anew"
+        why = "the control has laid the new table aside, would use it after a restart and does not discard it: do not restart the control"
         return record(PushState.OPERATOR, why=why, **mismatch_doc(f, truth))
     if known.lease and truth.owner == known.lease:
         data = f.image[: 2 * f.chunk_words]
@@ -267,7 +267,7 @@ def _verify(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
-    """Move the machine and ask; every answer but a clear yes rolls back."""
+    """Let the machine be measured (probe or verification); every answer but a clear yes rolls back."""
     why = _why_back(known)
     if why:
         return record(PushState.ROLLBACK, why=why)
@@ -301,7 +301,7 @@ def _keep(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _why_back(known: Knowledge) -> str:
-    """Why to roll back, or empty: after a crash, on a stop, when nothing answers."""
+    """Why to roll back (after a crash, on a stop, without answers); empty to go on."""
     if not known.mine:
         return "interrupted before it was verified"
     return known.stop or ("the controller does not answer" if known.unanswered >= MAX_UNANSWERED else "")

@@ -1,7 +1,7 @@
 """Operations of the push machine, their outcomes, and what a process knows of the controller. Plain values, no I/O.
 
-Last the sequence that push and rollback share: stage an image in the inactive bank, that is write it chunk by chunk, seal it, and read it
-back twice in full.
+`stage` is the sequence that push and rollback share: it writes an image into the inactive bank chunk by chunk, seals it, and reads it back
+twice in full.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class OperationKind(Enum):
     VERIFY = "verify"
     """Measure again and compare with before. Value: `Verdict`."""
     RECORD = "record"
-    """Write a journal entry; it is on disk before anything else happens."""
+    """Write a journal entry to disk before anything else happens."""
     END = "end"
     """Nothing more to do now."""
 
@@ -51,7 +51,7 @@ class OperationKind(Enum):
 class Operation:
     """One operation. Fields that a kind does not need keep their defaults.
 
-    ``first`` and ``count`` are registers; ``data`` is what is written or expected; ``mark`` begins a bracket of reads between two looks.
+    ``first``, ``count``: registers; ``data``: bytes to write or to expect; ``mark``: this look opens a bracket of reads (`bracket`).
     """
 
     kind: OperationKind
@@ -72,8 +72,8 @@ class Operation:
 class Truth:
     """What the controller reports in one coherent look.
 
-    ``crc`` is 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty when interlocks hold and nothing moves.
-    ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
+    ``crc``: of both banks, 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty if no interlock is open and
+    nothing moves. ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
     """
 
     boot: int
@@ -93,8 +93,8 @@ class Truth:
 class Approval:
     """A person's (or the policy's) yes to exactly one table on exactly one base.
 
-    ``digest``: what was approved (`abbe.service.push.journal.approval_digest`). ``expiry``: when it ends, as text, part of the digest.
-    ``until_s``: the same end in monotonic host time, because the wall clock can be set.
+    ``digest``: of what was approved (`abbe.service.push.journal.approval_digest`). ``expiry``: when the approval ends, UTC as text, part of
+    the digest. ``until_s``: the same in monotonic host time, because the wall clock can be set.
     """
 
     digest: str
@@ -138,8 +138,8 @@ Outcome = Done | Refused | Doubt
 class Knowledge(NamedTuple):
     """What a process has learned since its start or since the last journal entry; a crash loses all of it.
 
-    A plain tuple: a sweep over all faults makes millions. A process that did not begin the push (``mine`` false) knows nothing; this alone
-    makes the machine follow the rules of recovery.
+    A process that did not begin the push (``mine`` false) knows nothing, and this alone makes the push machine recover. It is a plain tuple
+    for speed: tests of all faults make millions.
 
     Parameters
     ----------
@@ -148,22 +148,23 @@ class Knowledge(NamedTuple):
     truth : Truth, optional
         The last look, if nothing has happened since that could have changed it.
     start : Truth, optional
-        The look that opened the present bracket of reads.
+        The look that opened the present bracket of reads (`bracket`).
     image, decoded_digest : bytes, str, optional
         What was read within the bracket.
     brackets : int
         Brackets opened since the last entry.
     chunk, wrote, differs, unsure : int, bool, bool, bool
-        Number of chunks written and read back; whether the present one was written, read back different, got no valid answer.
+        Number of chunks written and read back. Of the present chunk: whether it was written, was read back with other content, and whether
+        its write got no valid answer.
     written, rewrites, rewrites_here : int
-        Writes that certainly happened since the entry that permitted them; repeats in total, and of the present chunk.
+        Writes that certainly happened since the last journal entry; repeated writes in total, and of the present chunk.
     sealed : int
         Number of SEAL commands.
     asked : bool
-        The one activation that the last entry permits was sent.
+        Whether the one activation that the last entry permits was sent.
     lease, leases, releases, fenced : int, int, int, bool
-        Owner id of the requested lease (0: none); number of requests and of releases since the last entry; whether the old owner was
-        shut out since then.
+        Owner id of the requested lease (0: none). Since the last entry: number of requests and of releases, and whether a release shut out
+        late commands of the old owner.
     forgets : int
         Writes since the last entry that make a control discard a table that it laid aside.
     verdict : Done, Refused or Doubt, optional
@@ -175,11 +176,11 @@ class Knowledge(NamedTuple):
     approved_until_s : float
         Monotonic time at which the approval ends.
     wrote_last : bool
-        This process wrote the last journal entry, so the operation that the entry permits has not been done yet.
+        This process wrote the last journal entry, so no other process can have done the operation that the entry permits.
     rested : bool
-        This process has just recorded that rollback is blocked: it does not retry by itself.
+        This process has just recorded that the rollback is blocked, and does not retry by itself.
     stop : str
-        Why a person or the service stops the push, or why it is given up; empty while it continues.
+        Why a person or the service stops the push, or why the push is given up; empty while it continues.
     """
 
     mine: bool = False
@@ -215,7 +216,7 @@ _QUESTIONS = frozenset({OperationKind.VALIDATE, OperationKind.APPROVE, Operation
 
 
 def after_record(known: Knowledge, state: PushState) -> Knowledge:
-    """Knowledge after a journal entry: what concerns the controller is forgotten, what concerns the process stays."""
+    """Knowledge after a journal entry: forget the controller's state, keep what concerns this process."""
     return Knowledge(
         mine=known.mine,
         lease=known.lease,
@@ -291,9 +292,9 @@ def _commanded(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
 
 
 FORGET = "forget"
-"""Text of a write that makes a control discard a table that it laid aside."""
+"""``text`` of a write that makes a control discard a table that it laid aside."""
 BACK = "back"
-"""Text of an activation of the old table."""
+"""``text`` of an activation of the old table."""
 
 
 BRACKETS = 4
@@ -333,7 +334,7 @@ class Coherent:
 
 
 def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
-    """Next operation of a full read between two looks; None: the looks differ, so something changed in between.
+    """Next operation of a bracket, a full read between two looks; None: the looks differ, so something changed in between.
 
     ``count``: registers to read, 0 for the length in the image's header. ``again``: read a second time and decode independently.
     """
@@ -378,7 +379,7 @@ def _write_chunk(image: Image, known: Knowledge) -> Operation | Failed:
     if (known.truth.boot, known.truth.gen) != (image.boot, image.gen + known.written):
         return Failed("another program wrote into the bank, or the controller restarted; the bank was left unchanged", foreign=True)
     if known.rewrites_here >= REWRITES_PER_CHUNK or known.rewrites >= REWRITES:
-        return Failed(f"registers {first}.. do not hold what was written, also after {known.rewrites_here} repeats")
+        return Failed(f"the bank does not hold what was written at register {first}, even after {known.rewrites_here} repeats")
     return write
 
 

@@ -22,12 +22,12 @@ LARGEST = 32767
 WHOLE = 0.01
 """Allowed distance of a value from a whole unit of the table, in units: float noise only."""
 ZERO_MM = 0.5e-6
-"""A table that is not zero at its reference moves the axis at once when it comes into force."""
+"""Allowed value at the reference (first position): a table that is not zero there moves the axis as soon as it comes into force."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Correction of one axis over the travel of one axis.
+    """Correction of the axis ``corrected`` over the travel of the axis ``moved``, added to the command.
 
     ``left_mm``: the machine's measured error in this column with the table in force; a correction of opposite sign reduces it.
     ``reverse_mm``: corrections for the reverse approach, or empty; ``reversal_mm``: measured mean difference, reverse minus forward.
@@ -44,9 +44,11 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class TableEvidence:
-    """What the table was computed from. Lengths mm; ``machine_mark``: see `CandidateContext`.
+    """The measurement and the prediction behind a table. Lengths mm; ``machine_mark``: see `CandidateContext`.
 
-    ``ended_s``, ``last_s``: end of the oldest and of the newest run, seconds UTC by the service's clock; ``last_s`` None: the same.
+    ``before_mm``, ``after_mm``, ``u_mm``: predicted rms without and with the table, and the model's standard uncertainty. ``drift_mm``: rms
+    residual of the solution in a newer run, 0 without one. ``temperature_c``: lowest and highest air temperature. ``ended_s``, ``last_s``:
+    end of the oldest and of the newest run, seconds UTC; ``last_s`` None: the same as ``ended_s``.
     """
 
     run_count: int
@@ -91,7 +93,7 @@ class CandidateContext:
     Parameters
     ----------
     machine, machine_mark : str
-        Name; mark that changes with every reboot, crash alarm and maintenance, which invalidate older measurements.
+        Name; mark that changes when older measurements no longer hold (the boot ids of the controller).
     map_version, lsb_nm, bank_registers : int
         Of the controller.
     travel_mm : dict
@@ -107,7 +109,7 @@ class CandidateContext:
     attended : bool
         An authorised approver is at the machine.
     last_push_s : float
-        Time of the last unattended push; minus infinity for never.
+        Time of the last kept push, seconds UTC; minus infinity for never.
     """
 
     machine: str
@@ -197,7 +199,7 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
     if not context.now_s - limits.age_h * 3600.0 <= e.ended_s <= newest_s <= context.now_s:
         yield f"STALE: measured {(context.now_s - e.ended_s) / 3600.0:.1f} h ago, allowed are 0 to {limits.age_h:g} h"
     if e.machine_mark != context.machine_mark:
-        yield "CHANGED: the machine restarted, had a crash or was maintained since it was measured"
+        yield "CHANGED: the control was restarted since the measurement, or in the course of it: measure again"
     if not low <= e.temperature_c[0] <= e.temperature_c[1] <= high:
         yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, allowed are {low:g} to {high:g} °C"
     if e.run_count < limits.runs:
@@ -213,14 +215,17 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
 
 
 def drift_reason(drift_mm: float, limits: PushLimits) -> str:
-    """Why the drift between the first and the last run is too large; empty if it is not."""
+    """Why the drift is too large, by the rms residual of the solution in a newer run; empty if it is not."""
     if drift_mm <= limits.drift_mm:
         return ""
-    return f"DRIFT: {drift_mm * 1e3:.1f} µm between the first and the last run, allowed are {limits.drift_mm * 1e3:.1f} µm"
+    return f"DRIFT: a newer run deviates from the solution by {drift_mm * 1e3:.1f} µm rms, allowed are {limits.drift_mm * 1e3:.1f} µm"
 
 
 def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushLimits) -> str:
-    """Why a promise is too small to write; empty if it is not. Rms before and after, and the model's standard uncertainty, mm."""
+    """Why the predicted improvement is too small to write a table; empty if it is not.
+
+    ``before_mm``, ``after_mm``, ``u_mm``: predicted rms without and with the table, and the model's standard uncertainty.
+    """
     gain = before_mm - after_mm
     if u_mm <= limits.share * gain and gain > limits.k * u_mm and gain >= limits.gain * before_mm:
         return ""
@@ -233,7 +238,7 @@ def _policy(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iter
     if context.attended:
         return
     if context.now_s - context.last_push_s < limits.unattended_h * 3600.0:
-        yield f"POLICY TIME: the last unattended push was less than {limits.unattended_h:g} h ago"
+        yield f"POLICY TIME: the last kept push was less than {limits.unattended_h:g} h ago, too soon for an unattended one"
     for column in c.columns:
         then = context.month_ago.get((column.moved, column.corrected)) or (0.0,) * len(column.correction_mm)
         walk = max((abs(a - b) for a, b in zip(column.correction_mm, then, strict=False)), default=0.0)
@@ -244,13 +249,13 @@ def _policy(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iter
 def _seal(c: Candidate) -> Iterator[str]:
     digest = content_digest(c)
     if c.digest != digest:
-        yield "HASH: the table is not the one that its digest was computed from"
+        yield "HASH: the table does not match its digest"
     if not c.seal.role:
-        yield "UNSIGNED: it has no signature"
+        yield "UNSIGNED: the table has no signature"
     elif c.seal.role not in SIGNERS:
-        yield f"ROLE: signed by a {c.seal.role}, only a metrologist may"
+        yield f"ROLE: the table is signed by a {c.seal.role}, only a metrologist may sign it"
     elif c.seal.digest != digest:
-        yield "SIGNATURE: it was given for another table"
+        yield "SIGNATURE: the signature is for another table"
 
 
 def number_reasons(candidate: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
@@ -283,7 +288,7 @@ def _odd(column: Column) -> str:
 
 
 def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float], limits: PushLimits) -> Iterator[str]:
-    """Values, changes, steps and bends of one table beyond the limits: each with its place, its size and the key of its limit.
+    """Reasons against values, changes, steps and second differences of one table that exceed the limits.
 
     ``p``, ``v``, ``active``: positions, new corrections and those in force, mm.
     """
@@ -330,7 +335,7 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
 
 
 def _reverse(column: Column) -> Iterator[str]:
-    """The difference of the two directions has to reduce the measured reversal, not to double it."""
+    """Check that the difference between the two directions reduces the measured reversal instead of doubling it."""
     table = sum(b - a for a, b in zip(column.correction_mm, column.reverse_mm, strict=True)) / len(column.reverse_mm)
     if abs(column.reversal_mm + table) > abs(column.reversal_mm):
         measured_um, table_um = column.reversal_mm * 1e3, table * 1e3
@@ -338,14 +343,14 @@ def _reverse(column: Column) -> Iterator[str]:
 
 
 def _whole(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """Shadow simulation: predict the residual with the new table from measurements with the one in force."""
+    """Predict the residuals with the new table from those measured with the one in force."""
     values = [x for column in c.columns for x in column.correction_mm]
     active = [x for column in c.columns for x in _active(column, context)]
     if values == active:
         yield "SAME: this table is in force already"
         return
     if not any(values) and any(active):
-        yield "ZERO: it would only take the table in force away; that is a rollback"
+        yield "ZERO: the new table is all zeros and would only remove the one in force: use a rollback"
     left = [x for column in c.columns for x in column.left_mm]
     if len(left) != len(values) or len(active) != len(values):
         yield "RESIDUAL: the machine's residuals are missing, so nothing can be predicted"
@@ -354,8 +359,8 @@ def _whole(c: Candidate, context: CandidateContext, limits: PushLimits) -> Itera
     before_mm, after_mm = _rms(left), _rms(after)
     if not after_mm <= (1.0 - limits.gain) * before_mm:
         opposed = sum(e * (new - old) for e, new, old in zip(left, values, active, strict=True)) > 0.0
-        word = "SIGN: it adds to the error" if opposed else "GAIN: it takes too little of the error"
-        yield f"{word}: {before_mm * 1e3:.2f} to {after_mm * 1e3:.2f} µm rms in the shadow"
+        word = "SIGN: the table adds to the error" if opposed else "GAIN: the table removes too little of the error"
+        yield f"{word}: {before_mm * 1e3:.2f} → {after_mm * 1e3:.2f} µm rms predicted"
 
 
 def _active(column: Column, context: CandidateContext) -> tuple[float, ...]:

@@ -57,7 +57,7 @@ def test_what_does_not_forget_is_a_persons_matter() -> None:
     world = World(real(), Case("laid aside for good", stages=True, forgets=False), {})
     world.live(world.p.execute.push(world, world, world.order()))
     assert str(world.journal[-1].state) == "OPERATOR"
-    assert "does not forget" in world.journal[-1].doc["why"]
+    assert "does not discard" in world.journal[-1].doc["why"]
 
 
 def test_what_somebody_else_has_laid_aside_is_left_alone() -> None:

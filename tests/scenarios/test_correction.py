@@ -142,7 +142,7 @@ async def test_a_stop_and_a_wrong_sign_take_the_table_back_and_the_right_one_sta
 
     with monkeypatch.context() as patch:
         patch.setattr(workflow, "propose", wrong)
-        with pytest.raises(TableRefused, match="SIGN: it adds to the error"):
+        with pytest.raises(TableRefused, match="SIGN: the table adds to the error"):
             await shop.correct("june", shop.before)
     assert await shop.active() == base
 

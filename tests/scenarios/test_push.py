@@ -123,7 +123,7 @@ async def test_a_bit_lost_on_the_way_is_found_by_the_read_back_and_never_activat
     sims = start_sims("--speed", "60")
     async with bench(sims, tmp_path) as (site, store, session):
         before = await active(session)
-        with pytest.raises(PushNotBegun, match="do not hold what was written"):
+        with pytest.raises(PushNotBegun, match="does not hold what was written"):
             await push(Noisy(session.controller), store, site, steep(site))
         assert await active(session) == before
         assert (await session.controller.comp_status()).lease_owner == 0
@@ -251,7 +251,7 @@ async def test_a_push_cut_short_before_it_was_kept_is_taken_back_at_the_next_sta
             patch.setattr(StoreBook, "append", dies)
             with pytest.raises(StoreError) as raised:
                 await push(session.controller, store, site, steep(site), probe=meanwhile)
-            assert "rolls it back before anything else" in raised.value.__notes__[0]
+            assert "rolls the table back before anything else" in raised.value.__notes__[0]
         assert last(store) == state
         if state is PushState.PROBED:  # whoever looks now sees the new table; it is not that one which is vouched for
             said = await accept(session.controller, store, site)

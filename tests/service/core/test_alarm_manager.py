@@ -449,7 +449,7 @@ async def test_a_stop_does_not_end_the_way_back_and_an_abort_leaves_it_to_the_se
 
     monkeypatch.setattr(push_approved, "finish_when_safe", finish)
     aborted = await back(Control.abort)
-    assert (aborted.word, aborted.text.endswith("it will be rolled back as soon as possible")) == ("failed", True)
+    assert (aborted.word, aborted.text.endswith("the table will be rolled back as soon as possible")) == ("failed", True)
     assert await back(lambda control: safe.set()) == JobOutcome("rolled back", "the door is open; the old table was made active again")
 
 
