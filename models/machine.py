@@ -29,7 +29,7 @@ class Machine:
     Raises
     ------
     ValueError
-        The chain is not made of w, b, t and X, Y, Z once each, or an array has another shape, or a stroke is empty.
+        The chain is wrong, an array has another shape or a number that is not finite, or a stroke is empty.
     """
 
     chain: str
@@ -38,11 +38,11 @@ class Machine:
     tool_mm: F1 = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        """Check and normalise the geometry once."""
+        """Check the geometry and turn it into float64 arrays."""
         for name, shape in (("stroke_mm", (3, 2)), ("pivots_mm", (3, 3)), ("tool_mm", (3,))):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"machine: {name} must be finite numbers of shape {shape}, got shape {value.shape}")
+                raise ValueError(f"machine: {name} must hold finite numbers in shape {shape}; its shape is {value.shape}")
             object.__setattr__(self, name, value)
         if (self.stroke_mm[:, 1] <= self.stroke_mm[:, 0]).any():
             raise ValueError("machine: every stroke_mm must run from its smaller to its larger position")
@@ -62,12 +62,12 @@ class Machine:
 
 
 def split_chain(chain: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Carriages of a chain string as axis indices: (work side from workpiece to bed, tool side from bed to tool).
+    """Return the carriages of a chain as axis indices: (work side from workpiece to bed, tool side from bed to tool).
 
     Raises
     ------
     ValueError
-        Not ``w-...-b-...-t`` with X, Y, Z once each.
+        The chain is not ``w-...-b-...-t`` with X, Y, Z once each.
     """
     parts = chain.split("-")
     carriages = [p for p in parts if p in AXES]
@@ -78,9 +78,10 @@ def split_chain(chain: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 def lever_masks(chain: str) -> F3:
-    """Which commanded travels belong to the lever arm of each carriage (rule G), shape (3 carriages, 3 axes), 0 or 1.
+    """Return which commanded travels belong to the lever arm of each carriage, 0 or 1, shape (3 carriages, 3 axes).
 
-    Tool side: travels of the carriages nearer the tool. Work side: all travels except those of carriages nearer the workpiece.
+    Rule G (docs/explanation/conventions.md) counts, on the tool side, the travels of the carriages nearer the tool, and on the work side
+    all travels except those of carriages nearer the workpiece.
     """
     work, tool = split_chain(chain)
     mask = np.zeros((3, 3))
@@ -93,13 +94,13 @@ def lever_masks(chain: str) -> F3:
 
 
 def levers_mm(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> F3:
-    """Lever arms r_j of rule G at commanded positions.
+    """Return the lever arms r_j of rule G (docs/explanation/conventions.md) at commanded positions, mm.
 
     Parameters
     ----------
     axes_mm : array, shape (n, 3)
     tool_mm : array, shape (3,) or (n, 3), optional
-        Tool in place of ``machine.tool_mm``: one for all positions or one per position.
+        Tool vector in place of ``machine.tool_mm``: one for all positions or one per position.
 
     Returns
     -------
@@ -118,5 +119,5 @@ def levers_mm(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> 
 
 
 def with_tool(machine: Machine, tool_mm: F1 | None) -> Machine:
-    """The machine with another tool, for rule G's levers; None: its own."""
+    """Return the machine with another tool vector; with None, the machine itself."""
     return machine if tool_mm is None else replace(machine, tool_mm=tool_mm)

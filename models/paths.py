@@ -1,7 +1,7 @@
-"""Geometry of the tests, shared by sequences and solvers.
+"""Commanded positions of the tests, shared by sequences and solvers.
 
-Straight laser tests: body diagonals in sequential or plain steps (math.md 5.1), single-axis lines (ISO 230-2). On the ball-bar's sphere:
-circles and arcs (ISO 230-4) with the ways into a path, out of it and from another one, and hemispherical helices (math.md 4.3).
+Laser: body diagonals in sequential or plain steps (Wang), face diagonals (ISO 230-6) and single-axis lines (ISO 230-2). Ball-bar, on a
+sphere about the cup: circles and arcs (ISO 230-4), hemispherical helices (Yang and Kim), and the links between them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ DIAGONALS: dict[str, tuple[int, int, int]] = {"ppp": (1, 1, 1), "npp": (-1, 1, 1
 
 
 def diagonal_ends(box_mm: F2, diagonal: str) -> tuple[F1, F1]:
-    """Start and end of a body diagonal of a box: ``npp`` runs from large to small X (Wang's names, math.md 5.1).
+    """Return start and end of a body diagonal of a box, by Wang's names: ``npp`` runs from large to small X.
 
     Parameters
     ----------
     box_mm : array, shape (3, 2)
-        Lower and upper end of X, Y, Z, any frame.
+        Lower and upper end of X, Y, Z, mm, in any frame.
     diagonal : str
         ppp, npp, pnp or ppn.
 
@@ -32,7 +32,7 @@ def diagonal_ends(box_mm: F2, diagonal: str) -> tuple[F1, F1]:
     Raises
     ------
     ValueError
-        Another diagonal, or no (3, 2) box.
+        The diagonal is unknown, or the box has another shape.
     """
     if diagonal not in DIAGONALS:
         raise ValueError(f"diagonal {diagonal!r}: must be one of {', '.join(DIAGONALS)}")
@@ -45,21 +45,20 @@ def diagonal_ends(box_mm: F2, diagonal: str) -> tuple[F1, F1]:
 
 
 def step_diagonal(start_mm: F1, end_mm: F1, steps: int, order: str = "XYZ", *, back: bool = True) -> F2:
-    """Positions of a sequential step-diagonal test: one axis moves at a time, in ``order``, ``steps`` times.
+    """Return the positions of Wang's sequential step-diagonal test: the axes move one at a time in ``order``, ``steps`` times.
 
-    Out in the given order and, if ``back``, back in the reverse order with the turning point recorded twice (run-format.md 3). Source:
-    Wang's sequential step diagonal (math.md 5.1), which the paper steps X, Y, Z.
+    With ``back``, the same positions follow in reverse order; the turning point then stands there twice. The paper's order is X, Y, Z.
 
     Parameters
     ----------
     start_mm, end_mm : array, shape (3,)
-        Ends of the diagonal, e.g. of `diagonal_ends`.
+        Ends of the diagonal, e.g. from `diagonal_ends`.
     steps : int
         Steps per axis.
     order : str
         X, Y and Z once each.
     back : bool
-        Whether the way back belongs to the test.
+        Whether to add the way back.
 
     Returns
     -------
@@ -71,7 +70,7 @@ def step_diagonal(start_mm: F1, end_mm: F1, steps: int, order: str = "XYZ", *, b
         ``order`` does not name every axis once, or ``steps`` < 1.
     """
     if sorted(order) != ["X", "Y", "Z"] or steps < 1:
-        raise ValueError(f"step diagonal: order {order!r} must name X, Y, Z once each and steps be 1 or more")
+        raise ValueError(f"step diagonal: order {order!r} must name X, Y, Z once each, and steps = {steps} must be 1 or more")
     inc = (np.asarray(end_mm) - np.asarray(start_mm)) / steps
     counts = np.zeros((3 * steps + 1, 3))
     for k in range(3 * steps):
@@ -83,7 +82,7 @@ def step_diagonal(start_mm: F1, end_mm: F1, steps: int, order: str = "XYZ", *, b
 
 
 def straight_line(start_mm: F1, end_mm: F1, n: int, *, back: bool = True) -> F2:
-    """Positions of a plain line test: ``n`` equidistant positions out and, if ``back``, the same back (turning point twice; ISO 230-2).
+    """Return ``n`` equidistant positions on a line and, with ``back``, the same in reverse order (turning point twice; ISO 230-2).
 
     Parameters
     ----------
@@ -92,7 +91,7 @@ def straight_line(start_mm: F1, end_mm: F1, n: int, *, back: bool = True) -> F2:
     n : int
         Positions, both ends included.
     back : bool
-        Whether the way back belongs to the test.
+        Whether to add the way back.
 
     Returns
     -------
@@ -104,7 +103,7 @@ def straight_line(start_mm: F1, end_mm: F1, n: int, *, back: bool = True) -> F2:
         Fewer than two positions.
     """
     if n < 2:
-        raise ValueError(f"line: {n} positions, a line needs 2 or more")
+        raise ValueError(f"line: {n} positions given, 2 or more needed")
     out = np.linspace(start_mm, end_mm, n)
     return np.concatenate([out, out[::-1]]) if back else out
 
@@ -114,15 +113,15 @@ FACES: dict[str, tuple[str, str]] = {"XY": ("pp", "np"), "YZ": ("pp", "np"), "ZX
 
 
 def face_ends(box_mm: F2, plane: str, diagonal: str, share: float) -> tuple[F1, F1]:
-    """Start and end of a face diagonal of a box, with the third axis standing at ``share`` of its length (0 its lower end).
+    """Return start and end of a face diagonal of a box, mm, while the third axis stands at ``share`` (0 to 1) of its length.
 
     Raises
     ------
     ValueError
-        Another plane or diagonal.
+        The plane or the diagonal is unknown.
     """
     if plane not in FACES or diagonal not in FACES[plane]:
-        raise ValueError(f"face diagonal {plane} {diagonal}: must be XY, YZ or ZX and pp or np")
+        raise ValueError(f"face diagonal {plane} {diagonal}: the plane must be XY, YZ or ZX, the diagonal pp or np")
     a, b = ("XYZ".index(c) for c in plane)
     third = 3 - a - b
     start, end = box_mm[:, 0].copy(), box_mm[:, 0].copy()
@@ -133,12 +132,13 @@ def face_ends(box_mm: F2, plane: str, diagonal: str, share: float) -> tuple[F1, 
 
 
 def target_shares(n: int, offset_share: float, seed: int) -> F1:
-    """Places of n targets between 0 and 1: equidistant, each moved by a pseudo-random part of the interval (ISO 230-2).
+    """Return n target positions from 0 to 1: equidistant, each shifted by a pseudo-random part of the interval (ISO 230-2).
 
-    ``offset_share``: largest offset over the interval, below 0.5 so that the order stays; the first and last move inwards.
+    ``offset_share`` is the largest shift as a share of the interval, below 0.5 so that the targets keep their order. The first and the
+    last target shift inwards.
     """
     if n < 2 or not 0.0 <= offset_share < 0.5:
-        raise ValueError("targets: two or more, moved by less than half an interval")
+        raise ValueError(f"targets: {n} given, 2 or more needed; offset_share = {offset_share:g} must be at least 0 and below 0.5")
     step = 1.0 / (n - 1)
     offset = np.random.default_rng(seed).uniform(-1.0, 1.0, n) * offset_share * step
     offset[0], offset[-1] = abs(offset[0]), -abs(offset[-1])
@@ -146,22 +146,23 @@ def target_shares(n: int, offset_share: float, seed: int) -> F1:
 
 
 def cycles_of(out_mm: F2, cycles: int, overrun_mm: float = 0.0) -> tuple[F2, F1]:
-    """Positions of a bidirectional test and the direction (+1 out, -1 back) of each: out and back, ``cycles`` times.
-
-    With an overrun the machine goes so far beyond both ends (along the first and last leg) before it turns, so that every target is
-    approached from the side that its direction names; these places are positions too. Without, the turning points stand there twice.
+    """Return the positions of a bidirectional test, out and back ``cycles`` times, and the direction of each.
 
     Parameters
     ----------
     out_mm : array, shape (n, 3)
-        The way out.
+        Positions on the way out.
+    cycles : int
+    overrun_mm : float
+        How far the machine goes beyond both ends before it turns, so that it approaches every target from the right side. These turning
+        points are positions of the result too. Without an overrun the machine turns at the end positions, which then stand there twice.
 
     Returns
     -------
-    positions, shape (m, 3), and directions, shape (m,).
+    positions, shape (m, 3), mm, and directions, shape (m,): +1 out, -1 back.
     """
     if cycles < 1 or overrun_mm < 0.0:
-        raise ValueError("cycles: one or more, with an overrun of 0 or more")
+        raise ValueError(f"cycles = {cycles} must be 1 or more, and overrun_mm = {overrun_mm:g} must be 0 or more")
     way, there = np.asarray(out_mm, dtype=np.float64), np.ones(len(out_mm))
     if overrun_mm == 0.0:
         once, sign = np.concatenate([way, way[::-1]]), np.concatenate([there, -there])
@@ -181,14 +182,15 @@ def _unit(v: F1) -> F1:
 Plane = Literal["XY", "YZ", "ZX"]
 PLANES: tuple[Plane, ...] = ("XY", "YZ", "ZX")
 FAR_RAD = np.deg2rad(150.0)
-"""Two points farther apart have no good short way between them: by way of the pole the path stays clear of the cup."""
+"""If two points are farther apart, the path goes over the pole, clear of the cup."""
 LOW_RAD = np.deg2rad(30.0)
+"""The same limit if one of the points lies below the equator."""
 VERY_LOW = 0.7
-"""Below the equator by more than this share of the radius even a short way may pass the foot of the cup."""
+"""From a point lower than this share of the radius below the equator, even a short path may hit the foot of the cup."""
 
 
 def circle_points(centre_mm: F1, radius_mm: float, plane: Plane, angles_rad: F1) -> F2:
-    """Points of a circle in a plane of two axes at given angles, counted from the plane's first axis to its second.
+    """Return points of a circle in a plane of two axes at given angles, counted from the plane's first axis to its second.
 
     Parameters
     ----------
@@ -203,7 +205,7 @@ def circle_points(centre_mm: F1, radius_mm: float, plane: Plane, angles_rad: F1)
     Raises
     ------
     ValueError
-        Another plane, radius not positive, or a centre that is not three finite numbers.
+        The plane is unknown, the radius is not positive, or the centre is not three finite numbers.
     """
     if plane not in PLANES:
         raise ValueError(f"circle: plane {plane!r} must be XY, YZ or ZX")
@@ -217,17 +219,16 @@ def circle_points(centre_mm: F1, radius_mm: float, plane: Plane, angles_rad: F1)
 
 
 def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
-    """Points of the great circle that passes ``at_mm`` in the direction ``along``; angles count from there, negative ones before it.
+    """Return points of the great circle that passes ``at_mm`` in the direction ``along``, at given angles from there (negative before it).
 
-    Joined to a path that goes through ``at_mm`` in that direction, it enters (or leaves) the path without a corner and stays on the
-    sphere, so that a bar that hangs in keeps its length.
+    Such an arc leads into a path, or out of it, without a corner. It stays on the sphere, so that a mounted bar keeps its length.
 
     Parameters
     ----------
     centre_mm, at_mm : array, shape (3,)
         Centre of the sphere; a point on it.
     along : array, shape (3,)
-        Direction of motion there; what of it leaves the sphere does not count.
+        Direction of motion there; only its component tangential to the sphere counts.
     angles_rad : array, shape (n,)
 
     Returns
@@ -237,31 +238,31 @@ def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
     Raises
     ------
     ValueError
-        The point is the centre, or the direction has no part along the sphere.
+        The point is the centre, or the direction has no tangential component.
     """
     out = np.asarray(at_mm, dtype=np.float64) - centre_mm
     radius = float(np.linalg.norm(out))
     if not radius > 0.0:
-        raise ValueError("arc: the point is the sphere's centre")
+        raise ValueError("arc: the start point is the centre of the sphere")
     out = out / radius
     tangent = np.asarray(along, dtype=np.float64) - out * float(np.dot(along, out))
     size = float(np.linalg.norm(tangent))
     if not size > 1e-12:
-        raise ValueError("arc: the direction does not run along the sphere")
+        raise ValueError("arc: the direction is radial or zero, it must have a component along the sphere")
     tangent = tangent / size
     return np.asarray(centre_mm + radius * (np.outer(np.cos(angles_rad), out) + np.outer(np.sin(angles_rad), tangent)))
 
 
 def way_on_sphere(centre_mm: F1, start_mm: F1, end_mm: F1, up: F1, chord_mm: float) -> F2:
-    """Points of a way on the sphere from one of its points to another, at most about ``chord_mm`` apart, both ends included.
+    """Return points of a path on the sphere between two of its points, about ``chord_mm`` apart at most, both ends included.
 
-    The short great circle; by way of the pole where the points are nearly opposite, or one of them is low and the way is long: there the
-    short way could lead under the cup.
+    The path is the shorter great-circle arc. It goes over the pole if the points are nearly opposite, or if a point lies so low that the
+    shorter arc could lead under the cup (`FAR_RAD`, `LOW_RAD`, `VERY_LOW`).
 
     Parameters
     ----------
     up : array, shape (3,)
-        Unit vector from the centre to the pole, where the spindle is.
+        Unit vector from the centre to the pole, on the spindle's side.
     """
     a, b = (np.asarray(p, dtype=np.float64) - centre_mm for p in (start_mm, end_mm))
     radius = float(np.linalg.norm(a))
@@ -300,13 +301,13 @@ def _across(v: F1) -> F1:
 
 Law = Literal["angle", "area"]
 FINER, GROWS = 8, 0.2
-"""The way along a curve is added up in pieces this much shorter than the distances of its points; these differ so much from their mean."""
+"""`even_helix_points` adds up the length in pieces FINER times shorter than the point distances, which vary by GROWS about their mean."""
 
 
 def helix_points(
     centre_mm: F1, radius_mm: float, *, turns: float, n: int, law: Law = "angle", axis: int = 1, span_rad: float = np.pi / 2
 ) -> F2:
-    """Points of a hemispherical helix from the pole to the equator.
+    """Return points of a hemispherical helix from the pole to the equator.
 
     Parameters
     ----------
@@ -315,8 +316,8 @@ def helix_points(
     turns, n : float, int
         Turns about the hemisphere's axis and number of points, both ends included.
     law : "angle" | "area"
-        ``angle``: colatitude grows uniformly (math.md 4.3); ``area``: cos(colatitude) falls uniformly, so that every band of the sphere
-        gets points in proportion to its area.
+        ``angle``: colatitude grows uniformly; ``area``: cos(colatitude) falls uniformly, so that every band of the sphere gets points in
+        proportion to its area.
     axis : int
         Axis of the hemisphere: 0 X, 1 Y (the paper's horizontal-spindle machine), 2 Z.
     span_rad : float
@@ -330,10 +331,10 @@ def helix_points(
     ------
     ValueError
         n < 2, radius not positive, turns not finite, span outside (0, pi/2], unknown law, axis not 0, 1 or 2, or a centre that is not three
-        finite numbers. Fewer than three turns are drawn, though they determine little (math.md 4.5).
+        finite numbers. Fewer than three turns are accepted, but such a helix determines few errors.
     """
     if n < 2 or not 0 < radius_mm < np.inf or not np.isfinite(turns) or not 0 < span_rad <= np.pi / 2:
-        raise ValueError("helix: n must be 2 or more, radius positive, turns a number, span within (0, pi/2]")
+        raise ValueError("helix: n must be 2 or more, the radius positive, turns finite, and the span in (0, pi/2]")
     if law not in ("angle", "area"):
         raise ValueError(f"helix: law {law!r} must be 'angle' or 'area'")
     if axis not in (0, 1, 2):
@@ -344,12 +345,12 @@ def helix_points(
 
 
 def even_helix_points(centre_mm: F1, radius_mm: float, *, turns: float, n: int, law: Law = "area", axis: int = 2) -> F2:
-    """Points of the same curve at almost equal distances along it, growing from 0.8 to 1.2 of their mean.
+    """Return points of the same curve as `helix_points`, but at distances that grow from 0.8 to 1.2 of their mean.
 
-    By the area law itself, points lie several times as far apart at the pole as elsewhere. All of one distance, driven at one feed, they
-    would be passed with one frequency, like a vibration.
+    By the area law alone, points lie several times farther apart at the pole than elsewhere. Exactly equal distances at a constant feed
+    would give one fixed sampling frequency, like a vibration.
 
-    Parameters, result, errors: as `helix_points`, for the full hemisphere.
+    Parameters, result and errors are those of `helix_points` for the full hemisphere.
     """
     fine = np.linspace(0.0, 1.0, FINER * n) ** 2  # the area law leaves the pole like a square root
     curve = _unit_helix(fine, turns, law, axis, 0.5 * np.pi)
@@ -362,7 +363,7 @@ def even_helix_points(centre_mm: F1, radius_mm: float, *, turns: float, n: int, 
 
 
 def _unit_helix(share: F1, turns: float, law: Law, axis: int, span_rad: float) -> F2:
-    """Where a helix of radius 1 about the origin is at shares 0..1 of its turns, shape (n, 3)."""
+    """Return points of a helix of radius 1 about the origin at shares 0..1 of its turns, shape (n, 3)."""
     phi = span_rad * share if law == "angle" else np.arccos(1.0 - share * (1.0 - np.cos(span_rad)))
     theta = 2 * np.pi * turns * share
     a, b = (0, 2) if axis == 1 else ((axis + 1) % 3, (axis + 2) % 3)
@@ -374,11 +375,11 @@ def _unit_helix(share: F1, turns: float, law: Law, axis: int, span_rad: float) -
 
 
 def helix_points_likely_code(centre_mm: F1, radius_mm: float, *, turns: float) -> F2:
-    """The 63 points that the paper's own program probably made: t = 0, 0.1, .. 6.2, colatitude t / 4, longitude ``turns`` t (math.md 4.3).
+    """Return the 63 points that Yang and Kim's program probably made: t = 0, 0.1, .. 6.2, colatitude t / 4, longitude ``turns`` t.
 
-    ``t = 0:0.1:2*pi`` has exactly the 63 samples of the paper and stops 0.021 rad of colatitude above the equator; it cannot be proved.
+    The paper has 63 samples, as ``t = 0:0.1:2*pi`` would give; this is no proof. The last point is 0.021 rad above the equator.
 
-    Parameters, result: as `helix_points` with ``axis`` 1, shape (63, 3), mm.
+    Parameters are those of `helix_points` with ``axis`` 1; the result has shape (63, 3), mm.
 
     Raises
     ------
@@ -386,7 +387,7 @@ def helix_points_likely_code(centre_mm: F1, radius_mm: float, *, turns: float) -
         Radius not positive, or turns not finite.
     """
     if not 0 < radius_mm < np.inf or not np.isfinite(turns):
-        raise ValueError("helix: radius must be positive and turns a number")
+        raise ValueError("helix: the radius must be positive and turns finite")
     t = 0.1 * np.arange(63)
     phi, theta = t / 4.0, turns * t
     unit = np.stack([np.sin(phi) * np.cos(theta), np.cos(phi), np.sin(phi) * np.sin(theta)], axis=1)

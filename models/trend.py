@@ -1,10 +1,9 @@
-"""Trend of a series of figures: drift, its beginning, and the day on which the limit is reached.
+"""Trend of a series of check results ("figures"): whether it drifts, since when, and when it will reach its limit.
 
-The figures come at any times, each with its own standard uncertainty, of which only the proportions are believed: mean and scale are
-learned from the series itself. A figure is compared with the mean of all before it, and its deviation, a Student variable, is turned into
-a standard normal one (Hawkins' self-starting chart). While nothing changes these are exactly independent and standard normal whatever the
-uncertainties are, so that the false-alarm rates of the textbook's charts (ISO 7870-4 CUSUM, ISO 7870-6 EWMA) hold from the third figure
-on.
+Figures come at any times, each with a standard uncertainty. Only the ratios of these uncertainties count: mean and scale are estimated
+from the series itself (Hawkins' self-starting chart). Each figure is compared with the mean of all earlier ones; this deviation follows
+Student's t and is transformed to a standard normal variable. While nothing changes, these variables are independent, so that the
+false-alarm rates of CUSUM (ISO 7870-4) and EWMA (ISO 7870-6) hold from the third figure on.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ from abbe.models.arrays import F1
 from abbe.models.probability import f_limit, normal_below, normal_limit, t_above
 
 CUSUM_K = 0.5
-"""Half the smallest shift worth finding, in standard deviations of a check."""
+"""Reference value of the CUSUM: half the smallest shift worth finding, in standard deviations of a check."""
 CUSUM_H = 5.0
-"""Decision limit. With `CUSUM_K` one false alarm in 465 checks on average (`average_run_length`)."""
+"""Decision limit of the CUSUM: one false alarm in 465 checks on average (`average_run_length`)."""
 CUSUM_MOST = 2 * CUSUM_H
-"""The sums grow no further, so that a cured drift is over ten checks later."""
+"""Cap on the sums, so that the alarm ends about ten checks after a drift was cured."""
 EWMA_WEIGHT = 0.2
 EWMA_L = 2.962
-"""Width of the EWMA's limits: one false alarm in 500 checks on average (Lucas and Saccucci 1990)."""
+"""Width of the EWMA's limits, in its standard deviations: one false alarm in 500 checks on average (Lucas and Saccucci 1990)."""
 MIN_CHECKS = 8
 """Number of checks needed for a statement about drift."""
 MIN_FIT = 6
 """Number of checks needed for a statement about the limit."""
 SIGNIFICANCE = 0.01
-"""Significance level of a slope that is extrapolated."""
+"""Significance level that a slope needs before `forecast` extrapolates it."""
 Z_MAX = 8.0
 MOST_CHECKS = 400
 """How many of the latest checks a forecast uses; older ones say little about the days ahead."""
@@ -39,14 +38,14 @@ FARTHEST = 20.0
 """Longest forecast, in lengths of the series."""
 JUMP_SIGMAS = 5.0
 JUMP_SHARE = 0.25
-"""Smallest jump that counts, in standard uncertainties, and as a share of the limit, because the spread of few checks is not known."""
+"""Smallest jump that counts: in standard uncertainties, and as a share of the limit."""
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Days from the last check until the limit is reached, with a 95 % interval; NaN and a reason where that is not known.
+    """Days from the last check until the limit is reached, with a 95 % interval; NaN and a ``reason`` if unknown.
 
-    ``slope`` and ``slope_u``: change a day and its standard uncertainty, in the figure's unit.
+    ``slope`` and ``slope_u``: change per day and its standard uncertainty, in the figure's unit.
     """
 
     days: float
@@ -59,11 +58,11 @@ class Forecast:
 
 @dataclass(frozen=True)
 class Trend:
-    """What a series shows. ``state``: ``in control``, ``drifting`` or ``too few checks``.
+    """Verdict on a series and its control charts.
 
-    ``since``: index of the first check of the drift; ``found``: of the one at which it was certain. ``direction``: +1 up, -1 down, 0 none.
-    ``z``: standardised deviations (NaN for the first two checks); ``ewma`` and ``ewma_limit``: the chart of them and its two-sided limit;
-    ``high`` and ``low``: the CUSUM's two sums, limit `CUSUM_H`.
+    ``state``: ``in control``, ``drifting`` or ``too few checks``. ``direction``: +1 up, -1 down, 0 none. ``since``: index of the first
+    check of the drift. ``found``: index of the check at which the CUSUM crossed its limit. ``z``: standardised deviations, NaN for the
+    first two checks. ``ewma`` and ``ewma_limit``: EWMA of ``z`` and its two-sided limit. ``high`` and ``low``: upper and lower CUSUM.
     """
 
     state: str
@@ -79,12 +78,12 @@ class Trend:
 
 
 def standardised(values: F1, u: F1) -> F1:
-    """Deviation of each figure from the mean of all before it, as standard normal variable; NaN for the first two.
+    """Return the deviation of each figure from the mean of all earlier ones as a standard normal variable; NaN for the first two.
 
     Parameters
     ----------
     values, u : array (n,)
-        Figures and their standard uncertainties, in order of time. Only the proportions of ``u`` count.
+        Figures and their standard uncertainties, in order of time. Only the ratios of ``u`` count.
 
     Raises
     ------
@@ -93,7 +92,7 @@ def standardised(values: F1, u: F1) -> F1:
     """
     z = np.full(len(values), np.nan)
     if values.shape != u.shape or not bool(np.all(u > 0)):
-        raise ValueError("each figure needs a positive uncertainty")
+        raise ValueError("trend: each figure needs one positive standard uncertainty")
     if len(values) < 3:
         return z
     weight = 1.0 / u**2
@@ -107,7 +106,7 @@ def standardised(values: F1, u: F1) -> F1:
 
 
 def _normal(r: F1, scale: F1, dof: F1) -> F1:
-    """The standard normal variable that is as improbable as a Student one."""
+    """Transform Student variables ``r / scale`` to standard normal ones of the same probability."""
     with np.errstate(divide="ignore", invalid="ignore"):
         size = np.where(scale > 0, np.abs(r) / scale, np.where(r == 0, 0.0, np.inf))
     found = np.minimum(normal_limit(t_above(size, dof)), Z_MAX)
@@ -115,7 +114,7 @@ def _normal(r: F1, scale: F1, dof: F1) -> F1:
 
 
 def ewma(z: F1, weight: float = EWMA_WEIGHT, width: float = EWMA_L) -> tuple[F1, F1]:
-    """Exponentially weighted mean of standard normal variables and its limit, exact from the first on; NaN counts as not measured."""
+    """Return the exponentially weighted moving average of standard normal variables and its limit; NaN values are skipped."""
     mean, limit = np.full(len(z), np.nan), np.full(len(z), np.nan)
     last, variance = 0.0, 0.0
     for k in np.flatnonzero(np.isfinite(z)):
@@ -126,7 +125,7 @@ def ewma(z: F1, weight: float = EWMA_WEIGHT, width: float = EWMA_L) -> tuple[F1,
 
 
 def cusum(z: F1, k: float = CUSUM_K) -> tuple[F1, F1]:
-    """Upper and lower cumulative sum of standard normal variables; NaN counts as nothing."""
+    """Return the upper and lower cumulative sum of standard normal variables; NaN values are skipped."""
     high, low = np.zeros(len(z)), np.zeros(len(z))
     up = down = 0.0
     for n, one in enumerate(np.where(np.isfinite(z), z, np.nan).tolist()):
@@ -137,7 +136,10 @@ def cusum(z: F1, k: float = CUSUM_K) -> tuple[F1, F1]:
 
 
 def average_run_length(shift: float = 0.0, k: float = CUSUM_K, h: float = CUSUM_H, states: int = 400) -> float:
-    """Checks until a two-sided CUSUM alarms, on average, when the mean is off by ``shift`` standard deviations (Brook and Evans 1972)."""
+    """Return the mean number of checks until a two-sided CUSUM alarms if the mean is off by ``shift`` standard deviations.
+
+    A Markov chain with ``states`` states (Brook and Evans 1972).
+    """
     one = [_one_sided(sign * shift, k, h, states) for sign in (1, -1)]
     return 1.0 / sum(1.0 / length for length in one)
 
@@ -152,30 +154,30 @@ def _one_sided(shift: float, k: float, h: float, states: int) -> float:
 
 
 def trend(days: F1, values: F1, u: F1, limit: float | None = None) -> Trend:
-    """Judge a series.
+    """Judge whether a series of figures drifts, and forecast when it reaches its limit.
 
     Parameters
     ----------
     days : array (n,)
-        Times, d, rising.
+        Times in days, not decreasing.
     values, u : array (n,)
-        Figures and standard uncertainties, one unit.
+        Figures and their standard uncertainties, in one unit.
     limit : float, optional
-        What the figure must not exceed, in its unit.
+        Upper limit of the figure, in its unit; without it there is no forecast.
 
     Raises
     ------
     ValueError
-        Shapes differ, times do not rise, an uncertainty is not positive.
+        Shapes differ, times decrease, or an uncertainty is not positive.
     """
     if days.shape != values.shape or bool(np.any(np.diff(days) < 0)):
-        raise ValueError("times and figures have to be as many, in order of time")
+        raise ValueError("trend: give one time for each figure, in order of time")
     z = standardised(values, u)
     high, low = cusum(z)
     enough = len(values) >= MIN_CHECKS
     first = next(iter(np.flatnonzero(np.maximum(high, low) > CUSUM_H).tolist()), None)
     if first is not None and (since := _since(high if high[first] > CUSUM_H else low, first)) >= MIN_CHECKS:
-        # Checks are compared with what was before the drift from here on: else the drift itself would become the habit.
+        # Compare the checks after the alarm with the mean before the drift; otherwise the drift would become the new mean.
         z = _against_before(values, u, z, since, first)
         high, low = cusum(z)
     direction = 0 if not enough else 1 if high[-1] > CUSUM_H else -1 if low[-1] > CUSUM_H else 0
@@ -191,27 +193,28 @@ def trend(days: F1, values: F1, u: F1, limit: float | None = None) -> Trend:
 
 
 def mean_of(values: F1, u: F1) -> tuple[float, float]:
-    """Weighted mean of figures and its standard uncertainty."""
+    """Return the weighted mean of figures and its standard uncertainty."""
     weight = 1.0 / u**2
     return float(weight @ values / weight.sum()), float(1.0 / np.sqrt(weight.sum()))
 
 
 def jumps(change: float, u_change: float, limit: float) -> bool:
-    """Whether a figure grew by more than its uncertainty explains; for fewer than `MIN_CHECKS` checks, whose spread is unknown.
+    """Tell whether a figure grew by more than its uncertainty explains.
 
-    Unlike the chart, this uses the stated uncertainties as they are; `JUMP_SIGMAS` and `JUMP_SHARE` allow for components missing in them.
+    For series of fewer than `MIN_CHECKS` checks, whose spread is unknown. Unlike the charts, this test takes the stated uncertainties
+    at face value; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for contributions missing in them.
     """
     return change > JUMP_SIGMAS * u_change and change > JUMP_SHARE * limit
 
 
 def _since(side: F1, found: int) -> int:
-    """The check after the last one at which the sum was nothing: where the change most probably began."""
+    """Return the index after the last zero of a CUSUM: there the change most probably began."""
     zero = np.flatnonzero(side[: found + 1] == 0)
     return int(zero[-1]) + 1 if len(zero) else 0
 
 
 def _against_before(values: F1, u: F1, z: F1, since: int, found: int) -> F1:
-    """What `standardised` gives, with the checks after ``found`` compared with those before ``since``."""
+    """Return ``z`` with the checks after index ``found`` compared with those before index ``since``."""
     weight = 1.0 / u[:since] ** 2
     mean = float(np.sum(weight * values[:since]) / np.sum(weight))
     scale = np.sqrt(float(np.sum(weight * (values[:since] - mean) ** 2)) / (since - 1))
@@ -222,11 +225,11 @@ def _against_before(values: F1, u: F1, z: F1, since: int, found: int) -> F1:
 
 
 def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.95) -> Forecast:
-    """When the figure reaches its limit if its trend continues: constant at first, and rising evenly from some day on.
+    """Forecast when the figure reaches its limit, by a model that is constant up to an onset and rises linearly from there.
 
-    Weighted least squares over level, slope and the day of the onset (which may lie before the first check: a straight line); scale
-    from the residuals. The interval holds every day at which the limit may be reached without the fit becoming significantly worse
-    (likelihood ratio, F with 1 and n - 3 degrees of freedom). It does not cover a change of the machine's behaviour.
+    Weighted least squares give level, slope and day of the onset; an onset at the first check makes a straight line. The residuals give
+    the scale. The interval holds every day on which the limit may be reached without a significantly worse fit (likelihood ratio, F with
+    1 and n - 3 degrees of freedom). It does not cover a later change of the machine's behaviour.
     """
     n = len(values)
     if limit is None:
@@ -234,7 +237,7 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     if n < MIN_FIT:
         return Forecast(np.nan, np.nan, np.nan, f"not known: {n} checks are too few")
     if days[-1] <= days[0]:
-        return Forecast(np.nan, np.nan, np.nan, "not known: all checks are of one moment")
+        return Forecast(np.nan, np.nan, np.nan, "not known: all checks were made at the same time")
     sums = _Sums.of(days - days[-1], values - limit, 1.0 / u**2)
     left = sums.left()
     best = int(np.argmin(left))
@@ -253,13 +256,13 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     if reached == 0.0 and not len(inside):
         return Forecast(0.0, 0.0, 0.0, "", *slope_and_u)
     if reached > ahead[-1] or not len(inside) or inside[-1] == len(ahead) - 1:
-        return Forecast(np.nan, np.nan, np.nan, "not known: it may be very long", *slope_and_u)
+        return Forecast(np.nan, np.nan, np.nan, "not known: it may take very long", *slope_and_u)
     return Forecast(reached, float(ahead[max(inside[0] - 1, 0)]), float(ahead[inside[-1] + 1]), "", *slope_and_u)
 
 
 @dataclass(frozen=True)
 class _Sums:
-    """Weighted sums for a level with a ramp from each of several days on (``knots``); figures are counted from the limit."""
+    """Weighted sums for fits of a level and a ramp that starts at one of several days (``knots``); figures count from the limit."""
 
     knots: F1
     w: float
@@ -271,7 +274,7 @@ class _Sums:
 
     @staticmethod
     def of(days: F1, y: F1, w: F1) -> _Sums:
-        last = days[-3]  # an onset after it would be two checks and a guess
+        last = days[-3]  # a later onset would rest on two checks only
         candidates = np.concatenate([days[days <= last], (days[1:] + days[:-1])[days[1:] <= last] / 2])
         knots = np.unique(np.concatenate([[days[0]], candidates]))
         knots = knots[np.unique(np.linspace(0, len(knots) - 1, min(len(knots), MOST_KNOTS)).round().astype(int))]
@@ -285,11 +288,11 @@ class _Sums:
         return np.asarray((self.y - self.slope() * self.r) / self.w, dtype=np.float64)
 
     def left(self) -> F1:
-        """Weighted sum of squares that is left, for each knot."""
+        """Return the weighted residual sum of squares for each knot."""
         return np.asarray(self.yy - self.level() * self.y - self.slope() * self.yr, dtype=np.float64)
 
     def squares_if(self, reached: F1) -> F1:
-        """Smallest sum of squares if the limit is reached on each of these days, over all knots."""
+        """Return, for each day, the smallest residual sum of squares over all knots if the limit is reached on that day."""
         s = 1.0 / (reached[:, None] - self.knots[None, :])
         level2 = (self.y - s * self.yr) ** 2 / (self.w - 2 * s * self.r + s**2 * self.rr)
         return np.asarray((self.yy - level2).min(axis=1), dtype=np.float64)

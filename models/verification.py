@@ -11,12 +11,12 @@ from abbe.models.solvers.observations import RunData, bar_normals, nominal_readi
 from abbe.models.solvers.priors import U_WAVELENGTH
 
 U_REPEAT_MM = 1e-4
-"""Repeatability of a re-mounted ball-bar's shape reading, an assumption until repeats are measured."""
+"""Repeatability of the helix figure after mounting the ball-bar again: assumed, not measured."""
 
 
 @dataclass(frozen=True)
 class VerificationFigure:
-    """A measured figure, mm, its standard uncertainty, and the curve it comes from (position along the test, deviation; mm)."""
+    """A figure and its standard uncertainty, and the curve behind it: deviation over position along the test (helix: index), all mm."""
 
     value_mm: float
     u_mm: float
@@ -25,10 +25,10 @@ class VerificationFigure:
 
 
 def diagonal_figure(run: RunData) -> VerificationFigure:
-    """Range of the mean of out and back along a body diagonal, with its uncertainty (ISO 230-6 style).
+    """Return the range of the mean deviation (out and back) along a body diagonal, with its uncertainty (ISO 230-6 style).
 
-    The scatter of half the difference out - back about its mean (which is lost motion) gives the noise; the wavelength adds its share of
-    the length. Positions are matched by their place on the line, so a missing reading removes only its own pair.
+    Half the difference out - back is lost motion; its scatter gives the noise. The wavelength adds an uncertainty proportional to the
+    length. Readings are paired by their position on the line, so a missing reading removes only its own pair.
     """
     assert run.beam is not None
     s = np.round((run.axes_mm - run.axes_mm[0]) @ run.beam, 4)
@@ -41,16 +41,16 @@ def diagonal_figure(run: RunData) -> VerificationFigure:
         raise ValueError(f"run {run.label}: fewer than 3 positions were measured out and back")
     mean = np.array([(out[p] + back[p]) / 2 for p in both])
     half = np.array([(out[p] - back[p]) / 2 for p in both])
-    scatter = float(np.std(half, ddof=1))  # of a mean of two readings, like the mean itself
+    scatter = float(np.std(half, ddof=1))  # a mean of two readings has the same scatter
     length = both[-1] - both[0]
     return VerificationFigure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), np.array(both), mean)
 
 
 def helix_figure(run: RunData) -> VerificationFigure:
-    """Rms of the bar deviation after the cup offset and the bar length are fitted away; abscissa: path index.
+    """Return the rms of the ball-bar deviation after a fit of cup offset and bar length, with its uncertainty; abscissa: path index.
 
-    What is left is the machine's error about this centre, not the mounting. Uncertainty: the noise of the block means (second
-    differences) through the rms, and `U_REPEAT_MM`.
+    The fit removes the mounting and leaves the machine's error about this centre. The uncertainty combines the noise of the block means
+    (from second differences) and `U_REPEAT_MM`.
     """
     n = bar_normals(run)
     a = np.concatenate([n, np.ones((len(n), 1))], axis=1)

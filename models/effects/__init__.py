@@ -1,1 +1,1 @@
-"""Physical effects beyond the smooth error motions: one file each, declared so that one runner tests them all."""
+"""Physical effects beyond the smooth error motions: one file per effect; `self_test` checks all their declarations."""

@@ -1,4 +1,4 @@
-"""All effects that Abbe knows by name, in the order of effects.md."""
+"""All effects that Abbe knows by name."""
 
 from __future__ import annotations
 

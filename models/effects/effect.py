@@ -1,4 +1,4 @@
-"""Declaration of an effect: everything that discovery, reports and self-test need."""
+"""Declaration of a physical effect: everything that discovery, reports and the self-test need to know of it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from abbe.models.arrays import F1, F2
 from abbe.models.effects.path import Path
 
 Values = Mapping[str, float]
-"""Non-linear parameters of an effect by name."""
+"""Values of the non-linear parameters of an effect, by name."""
 Signal = Callable[[tuple[Path, ...], str, Values], list[F2]]
-"""Columns of all runs for one key: one array (n, k) per path, mm per unit of each of k coefficients; zeros where the run is blind to it."""
+"""From runs, key and non-linear parameters to one array (n, k) per run: mm per unit of each of k coefficients. Runs that cannot show the
+effect get zeros."""
 Family = Literal["drive", "structure", "thermal", "instrument", "geometry"]
 Remedy = Literal["table", "control parameter", "mechanics", "warm up or sensor", "set-up"]
-"""Who can take it out: a static table, a parameter of the control, a fitter, temperature control, mounting the instrument anew."""
+"""What removes an effect: a compensation table, a parameter of the control, a fitter's work, temperature control, a better set-up."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One non-linear parameter: physical bounds, usual range with its source, and starts of a search."""
+    """A non-linear parameter: physical bounds, usual value and its source, and start values of the search."""
 
     name: str
     unit: str
@@ -33,9 +34,9 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A freedom of form that belongs to an effect once it is there (a machine's backlash is not a textbook's): more columns, lower price.
+    """A deviation of an effect from its textbook form: further columns that the search may add once the effect itself is found.
 
-    ``signal`` as of the effect, for its key and its non-linear parameters. Never a name of its own.
+    ``signal`` takes the key and the non-linear parameters of the effect. A form is never reported as an effect of its own.
     """
 
     name: str
@@ -44,46 +45,53 @@ class Form:
 
 @dataclass(frozen=True)
 class Effect:
-    """One physical effect.
+    """A physical effect, with its first-order signal and the texts for its report.
 
     Attributes
     ----------
     name : str
-        Of run-format.md 5, e.g. ``"backlash"``; a label is ``name:key`` or, without keys, the name alone.
+        E.g. ``"backlash"``; the label is ``name:key`` or, without keys, the name alone.
     title : str
         The field's term, for people.
-    family : which part of the machine it belongs to.
+    family : Family
+        Part of the machine to which it belongs.
     keys : tuple of str
         Axes, components or planes at which it may occur; ``("",)`` if there is only one.
     unit : str
-        Of the strength: ``"um"``, ``"urad"``, ``"ms"``, ``"K"``, ``"K/h"`` or ``"mrad"`` (run-format.md 5).
+        Unit of the strength: ``"um"``, ``"urad"``, ``"ms"``, ``"K"``, ``"K/h"`` or ``"mrad"``.
     per_unit : float
-        Coefficient (of the columns of ``signal``) per unit of strength, where the strength is ``strength(coefficients) / per_unit``.
+        The stated strength is ``strength(coefficients, values) / per_unit``.
     typical : tuple of float
-        Usual range of the strength's size, its unit, with its ``source``.
+        Usual range of the absolute strength, in ``unit``.
     shape : tuple of Parameter
         Non-linear parameters.
     signal : Signal
-        First-order reading. Exactly zero for zero coefficients; linear in them.
+        Columns of the first-order reading.
     strength : function (coefficients (k,), non-linear values) -> float
-        Signed strength in ``unit``. The strength is linear or a norm of the coefficients.
+        Signed strength in ``unit``: linear in the coefficients, or a norm of them.
+    needs : str
+        What a campaign must contain to show the effect.
+    signature : str
+        How the effect looks in the readings.
+    remedy, remedy_text : Remedy, str
+        What removes it, in one word and as advice to the operator.
+    source : str
+        Paper, standard or model behind it.
     forms : tuple of Form
     unseen : tuple of float
-        Whole strength over that of the columns, and its standard uncertainty, where the columns leave out what the present model absorbs
-        of the effect (the line of a straightness); the stated strength includes it.
+        Ratio of the whole strength to that of the columns, and its standard uncertainty, where the present model absorbs a part of the
+        effect (e.g. the line of a straightness). The stated strength includes this part.
     kind : "mean" | "variance"
-        Whether it moves the readings or makes them noisier (stick-slip, vibration with an unknown phase, outliers); a "variance" effect's
-        ``signal`` says where: its columns are non-negative weights of the extra variance per reading.
+        Whether it shifts the readings or makes them noisier (stick-slip, vibration with an unknown phase, outliers). The columns of a
+        "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative.
     absorbed_by : tuple of str
-        Entries of ``current_model.includes`` that make it part of the present model (then it is not a candidate).
-    needs : what a campaign must contain to show it, for people. blind : tests that cannot show it.
-    signature, remedy_text : for people: how it looks, what to do at the machine.
-    remedy : part of the machine or control that can remove it.
+        Entries of ``current_model.includes`` with which it is part of the present model and no candidate.
+    blind : tuple of str
+        Tests that cannot show it.
     variant_of : str
-        Name of a simpler effect that this one contains, with a freedom of its own; preferred only if the evidence is clear.
+        Name of a simpler effect which this one contains. It replaces the simpler one only on clear evidence.
     separated_by : dict
-        Rival (name, or name:key) -> what to add (``next_test.adds`` of run-format.md 5) to tell the two apart.
-    source : paper, standard or effects.md section.
+        From a rival (name, or name:key) to the tests that tell the two apart (``next_test.adds``).
     """
 
     name: str
@@ -110,5 +118,5 @@ class Effect:
     separated_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def label(self, key: str) -> str:
-        """``name:key``, or the name alone."""
+        """Return ``name:key``, or the name alone if the key is empty."""
         return f"{self.name}:{key}" if key else self.name

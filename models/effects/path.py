@@ -1,4 +1,4 @@
-"""A run as effects need it: positions, velocities, reversals, clock, and measuring direction of the instrument."""
+"""A run without its readings, as effects need it: positions, velocities, reversals, times, and direction of measurement."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from abbe.models.machine import Machine
 
 Kind = Literal["bar", "laser"]
 FAR_MM = 1e9
-"""Travel since the last reversal of an axis that has not reversed yet."""
+"""Stands for the travel since the last reversal if an axis has not reversed yet."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Position and motion of the tool, one row per time: all that an effect of the machine may depend on.
+    """Position and motion of the tool, one row per time: all on which an effect of the machine may depend.
 
     Attributes
     ----------
@@ -34,9 +34,9 @@ class Places:
     v_mm_s, a_mm_s2 : array, shape (n, 3)
         Commanded velocity and acceleration; zero where the machine dwells.
     t_s : array, shape (n,)
-        Campaign clock.
+        Campaign time.
     temp_c : dict
-        Temperatures that the run holds, by sensor ("x", "y", "z", "spindle", "air"), shape (n,) each; empty: no sensors.
+        Recorded temperatures, degree C, by sensor ("x", "y", "z", "spindle", "air"), shape (n,) each; empty without sensors.
     """
 
     q_mm: F2
@@ -49,9 +49,9 @@ class Places:
 
     @cached_property
     def commanded_turns(self) -> tuple[F2, F2]:
-        """Direction of the last motion and travel since the last turn, shape (n, 3) each, where axes turn at a commanded position.
+        """``sign`` and ``since_mm``, shape (n, 3) each, if every axis reverses at a commanded position and not between two of them.
 
-        A machine that dwells turns where ``sign`` and ``since_mm`` say: it may have gone beyond a place and come back.
+        A machine that dwells keeps its own ``sign`` and ``since_mm``.
         """
         n = len(self.t_s)
         if n < 2 or not self.v_mm_s.any():
@@ -67,27 +67,29 @@ class Path:
 
     Attributes
     ----------
-    label, setup, test : names of run, set-up and test (run-format.md 3).
+    label, setup, test : str
+        Names of run, set-up and test.
     kind : "bar" | "laser"
     machine : Machine
         With the tool of this run.
     vertical : int
-        Index of the axis that gravity acts along (run-format.md 1, ``vertical_axis``).
+        Index of the axis along which gravity acts.
     at : Places
         The path itself.
     reference : Places
-        Zero of the reading, one row: cup set with the spindle (bar: at the centre, at ``t_set_s``, standing, from
-        no known direction), or the first record (laser).
+        Where the reading is zero, one row. Ball-bar: the centre, where the spindle set the cup at ``t_set_s``, standing, approached from an
+        unknown direction. Laser: the first record.
     look : array, shape (n, 3)
-        Direction of measurement, unit vector: cup to tool, or beam; change of the reading per mm of deviation, to first order.
+        Direction of measurement, unit vector from cup to tool or along the beam: the reading per mm of deviation, to first order.
     feed_mm_min, direction : array, shape (n,)
     travel_mm : array, shape (n,)
         Nominal displacement along the beam since the first record; zero for a bar.
     t_set_s : float
-        When the set-up was mounted and zeroed, campaign clock.
+        Campaign time at which the set-up was mounted and zeroed.
     dead_path_mm : float
-        Laser path outside of the measured travel.
-    radius_mm, centre_mm : of the bar; 0 and zeros for a laser.
+        Length of the laser path outside the measured travel.
+    radius_mm, centre_mm : float, array, shape (3,)
+        Of the ball-bar's sphere; zero for a laser.
     """
 
     label: str
@@ -113,7 +115,7 @@ class Path:
         return len(self.at.t_s)
 
     def read(self, deviation: Callable[[Places], F3]) -> F2:
-        """Reading of a deviation of the tool from the workpiece, first order (effects.md, "First-order observables").
+        """Return the first-order reading of a deviation of the tool relative to the workpiece.
 
         Parameters
         ----------
@@ -123,13 +125,13 @@ class Path:
         Returns
         -------
         array, shape (n, k)
-            Reading, mm: ``look . (deviation at the place - deviation at the reference)``.
+            Reading, mm: ``look . (deviation(at) - deviation(reference))``.
         """
         return np.asarray(np.einsum("ni,nik->nk", self.look, deviation(self.at) - deviation(self.reference)))
 
 
 def read_together(paths: Sequence[Path], deviation: Callable[[Places], F3]) -> list[F2]:
-    """`Path.read` of all runs at once, for a deviation that depends on every row of `Places` alone and on no temperature."""
+    """Return `Path.read` of all runs at once, for a deviation that treats each row of `Places` alone and uses no temperature."""
     if not paths:
         return []
     found = deviation(_joined([*(p.at for p in paths), *(p.reference for p in paths)]))
@@ -140,33 +142,33 @@ def read_together(paths: Sequence[Path], deviation: Callable[[Places], F3]) -> l
 
 
 def _joined(parts: Sequence[Places]) -> Places:
-    """One after the other, without temperatures."""
+    """Concatenate places, without temperatures."""
     columns = [[p.q_mm, p.sign, p.since_mm, p.v_mm_s, p.a_mm_s2] for p in parts]
     q, sign, since, v, a = (np.concatenate(c) for c in zip(*columns, strict=True))
     return Places(q, sign, since, v, a, np.concatenate([p.t_s for p in parts]), {})
 
 
 RUN_IN = 2
-"""Positions before the first reading that are made up from the motion after it."""
+"""Number of positions that `run_in` extrapolates before the first reading."""
 
 
 def driven(q_mm: F2, t_s: F1, feed_mm_min: F1, *, dwelling: bool, temp_c: Mapping[str, F1]) -> Places:
-    """Places of a sequence of commanded positions.
+    """Return the `Places` of a sequence of commanded positions, mm, at times ``t_s``.
 
-    A moving axis turns between two samples; where, is read from the velocities on both sides (constant acceleration between them), because
-    the travel since then decides what backlash and friction do to the next samples.
+    A moving axis reverses between two samples. The velocities on both sides give the position, at constant acceleration; backlash and
+    friction in the next samples depend on the travel from there.
 
     Parameters
     ----------
     dwelling : bool
-        The machine stands at every position (step tests): no velocity, no acceleration. Else velocity is the motion between samples,
-        scaled to the commanded feed where the samples are rounded.
+        Whether the machine stands at every position (step tests): velocity and acceleration are then zero. Otherwise the velocity has the
+        direction of the path and the size of the commanded feed.
     """
     v, a = np.zeros_like(q_mm), np.zeros_like(q_mm)
     if dwelling or len(t_s) < 3:
         sign = travel_sign(q_mm)
         return Places(q_mm, sign, since_reversal(q_mm, sign), v, a, t_s, temp_c)
-    v = np.asarray(scipy.interpolate.CubicSpline(t_s, q_mm, axis=0)(t_s, 1))  # chords are shorter than arcs: 2 % near a helix's pole
+    v = np.asarray(scipy.interpolate.CubicSpline(t_s, q_mm, axis=0)(t_s, 1))  # chords would give 2 % too little near the pole of a helix
     speed = np.linalg.norm(v, axis=1, keepdims=True)
     v *= np.divide(feed_mm_min[:, None] / 60.0, speed, out=np.ones_like(speed), where=speed > 0)
     a = np.gradient(v, t_s, axis=0, edge_order=2)
@@ -178,18 +180,18 @@ def driven(q_mm: F2, t_s: F1, feed_mm_min: F1, *, dwelling: bool, temp_c: Mappin
 
 
 def run_in(q_mm: F2) -> F2:
-    """The positions with `RUN_IN` more in front, as at constant acceleration: a test may start at the turn of an axis."""
+    """Prepend `RUN_IN` positions, extrapolated at constant acceleration, because a test may start where an axis reverses."""
     before = [q_mm[:1] - k * (q_mm[1:2] - q_mm[:1]) + 0.5 * k * (k + 1) * (q_mm[2:3] - 2.0 * q_mm[1:2] + q_mm[:1]) for k in (2, 1)]
     return np.concatenate([*before, q_mm])
 
 
 def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
-    """Travel of each axis since its last reversal, shape (n, 3); `FAR_MM` before the first.
+    """Return the travel of each axis since its last reversal, mm, shape (n, 3); `FAR_MM` before the first.
 
     Parameters
     ----------
     step_mm : array, shape (n, 3), optional
-        Motion per sample at every sample: the axis turns between two samples, where it comes to rest. None: it turns at a sample.
+        Motion per sample, at every sample. With it an axis reverses between two samples, where it comes to rest; without it, at a sample.
     """
     travel = np.abs(np.diff(q_mm, axis=0, prepend=q_mm[:1])).cumsum(axis=0)
     out = np.full(q_mm.shape, FAR_MM)
@@ -206,6 +208,6 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
 
 
 def at_rest(q_mm: F1, t_s: float, temp_c: Mapping[str, F1]) -> Places:
-    """Places with one row: the machine stands, its approach is unknown."""
+    """Return `Places` with one row: the machine stands, and its direction of approach is unknown."""
     rest = np.zeros((1, 3))
     return Places(q_mm[None], rest, np.full((1, 3), FAR_MM), rest, rest, np.array([t_s]), temp_c)

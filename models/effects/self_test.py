@@ -1,7 +1,4 @@
-"""What every effect must keep, built-in or plug-in: one runner, one line per fault, on a small campaign made up for tests.
-
-The campaign has every kind of test, both directions, two feeds, two radii, and runs early and late.
-"""
+"""Check that an effect, built-in or plug-in, keeps the rules of its declaration; its columns are tried on a small synthetic campaign."""
 
 from __future__ import annotations
 
@@ -39,24 +36,30 @@ SENSORS = ("x", "y", "z", "spindle", "air")
 
 
 def declaration_faults(effect: Effect) -> tuple[str, ...]:
-    """Faults of an effect's declaration; empty if there are none. No column is computed."""
+    """Return one message per fault of an effect's declaration; no column is computed."""
     texts = {n: getattr(effect, n) for n in ("title", "needs", "signature", "remedy_text", "source")}
     low, high = effect.typical
     checks = [
         (bool(NAME.fullmatch(effect.name)), f"name {effect.name!r}: lower-case letters, digits and _ expected"),
-        (bool(effect.keys) and len(set(effect.keys)) == len(effect.keys), "keys: at least one, each once"),
+        (bool(effect.keys) and len(set(effect.keys)) == len(effect.keys), f"keys {effect.keys}: at least one, each only once, expected"),
         (all(KEY.fullmatch(k) for k in effect.keys), f"keys {effect.keys}: X, EYX, EAX, XY, ZX, YZ or nothing expected"),
         (effect.unit in UNITS, f"unit {effect.unit!r}: one of {', '.join(UNITS)} expected"),
-        (effect.per_unit > 0.0, "per_unit: must be positive"),
-        (0.0 < low <= high, f"typical {effect.typical}: smaller and larger size expected"),
+        (effect.per_unit > 0.0, f"per_unit {effect.per_unit}: must be positive"),
+        (0.0 < low <= high, f"typical {effect.typical}: two positive numbers, the smaller first, expected"),
         (effect.family in get_args(Family), f"family {effect.family!r}: one of {', '.join(get_args(Family))} expected"),
         (effect.remedy in get_args(Remedy), f"remedy {effect.remedy!r}: one of {', '.join(get_args(Remedy))} expected"),
         (effect.kind in ("mean", "variance"), f"kind {effect.kind!r}: mean or variance expected"),
-        (set(effect.blind) < set(TESTS), f"blind {effect.blind}: some, not all, of {', '.join(TESTS)} expected"),
-        (all(set(v) <= set(ADDS) and v for v in effect.separated_by.values()), f"separated_by: only {', '.join(ADDS)}"),
-        *((bool(text.strip()), f"{n}: must say something") for n, text in texts.items()),
+        (set(effect.blind) < set(TESTS), f"blind {effect.blind}: only names from {', '.join(TESTS)}, and not all of them, expected"),
+        (
+            all(set(v) <= set(ADDS) and v for v in effect.separated_by.values()),
+            f"separated_by: for each rival one or more of {', '.join(ADDS)} expected",
+        ),
+        *((bool(text.strip()), f"{n}: must not be empty") for n, text in texts.items()),
         *(
-            (p.low <= min(p.starts) <= max(p.starts) <= p.high and p.low <= p.typical <= p.high and p.low < p.high, f"{p.name}: {p}")
+            (
+                p.low <= min(p.starts) <= max(p.starts) <= p.high and p.low <= p.typical <= p.high and p.low < p.high,
+                f"parameter {p.name}: low < high, and typical and all starts between them, expected; got {p}",
+            )
             for p in effect.shape
         ),
     ]
@@ -64,7 +67,7 @@ def declaration_faults(effect: Effect) -> tuple[str, ...]:
 
 
 def signal_faults(effect: Effect, paths: tuple[Path, ...]) -> tuple[str, ...]:
-    """Faults of the columns of an effect and of its forms on some paths; empty if there are none."""
+    """Return one message per fault of the columns of an effect and its forms on the given paths."""
     out: list[str] = []
     for name, signal in (("signal", effect.signal), *((f"form {f.name}", f.signal) for f in effect.forms)):
         for key, values in itertools.product(effect.keys, corners(effect)):
@@ -76,7 +79,7 @@ def signal_faults(effect: Effect, paths: tuple[Path, ...]) -> tuple[str, ...]:
 
 
 def corners(effect: Effect) -> Iterable[Values]:
-    """Values of the non-linear parameters to try: usual ones, and both ends of the bounds."""
+    """Return values of the non-linear parameters to try: the typical ones, all lower bounds, all upper bounds."""
     sets: list[Mapping[str, float]] = [{p.name: p.typical for p in effect.shape}]
     if effect.shape:
         sets += [{p.name: p.low for p in effect.shape}, {p.name: p.high for p in effect.shape}]
@@ -87,14 +90,18 @@ def _faults(effect: Effect, signal: Signal, paths: tuple[Path, ...], key: str, v
     columns = signal(paths, key, values)
     shape = [np.shape(c) for c in columns]
     if len(columns) != len(paths) or any(len(s) != 2 or s[0] != p.n or s[1] != shape[0][1] for s, p in zip(shape, paths, strict=False)):
-        return [f"one array (readings, coefficients) per run expected, the same number of coefficients in all, got {shape}"]
+        return [f"one array of shape (readings, coefficients) per run expected, with equally many coefficients; got shapes {shape}"]
     if not all(np.isfinite(c).all() for c in columns):
-        return ["a value is not finite"]
-    out = [f"declared blind to {p.test} and is not" for p, c in zip(paths, columns, strict=True) if p.test in effect.blind and c.any()][:1]
+        return ["a column holds NaN or infinity"]
+    out = [
+        f"blind names {p.test}, but the columns of that test are not zero"
+        for p, c in zip(paths, columns, strict=True)
+        if p.test in effect.blind and c.any()
+    ][:1]
     if effect.kind == "variance" and any((c < 0.0).any() for c in columns):
-        out.append("extra variance must not be negative")
+        out.append("the extra variance must not be negative")
     if not _same_in_any_order(signal, paths, key, values, columns):
-        out.append("another order of the runs gives other columns")
+        out.append("the columns must not depend on the order of the runs")
     return out
 
 
@@ -104,14 +111,14 @@ def _same_in_any_order(signal: Signal, paths: tuple[Path, ...], key: str, values
 
 
 def probe_paths(machine: Machine = MACHINE, vertical: int = VERTICAL) -> tuple[Path, ...]:
-    """Helices and circles (both directions, two feeds, two radii), step diagonals, a line along X; six hours on the clock.
+    """Return a synthetic campaign of six hours: helices and circles (both directions, two feeds, two radii), step diagonals, a line on X.
 
     Parameters
     ----------
     machine : Machine
-        Its strokes must hold 150 mm around (290, 240, 200).
+        Its strokes must contain a sphere of 150 mm radius about (290, 240, 200) mm.
     vertical : int
-        Axis that gravity acts along.
+        Index of the axis along which gravity acts.
     """
     runs: list[Path] = []
     for k, (feed, direction, radius) in enumerate(((1000.0, 1, 150.0), (1000.0, -1, 150.0), (3000.0, 1, 100.0), (3000.0, -1, 100.0))):
@@ -144,12 +151,12 @@ def _circle(radius_mm: float, plane: int) -> F2:
 
 
 def _warm(t_s: F1) -> dict[str, F1]:
-    """Temperatures of all sensors, degrees C: all rise, each at its own rate."""
+    """Return temperatures of all sensors, degree C: all rise, each at its own rate."""
     return {name: 20.0 + (k + 1) * -np.expm1(-t_s / (1500.0 + 900.0 * k)) for k, name in enumerate(SENSORS)}
 
 
 def _bar(owner: tuple[Machine, int], names: tuple[str, str], q_mm: F2, radius_mm: float, drive: tuple[float, int], start_s: float) -> Path:
-    """``owner``: machine and vertical axis; ``names``: label and test; ``drive``: feed and direction."""
+    """Return a ball-bar run; ``owner``: machine and vertical axis, ``names``: label and test, ``drive``: feed in mm/min and direction."""
     (label, test), (feed, direction), (machine, vertical) = names, drive, owner
     q_mm = q_mm[::direction]
     way: F1 = np.asarray(np.linalg.norm(np.diff(q_mm, axis=0, prepend=q_mm[:1]), axis=1).cumsum(), dtype=np.float64)

@@ -17,14 +17,14 @@ from abbe.models.functions.axis_function import frozen_vector, interval, positio
 class BSpline:
     """value(x) = sum of c_i B_i(x) on knots t, between t[degree] and t[m] (m coefficients).
 
-    Outside this interval the end value is held and the slope is zero, as controllers do; at the ends themselves the slope is the inner
-    one. Where ``degree`` knots coincide the slope may jump: there it is that of the interval to the right.
+    Outside this interval the end value holds and the slope is zero, as in controllers; at the two ends the slope is the one inside.
+    Where ``degree`` knots coincide the slope may jump; ``derivative`` then returns the slope on the right.
 
     Parameters
     ----------
     knots_mm : array, shape (m + degree + 1,)
-        Never decreasing, no knot more than degree times (the function is continuous); only the first and the last may stand
-        degree + 1 times, which makes a clamped spline.
+        Not decreasing. An inner knot occurs at most ``degree`` times, so that the function is continuous; the first and the last may
+        occur ``degree`` + 1 times (clamped spline).
     coefficients : array, shape (m,), m > degree
         mm or rad.
     degree : int, 1 to 9
@@ -42,7 +42,7 @@ class BSpline:
     _slopes: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check once, and keep the spline and its derivative."""
+        """Check the knots and build the spline and its derivative."""
         object.__setattr__(self, "knots_mm", frozen_vector("knots_mm", self.knots_mm))
         object.__setattr__(self, "coefficients", frozen_vector("coefficients", self.coefficients))
         t, m, k = self.knots_mm, self.coefficients.size, self.degree
@@ -54,9 +54,9 @@ class BSpline:
         if often.any():
             knot = float(t[1 + int(np.argmax(often))])
             limit = k + 1 if knot in (t[0], t[-1]) else k
-            raise ValueError(f"bspline: knot {knot:g} stands more than {limit} times (inner knots {k} at most, first and last {k + 1})")
+            raise ValueError(f"bspline: knot {knot:g} occurs more than {limit} times (inner knots at most {k}, first and last {k + 1})")
         if not t[k] < t[m]:
-            raise ValueError(f"bspline: knots_mm must rise from knot {k + 1} to knot {m + 1}, where the function is stated")
+            raise ValueError(f"bspline: knots_mm must rise from knot {k + 1} to knot {m + 1}, the ends of the function's domain")
         object.__setattr__(self, "_spline", scipy.interpolate.BSpline(t, self.coefficients, k))
         with np.errstate(over="ignore"):
             object.__setattr__(self, "_slopes", self._spline.derivative())
@@ -98,14 +98,14 @@ class BSpline:
         return replace(self, coefficients=same_size(parameters, self.coefficients))
 
     def plus_line(self, offset: float, slope: float) -> BSpline:
-        """This spline + offset + slope * x_mm: a B-spline holds a line exactly with the means of ``degree`` neighbouring knots."""
+        """Return this spline + offset + slope * x_mm, exactly: the coefficients of x_mm are the means of ``degree`` neighbouring knots."""
         k, m = self.degree, self.coefficients.size
         greville = np.array([self.knots_mm[i + 1 : i + k + 1].mean() for i in range(m)])
         return replace(self, coefficients=self.coefficients + offset + slope * greville)
 
 
 def clamped_knots(stroke_mm: ArrayLike, pieces: int, degree: int = 3) -> F1:
-    """Knots of equal distance over a stroke, ends repeated, for ``pieces`` intervals: ``pieces + degree`` coefficients.
+    """Return the knots, mm, of a clamped spline with ``pieces`` equal intervals over a stroke: it has ``pieces + degree`` coefficients.
 
     Raises
     ------

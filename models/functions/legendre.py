@@ -14,7 +14,7 @@ from abbe.models.functions.axis_function import frozen_vector, interval, positio
 
 
 def legendre_values(x_mm: F1, stroke_mm: ArrayLike, order: int) -> F2:
-    """Legendre polynomials P0..P_order over the stroke, shape (n, order + 1); the end value is held outside the stroke."""
+    """Return Legendre polynomials P0..P_order over the stroke, shape (n, order + 1); outside the stroke the end value holds."""
     return np.asarray(legendre.legvander(_unit(np.asarray(x_mm, dtype=np.float64), stroke_mm), order), dtype=np.float64)
 
 
@@ -27,7 +27,7 @@ def _unit(x_mm: F1, stroke_mm: ArrayLike) -> F1:
 class Legendre:
     """value(x) = sum of c_k P_k(u), u = -1 at the start and +1 at the end of the stroke.
 
-    Outside the stroke the end value is held and the slope is zero, as controllers do; at the ends themselves the slope is the inner one.
+    Outside the stroke the end value holds and the slope is zero, as in controllers; at the two ends the slope is the one inside.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Legendre:
     _slopes: F1 = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check once, and keep the derivative's coefficients, per mm."""
+        """Check the numbers and compute the derivative's coefficients, per mm."""
         object.__setattr__(self, "coefficients", frozen_vector("coefficients", self.coefficients))
         object.__setattr__(self, "stroke_mm", interval("stroke_mm", self.stroke_mm))
         per_mm = 2.0 / (self.stroke_mm[1] - self.stroke_mm[0])
@@ -54,7 +54,7 @@ class Legendre:
 
     @property
     def domain_mm(self) -> tuple[float, float]:
-        """Range of definition: the stroke."""
+        """The stroke."""
         return self.stroke_mm
 
     @property
@@ -91,7 +91,7 @@ class Legendre:
         return replace(self, coefficients=same_size(parameters, self.coefficients))
 
     def plus_line(self, offset: float, slope: float) -> Legendre:
-        """This series + offset + slope * x_mm; a constant gets a second coefficient when it needs one."""
+        """Return this series + offset + slope * x_mm; a constant gets a second coefficient if needed."""
         lo, hi = self.stroke_mm
         coefficients = np.zeros(max(self.coefficients.size, 2 if slope != 0.0 else 1))
         coefficients[: self.coefficients.size] = self.coefficients

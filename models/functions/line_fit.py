@@ -1,4 +1,4 @@
-"""Least-squares straight lines through measured errors: Pahk's m[.] (math.md 2.1), Yang's Table 3 (math.md 8)."""
+"""Least-squares straight lines through measured errors: Pahk's slope m[.], Yang and Kim's Tables 2 and 3."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from abbe.models.arrays import F1
 
 
 def straight_line(x: F1, y: F1) -> tuple[float, float]:
-    """Ordinary least-squares line through points.
+    """Fit an ordinary least-squares line.
 
     Parameters
     ----------
@@ -29,25 +29,25 @@ def straight_line(x: F1, y: F1) -> tuple[float, float]:
     centred = a - a.mean()
     power = float(centred @ centred)
     if power == 0.0:
-        raise ValueError("straight line: it takes at least two different positions")
+        raise ValueError("straight line: at least two different positions are needed")
     slope = float(centred @ b) / power
     return slope, float(b.mean() - slope * a.mean())
 
 
 def slope_through_origin(x: F1, y: F1) -> float:
-    """Least-squares slope of the line through (0, 0): what Yang and Kim's Table 2 holds for the laser (math.md 8).
+    """Return the least-squares slope of a line through (0, 0), as in the laser columns of Yang and Kim's Table 2.
 
-    Shapes, units and errors as in `straight_line`; one position other than zero is enough.
+    Shapes, units and errors as in `straight_line`, but one position other than zero is enough.
     """
     a, b = _pair(x, y)
     power = float(a @ a)
     if power == 0.0:
-        raise ValueError("slope through the origin: it takes at least one position other than zero")
+        raise ValueError("slope through the origin: at least one position other than zero is needed")
     return float(a @ b) / power
 
 
 def _pair(x: F1, y: F1) -> tuple[F1, F1]:
     a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if a.ndim != 1 or a.shape != b.shape or a.size == 0:
-        raise ValueError(f"straight line: positions {a.shape} and values {b.shape} do not fit together")
+        raise ValueError(f"straight line: positions and values must be vectors of one length, got shapes {a.shape} and {b.shape}")
     return a, b

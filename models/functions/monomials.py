@@ -1,7 +1,7 @@
-"""The 21 error functions as powers of u = position / travel, the form in which the papers' reference vectors state a machine (math.md 4.6).
+"""The 21 error functions as powers of u = position / travel: the form in which the reference vectors of the papers state a machine.
 
-Positioning and angles have powers 1..d, straightness 2..d, squareness one value: 18 d - 3 coefficients. Both papers' letters fit: delta_ij
-and eps_ij (Yang), delta_i(J) and alpha_i(J) (Wang); `abbe.models.notation` converts their signs.
+Positioning and angles have powers 1..d, straightness 2..d, squareness one value: 18 d - 3 coefficients. The indices are those of Yang
+(delta_ij, eps_ij) and Wang (delta_i(J), alpha_i(J)); `abbe.models.notation` converts signs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SQUARENESS = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, slots=True)
 class Monomial:
-    """Coefficient of u_j**power in delta_ij ("d", mm), eps_ij ("e", rad) or, "S" with power 1, the squareness of axes i and j (rad)."""
+    """One term: u_j**power in delta_ij (kind "d", mm) or eps_ij ("e", rad), or the squareness of axes i and j ("S", rad, power 1)."""
 
     kind: Kind
     i: int
@@ -29,16 +29,16 @@ class Monomial:
 
     @property
     def name(self) -> str:
-        """Name as the vector files write it: ``dxx^1``, ``ezy^2``, ``Sxy^1``."""
+        """Name in the reference-vector files: ``dxx^1``, ``ezy^2``, ``Sxy^1``."""
         return f"{self.kind}{'xyz'[self.i]}{'xyz'[self.j]}^{self.power}"
 
 
 @dataclass(frozen=True)
 class ErrorArrays:
-    """Values at n positions.
+    """Error values at n positions.
 
-    ``d`` and ``e``, shape (n, 3, 3): ``[:, i, j]`` in direction (about axis) i of the motion along j, mm and rad; ``s``, shape (3,):
-    squareness xy, xz, yz in rad.
+    ``d`` (mm) and ``e`` (rad), shape (n, 3, 3): element ``[:, i, j]`` is the error along (about) axis i of the motion along axis j.
+    ``s``, shape (3,): squareness xy, xz, yz in rad.
     """
 
     d: F3
@@ -47,7 +47,7 @@ class ErrorArrays:
 
 
 def monomials(degree: int) -> tuple[Monomial, ...]:
-    """All 18 degree - 3 monomials: delta_ij by moving axis, then eps_ij by moving axis, then squareness (order of the reference vectors).
+    """Return all 18 degree - 3 monomials in the order of the reference vectors: delta_ij and eps_ij by moving axis, then squareness.
 
     Raises
     ------
@@ -67,16 +67,16 @@ def monomials(degree: int) -> tuple[Monomial, ...]:
 
 
 def error_arrays(terms: tuple[Monomial, ...], theta: F1, u: F2, angle_scale: float = 1.0) -> ErrorArrays:
-    """Error functions of given coefficients.
+    """Evaluate error functions with given coefficients.
 
     Parameters
     ----------
     terms, theta : tuple of Monomial, array of shape (len(terms),)
-        Coefficients: mm for translations; rad for angles and squareness, times ``1 / angle_scale``.
+        Coefficients: mm for translations, rad / ``angle_scale`` for angles and squareness.
     u : array, shape (n, 3)
         Position over travel of each axis.
     angle_scale : float
-        Factor on the coefficients of angles and squareness: 1/500 for those of the reference vectors, which are stated times 500 mm.
+        Factor on the coefficients of angles and squareness. The reference vectors multiply these by 500 mm; for them it is 1/500.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def error_arrays(terms: tuple[Monomial, ...], theta: F1, u: F2, angle_scale: flo
         Numbers of terms and coefficients differ.
     """
     if theta.shape != (len(terms),):
-        raise ValueError(f"error functions: {len(terms)} terms need as many coefficients, got shape {theta.shape}")
+        raise ValueError(f"error functions: expected {len(terms)} coefficients, one per term, got shape {theta.shape}")
     n = u.shape[0]
     d, e, s = np.zeros((n, 3, 3)), np.zeros((n, 3, 3)), np.zeros(3)
     for t, c in zip(terms, theta, strict=True):
@@ -98,13 +98,15 @@ def error_arrays(terms: tuple[Monomial, ...], theta: F1, u: F2, angle_scale: flo
 
 
 def individual_terms(terms: tuple[Monomial, ...], u: F2, angle_scale: float = 1.0) -> list[tuple[slice, ErrorArrays]]:
-    """Functions with one coefficient 1 and the others 0, for every coefficient in as few batches as possible: a design needs them all.
+    """Evaluate each term alone with coefficient 1, in as few batches as possible: the columns of a design matrix.
+
+    Parameters are those of `error_arrays`.
 
     Returns
     -------
-    list of (terms, arrays)
-        ``terms``: which of the terms; ``arrays``: their values one term after the other, k n positions for k terms. Squareness, which has
-        one value per batch, comes in batches of one term.
+    list of (slice, ErrorArrays)
+        Which terms the batch holds, and their values one term after the other: k n positions for k terms. `ErrorArrays` hold one
+        squareness each, so every squareness term is a batch of its own.
     """
     n, out = u.shape[0], []
     functions = next((k for k, t in enumerate(terms) if t.kind == "S"), len(terms))

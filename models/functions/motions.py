@@ -1,4 +1,4 @@
-"""A machine's 21 error motions: six functions for each axis, three squarenesses, and what differs after a reversal."""
+"""The 21 error motions of a machine: six functions per axis, which may depend on the direction of motion, and three squareness errors."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from abbe.models.functions.table import Table
 from abbe.models.machine import AXES
 
 PASSES = 2
-"""Number of passes: the first removes the line, the second what rounding left of it."""
+"""The second pass removes the rest that rounding leaves after the first."""
 ROTATIONS = ("A", "B", "C")
 REVERSE = "@reverse"
 SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
-"""Axis, component and sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/explanation/conventions.md)."""
+"""Moving axis, component, sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/explanation/conventions.md)."""
 _SLOPES = {"EXY": ("C0Y", -1.0), "EXZ": ("B0Z", 1.0), "EYZ": ("A0Z", -1.0), "EYX": ("C0Y", -1.0), "EZX": ("B0Z", 1.0), "EZY": ("A0Z", -1.0)}
-"""What the slope of a straightness adds to which squareness (angle of +a and +b less 90 degrees, math.md 1)."""
+"""Squareness to which the slope of a straightness belongs, and the sign."""
 _TURNS = {"EYX": (2, 1.0), "EZX": (1, -1.0), "EZY": (0, 1.0)}
-"""The frame turns about this axis when the slope of the datum's own straightness goes into squareness."""
+"""Axis and sign of the frame's rotation when the slope of a straightness of the datum axes moves into squareness."""
 
 
 def nodes(stroke_mm: tuple[float, float], breaks_mm: F1, count: int) -> tuple[F1, F1]:
-    """Gauss-Legendre nodes and weights over a stroke, piece by piece.
+    """Return Gauss-Legendre nodes and weights over a stroke, piece by piece.
 
     Parameters
     ----------
     stroke_mm : (smaller, larger)
     breaks_mm : array
-        Ends of the pieces, in any order; those outside the stroke do not matter.
+        Ends of the pieces, in any order; those outside the stroke are ignored.
     count : int
         Nodes per piece: integrals of polynomials up to degree 2 count - 1 are exact.
 
@@ -55,7 +55,7 @@ def nodes(stroke_mm: tuple[float, float], breaks_mm: F1, count: int) -> tuple[F1
 
 @dataclass(frozen=True, slots=True)
 class Straightness:
-    """A function without its line, and the line: ``original(x) = function(x) + offset_mm + slope * x_mm``.
+    """A straightness split into a curve and a line: ``original(x) = function(x) + offset_mm + slope * x_mm``.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Straightness:
     offset_mm : float
         Value of the removed line at axis coordinate zero.
     slope : float
-        Slope of the removed line, mm/mm = rad: it belongs to squareness (`abbe.models.functions.motions.ErrorMotions.straightened`).
+        Slope of the removed line, rad; it belongs to squareness (`ErrorMotions.straightened`).
     """
 
     function: AxisFunction
@@ -74,18 +74,17 @@ class Straightness:
 
 @dataclass(frozen=True, slots=True)
 class FromZero:
-    """A function that is zero at its reference, and the constant: ``original(x) = function(x) + constant``."""
+    """A function that is zero at its reference position, and the constant taken off: ``original(x) = function(x) + constant``."""
 
     function: AxisFunction
     constant: float
 
 
 def as_straightness(function: AxisFunction, stroke_mm: ArrayLike) -> Straightness:
-    """Remove the least-squares line over the stroke.
+    """Remove the least-squares line over the stroke from a straightness.
 
-    For polynomials, Legendre series and B-splines the line minimises the INTEGRAL of the squared rest over the stroke, integrated exactly
-    (Gauss-Legendre on every polynomial piece). For a table it minimises the SUM of squares over the table's own positions inside the
-    stroke, which is what instruments do with their readings.
+    For polynomials, Legendre series and B-splines the line minimises the INTEGRAL of the squared residual over the stroke, computed
+    exactly. For a table it minimises the SUM over the table's positions inside the stroke, as instruments do with their readings.
 
     Parameters
     ----------
@@ -112,7 +111,7 @@ def as_straightness(function: AxisFunction, stroke_mm: ArrayLike) -> Straightnes
 
 
 def as_angle(function: AxisFunction, reference_mm: float) -> FromZero:
-    """Make an angular error zero at the axis' reference; the constant is the carriage's resting angle, rad.
+    """Make an angular error zero at a reference position; the constant is the carriage's angle there, rad.
 
     Raises
     ------
@@ -130,12 +129,12 @@ def as_angle(function: AxisFunction, reference_mm: float) -> FromZero:
 
 
 def as_positioning(function: AxisFunction, start_mm: float) -> FromZero:
-    """Make a positioning error zero where the measurement starts; the constant is a zero shift, mm. Errors as in `as_angle`."""
+    """Make a positioning error zero at the start of the measurement; the constant is the error there, mm. Raises as `as_angle`."""
     return as_angle(function, start_mm)
 
 
 def least_squares_line(function: AxisFunction, stroke_mm: ArrayLike) -> tuple[float, float]:
-    """Slope (per mm) and value at axis coordinate zero of the line that `as_straightness` removes; errors as there."""
+    """Return slope (per mm) and value at axis zero of the line that `as_straightness` removes; raises as that does."""
     return _line(function, _inside(function, stroke_mm))
 
 
@@ -163,7 +162,7 @@ def _inside(function: AxisFunction, stroke_mm: ArrayLike) -> tuple[float, float]
 
 
 def motion_names(axis: str) -> tuple[str, ...]:
-    """ISO 230-1 names of the six error motions of an axis, translations first: EXX EYX EZX EAX EBX ECX for X."""
+    """Return the ISO 230-1 names of the six error motions of an axis, for X: EXX EYX EZX EAX EBX ECX."""
     return tuple(f"E{c}{axis}" for c in AXES + ROTATIONS)
 
 
@@ -175,14 +174,14 @@ PLACES: Mapping[str, tuple[int, int]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Straightened:
-    """The same errors with straight axes: deviation before = deviation after + offset_mm + rotation_rad x commanded position (rule G).
+    """Error motions with straight axes: deviation before = deviation after + offset_mm + rotation_rad x commanded position (rule G).
 
     Parameters
     ----------
     motions : ErrorMotions
-        Straightness without line, squareness with all slopes.
+        Straightness without lines; their slopes are in the squareness errors.
     offset_mm, rotation_rad : arrays, shape (3,)
-        Rigid motion of the frame that went with the lines.
+        Rigid motion of the frame that came with the lines.
     """
 
     motions: ErrorMotions
@@ -192,18 +191,18 @@ class Straightened:
 
 @dataclass(frozen=True, eq=False)
 class ErrorMotions:
-    """Error motions as functions of the axes' positions (``abbe-errors/1``, run-format.md 2).
+    """Error motions as functions of the axis positions (file format ``abbe-errors/1``, docs/reference/formats.md).
 
-    Squareness acts on the commanded position, counted from AXIS ZERO (as `travel` does in rule G's levers); a count from the stroke's
-    start, as `abbe.models.geometry.bases` has it, differs by a constant offset of the whole machine.
+    Squareness multiplies the travel from AXIS ZERO. `abbe.models.geometry.bases` counts from the start of the stroke; the two differ by a
+    constant offset of the whole map.
 
     Parameters
     ----------
     functions : mapping
-        ``"EXX"`` .. ``"ECZ"`` in mm or rad; what is missing is zero. ``"EXX@reverse"``: value when the axis last moved in -; without it
-        ``"EXX"`` holds for both directions.
+        ``"EXX"`` .. ``"ECZ"`` in mm or rad; missing ones are zero. ``"EXX@reverse"`` holds after a move in the negative direction;
+        without it ``"EXX"`` holds for both directions.
     squareness_rad : mapping
-        ``"C0Y"``, ``"B0Z"``, ``"A0Z"``; what is missing is zero.
+        ``"C0Y"``, ``"B0Z"``, ``"A0Z"``; missing ones are zero.
 
     Raises
     ------
@@ -215,10 +214,10 @@ class ErrorMotions:
     squareness_rad: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the names once; they cannot change later."""
+        """Check the names and freeze both mappings."""
         for key in self.functions:
             if key.removesuffix(REVERSE) not in PLACES:
-                raise ValueError(f"error motion {key!r}: expected one of {', '.join(PLACES)}, or such a name with {REVERSE}")
+                raise ValueError(f"error motion {key!r}: expected one of {', '.join(PLACES)}, with or without {REVERSE}")
         for key, value in self.squareness_rad.items():
             if key not in SQUARENESS or not np.isfinite(value):
                 raise ValueError(f"squareness {key!r} = {value}: expected a finite number for C0Y, B0Z or A0Z")
@@ -226,15 +225,15 @@ class ErrorMotions:
         object.__setattr__(self, "squareness_rad", MappingProxyType({k: float(v) for k, v in self.squareness_rad.items()}))
 
     def motions(self, axes_mm: ArrayLike, direction: ArrayLike | None = None) -> F3:
-        """Values for `abbe.models.geometry.chain.deviation_mm`, squareness times position included.
+        """Return the error motions at positions, squareness included, as `abbe.models.geometry.chain.deviation_mm` takes them.
 
         Parameters
         ----------
         axes_mm : array, shape (n, 3)
             Commanded positions.
         direction : array, shape (n, 3), optional
-            Sign of each axis' last move, as `abbe.models.geometry.chain.travel_sign` gives it. Below zero the ``@reverse`` functions hold,
-            otherwise, and when left out, the plain ones.
+            Sign of the last move of each axis, as `abbe.models.geometry.chain.travel_sign` returns it. The ``@reverse`` functions hold
+            where it is negative, the plain ones elsewhere; without it, the plain ones everywhere.
 
         Returns
         -------
@@ -258,31 +257,31 @@ class ErrorMotions:
         return out
 
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of all linear parameters: squareness, then ``KEY.k`` with k = 0, 1, ... the coefficient or the row of the table."""
+        """Return the names of all linear parameters: squareness, then ``EXX.k`` with k = 0, 1, ... the coefficient or table row."""
         named = (f"{key}.{k}" for key, function in self.functions.items() for k in range(function.parameters.size))
         return (*SQUARENESS, *named)
 
     def sensitivities(
         self, names: Iterable[str], axes_mm: ArrayLike, direction: ArrayLike | None = None
     ) -> tuple[list[tuple[int, int]], F2]:
-        """Derivative of the error motions at given positions with respect to each parameter.
+        """Return the derivative of the error motions with respect to each parameter at given positions.
 
         Parameters
         ----------
         names : iterable of str
-            As `parameter_names` writes them.
+            Some of `parameter_names`.
         axes_mm, direction
             As in `motions`.
 
         Returns
         -------
         list of (axis, component), and array, shape (n, len(names))
-            The error motion that the parameter acts in, and its derivative with respect to the parameter.
+            The error motion in which each parameter acts, and the derivative of this motion with respect to it.
 
         Raises
         ------
         ValueError
-            A name is not a parameter of these motions, or as in `motions`.
+            A name is not a parameter of these motions, or `motions` would raise.
         """
         axes, signs = _checked(axes_mm, direction)
         wanted, known = tuple(names), set(self.parameter_names())
@@ -306,9 +305,9 @@ class ErrorMotions:
         return places, weights
 
     def straightened(self, stroke_mm: ArrayLike) -> Straightened:
-        """Move all slopes of straightness into squareness; the deviation changes by a rigid motion, which is returned.
+        """Move the slopes of all straightness errors into squareness, and return the rigid motion by which the deviation changes.
 
-        The lines are those of `as_straightness`.
+        `as_straightness` says which lines these are.
 
         Parameters
         ----------
@@ -317,14 +316,14 @@ class ErrorMotions:
         Raises
         ------
         ValueError
-            A straightness depends on the direction (then it has no one slope), or as in `as_straightness`.
+            A straightness depends on the direction and so has two slopes, or `as_straightness` raises.
         """
         strokes = np.asarray(stroke_mm, dtype=np.float64)
         functions, squareness = dict(self.functions), dict.fromkeys(SQUARENESS, 0.0) | dict(self.squareness_rad)
         offset, rotation = np.zeros(3), np.zeros(3)
         for name, (target, sign) in _SLOPES.items():
             if name + REVERSE in functions:
-                raise ValueError(f"{name}{REVERSE}: a straightness that depends on the direction has no one slope")
+                raise ValueError(f"{name}{REVERSE}: a straightness that depends on the direction has two slopes and cannot be straightened")
             if name not in functions:
                 continue
             axis, component = PLACES[name]
@@ -338,7 +337,7 @@ class ErrorMotions:
         return Straightened(ErrorMotions(functions, squareness), offset, rotation)
 
     def _rows(self, key: str, sign: F1) -> slice | np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Points at which a function holds."""
+        """Return the positions at which a function holds."""
         if key.endswith(REVERSE):
             return np.asarray(sign < 0.0)
         return np.asarray(sign >= 0.0) if key + REVERSE in self.functions else slice(None)

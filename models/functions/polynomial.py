@@ -1,4 +1,4 @@
-"""Polynomial error function: the ``polynomial`` of the exchange format (run-format.md 2)."""
+"""Polynomial error function: kind ``polynomial`` of the exchange format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from abbe.models.functions.axis_function import frozen_vector, positions, same_s
 class Polynomial:
     """value(x) = sum of c_k (x - origin)^k.
 
-    It is unbounded: outside any stroke it continues and grows. Callers that must not extrapolate have to check the range of the data.
+    It has no domain limits and grows outside the stroke; a caller that must not extrapolate has to check the positions.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Polynomial:
     _slopes: F1 = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check once, and keep the derivative's coefficients."""
+        """Check the numbers and compute the derivative's coefficients."""
         object.__setattr__(self, "coefficients", frozen_vector("coefficients", self.coefficients))
         object.__setattr__(self, "origin_mm", float(positions(self.origin_mm)))
         object.__setattr__(self, "_slopes", polynomial.polyder(self.coefficients))
@@ -54,7 +54,7 @@ class Polynomial:
 
     @property
     def breaks_mm(self) -> F1:
-        """None: one polynomial everywhere."""
+        """Empty: one polynomial everywhere."""
         return np.empty(0)
 
     @property
@@ -79,7 +79,7 @@ class Polynomial:
         return replace(self, coefficients=same_size(parameters, self.coefficients))
 
     def plus_line(self, offset: float, slope: float) -> Polynomial:
-        """This polynomial + offset + slope * x_mm; a constant gets a second coefficient when it needs one."""
+        """Return this polynomial + offset + slope * x_mm; a constant gets a second coefficient if needed."""
         size = max(self.coefficients.size, 2 if slope != 0.0 else 1)
         coefficients = np.zeros(size)
         coefficients[: self.coefficients.size] = self.coefficients

@@ -1,4 +1,4 @@
-"""Tabulated error function: values at positions, as instruments give them and controllers take them (run-format.md 2)."""
+"""Tabulated error function: values at positions, as instruments deliver and controllers accept them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ Interpolation = Literal["linear", "cubic"]
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Values at positions; between them straight lines or one smooth cubic spline.
+    """Values at positions, with linear or cubic-spline interpolation between them.
 
-    Outside the positions the end value is held and the slope is zero, as controllers do. ``cubic`` is the interpolating spline with
-    continuous second derivative whose first two and last two pieces are one cubic each (not-a-knot); three positions give a parabola,
-    two a line.
+    Outside the positions the end value holds and the slope is zero, as in controllers. ``cubic`` is the not-a-knot cubic spline; with three
+    positions it is a parabola, with two a line.
 
     Parameters
     ----------
@@ -34,7 +33,7 @@ class Table:
     Raises
     ------
     ValueError
-        Positions do not rise, lengths differ, a number is not finite, or no cubic through such values can be written in float64.
+        Positions do not rise, lengths differ, a number is not finite, or the cubic spline overflows float64.
     """
 
     position_mm: F1
@@ -43,11 +42,11 @@ class Table:
     _spline: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check once, and keep the spline."""
+        """Check the numbers and build the spline."""
         object.__setattr__(self, "position_mm", frozen_vector("position_mm", self.position_mm, 2))
         object.__setattr__(self, "value", frozen_vector("value", self.value, 2))
         if self.position_mm.size != self.value.size:
-            raise ValueError(f"table: expected as many values as positions, got {self.value.size} and {self.position_mm.size}")
+            raise ValueError(f"table: expected one value per position, got {self.value.size} values and {self.position_mm.size} positions")
         if (np.diff(self.position_mm) <= 0.0).any():
             row = int(np.argmax(np.diff(self.position_mm) <= 0.0)) + 2
             raise ValueError(f"table: position_mm[{row}] = {self.position_mm[row - 1]:g}: expected positions that rise")
@@ -83,10 +82,9 @@ class Table:
         return np.asarray(self._spline(np.clip(x, *self.domain_mm)), dtype=np.float64)
 
     def derivative(self, x_mm: ArrayLike) -> F1:
-        """Slope per mm at positions of any shape.
+        """Return the slope per mm at positions of any shape.
 
-        A linear table has one slope per interval; at a position of the table it is that of the interval to the RIGHT, at the last
-        position of the one to the left.
+        At a position of a linear table it is the slope of the interval to the RIGHT; at the last position, of the one to the left.
         """
         x, (lo, hi) = positions(x_mm), self.domain_mm
         if self._spline is None:
@@ -97,7 +95,7 @@ class Table:
         return np.where((x >= lo) & (x <= hi), slope, 0.0)
 
     def basis(self, x_mm: F1) -> F2:
-        """Derivative with respect to each value, shape (n, m): hat functions, or the cubic spline through a single 1."""
+        """Return the derivative with respect to each value, shape (n, m): hat functions, or cubic splines through a single 1."""
         x, unit = np.clip(positions(x_mm), *self.domain_mm), np.eye(self.value.size)
         if self._spline is None:
             return np.stack([np.interp(x, self.position_mm, one) for one in unit], axis=-1)
@@ -119,5 +117,5 @@ def _cubic(position_mm: F1, value: F1) -> Any:
     except ValueError:
         spline = None  # scipy's solver met an infinity
     if spline is None or not np.isfinite(spline.c).all():
-        raise ValueError("table: the values are too large, or too steep, for a cubic spline")
+        raise ValueError("table: the values are too large or too steep for a cubic spline; use linear interpolation")
     return spline

@@ -1,1 +1,1 @@
-"""Effects of drives and controls: one file an effect."""
+"""Effects of drives and controls: one file per effect."""

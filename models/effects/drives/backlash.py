@@ -10,11 +10,11 @@ from abbe.models.effects.effect import Effect, Form, Values
 from abbe.models.effects.path import Places
 
 WIND_UP_MM = (0.05, 0.15, 0.5, 2.0)
-"""Travel over which screw, coupling and guide wind up before the carriage follows; far below 0.05 mm the step is a step."""
+"""Lengths over which screw, coupling and guide wind up before the carriage follows, mm; much shorter ones look like a step."""
 
 
 def lost_motion(at: Places, key: str, values: Values) -> F3:
-    """-(B/2) times the direction of the last motion, B = 1 um, after the play itself has been travelled."""
+    """Return -B/2 times the direction of the last motion, B = 1 um; the change takes place while the axis crosses its play."""
     a = axis_of(key)
     return along(a, -0.5 * UM * play(at, a))
 
@@ -34,7 +34,7 @@ def _turning(at: Places, key: str, values: Values) -> F3:
 
 
 def _run_in(at: Places, key: str, values: Values) -> F3:
-    """Wind-up of a turn just before the first reading."""
+    """Wind-up left from a reversal just before the first reading."""
     a = axis_of(key)
     return along(a, -0.5 * UM * at.sign[:, a] * np.exp(-before_first_turn(at, a) / WIND_UP_MM[2]))
 
@@ -57,10 +57,10 @@ EFFECT = Effect(
         Form("run-in", of_machine(_run_in)),
     ),
     needs="runs in both directions; a laser alone hardly tells X, Y and Z apart",
-    signature="circle and helix: a step outward at both ends of the axis, of the same size at all feeds; laser: forth and back stay apart",
+    signature="circle and helix: a step outward at both ends of the axis, equal at all feeds; laser: forth and back stay apart",
     remedy="control parameter",
     remedy_text="enter the width as backlash compensation of the axis; if it grows or exceeds 30 um: screw nut, coupling, thrust bearing",
-    source="effects.md 1; docs/explanation/conventions.md, direction-dependent error",
+    source="ISO 230-2 (reversal value), ISO 230-4; usual model: a step with the direction of motion",
     separated_by={
         "backlash": ("ballbar", "planar_circles", "opposite_direction"),
         "backlash_position_dependent": ("second_radius",),

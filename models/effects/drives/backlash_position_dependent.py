@@ -1,4 +1,4 @@
-"""Backlash that depends on the position: a screw worn where it works most, or winding up with its free length."""
+"""Backlash that depends on position: the screw is worn where it works most, or winds up more where its free length is longer."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def _half(at: Places, key: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def unequal(path: Path, at: Places, key: str, values: Values) -> F3:
-    """-(1/2) s and -(1/2) s x, 1 um, x = -1 .. +1 over the stroke: mean width and how it changes towards the end."""
+    """Return -s/2 and -s x/2 times 1 um, s the direction of motion, x = -1 .. +1 over the stroke: mean width, and its change along x."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     return along(a, _half(at, key), _half(at, key) * x)
 
 
 def _curved(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Worn in the middle, or at both ends."""
+    """Wear in the middle or at the ends."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     return along(a, _half(at, key) * (x**2 - VISITED), _half(at, key) * x**3)
@@ -58,7 +58,7 @@ EFFECT = Effect(
     signature="the steps at the two ends of the axis differ, or differ between two origins",
     remedy="mechanics",
     remedy_text="the screw is worn where it works most: replace or regrind it; a table of backlash over position helps meanwhile",
-    source="effects.md 1: B (1 + k x), unequal backlash",
+    source="usual model: B (1 + k x), unequal backlash",
     variant_of="backlash",
     separated_by={
         "backlash": ("second_radius",),

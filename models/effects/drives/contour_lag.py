@@ -13,25 +13,25 @@ MS2 = 1e-6
 
 
 def inward(path: Path, key: str, values: Values) -> F2:
-    """-v^2 / (2 R) at a lag of 1 ms; the coefficient is the lag's square in ms^2.
+    """Return -tau^2 v^2 / (2 R) for a lag tau of 1 ms; the coefficient is the square of the lag in ms^2.
 
-    A lag tau moves the tool by -tau v + tau^2 a. On a path around the cup u.v = 0 and u.a = -v^2 / R, and the sideways tau v lengthens the
-    bar by tau^2 v^2 / (2 R); what is left is half of the inward part.
+    A lag tau moves the tool by -tau v + tau^2 a. On a path around the cup with bar direction u, u.v = 0 and u.a = -v^2 / R; the sideways
+    displacement tau v lengthens the bar by tau^2 v^2 / (2 R), half of what the inward part shortens it.
     """
     speed_squared = (path.at.v_mm_s**2).sum(axis=1)
     return np.asarray(-MS2 * speed_squared / (2.0 * path.radius_mm))[:, None]
 
 
 def _off_centre(path: Path, key: str, values: Values) -> F2:
-    """-tau u.v, 1 ms: zero on a circle about the cup; what a cup beside the centre makes of the lag looks like a servo mismatch.
+    """Return -tau u.v for tau = 1 ms: on a path about a cup beside the nominal centre, a lag looks like a servo mismatch.
 
-    It needs a path whose ``look`` is the bar's real direction; with the nominal one the column is zero but for rounding.
+    ``path.look`` must be the actual direction of the bar; with the nominal one the column is zero.
     """
     return np.asarray(-1e-3 * np.einsum("ni,ni->n", path.look, path.at.v_mm_s))[:, None]
 
 
 def strength(coefficients: F1, values: Values) -> float:
-    """Lag in ms; negative where the circle grows instead of shrinking."""
+    """Return the lag in ms; negative if the circle grows instead of shrinking."""
     c = float(coefficients[0])
     return float(np.sign(c) * np.sqrt(abs(c)))
 
@@ -49,10 +49,10 @@ EFFECT = Effect(
     strength=strength,
     forms=(Form("off centre", of_kind("bar", _off_centre, 1)),),
     needs="ball-bar runs with at least two feeds",
-    signature="the radius shrinks with the square of the feed, alike in all directions and at all places",
+    signature="the radius shrinks with the square of the feed, equally in all directions and at all places",
     remedy="control parameter",
     remedy_text="raise the position gain of all axes together or switch on velocity feed-forward; meanwhile finish at a low feed",
-    source="effects.md 1: -tau^2 v^2 / (2 R)",
+    source="usual model: -tau^2 v^2 / (2 R)",
     blind=("laser_diagonal", "laser_linear"),
     separated_by={
         "laser_cosine": ("second_feed",),

@@ -1,4 +1,4 @@
-"""Cyclic error: screw, encoder or gear repeats a small wave with every turn."""
+"""Cyclic error: screw, encoder or gear repeats a small wave in every revolution."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
 LOW_MM, HIGH_MM, PER_MM = 4.0, 30.0, 0.0024
-"""Pitches of screws, and how far apart the starts' wave numbers (1/mm) are: over 300 mm two neighbours differ by less than a turn, so a
-refinement from the nearer one finds the truth between them."""
+"""Bounds of the pitch, and spacing of the start values in wave number, 1/mm: neighbours differ by less than one period over 300 mm, so the
+search converges from the nearer one."""
 STARTS = tuple(float(1.0 / k) for k in np.arange(1.0 / HIGH_MM, 1.0 / LOW_MM + PER_MM, PER_MM) if 1.0 / k >= LOW_MM)
 
 
@@ -22,7 +22,7 @@ def _waves(at: Places, key: str, values: Values, harmonic: int) -> tuple[F3, F3]
 
 
 def wave(at: Places, key: str, values: Values) -> F3:
-    """Sine and cosine of 2 pi x / pitch, 1 um."""
+    """Return sine and cosine of 2 pi x / pitch, 1 um."""
     return along(axis_of(key), *_waves(at, key, values, 1))
 
 
@@ -36,13 +36,13 @@ def _along(path: Path, at: Places, key: str) -> F1:
 
 
 def _modulated(path: Path, at: Places, key: str, values: Values) -> F3:
-    """The same wave growing along the screw, times -1 .. +1: the strength stays the mean amplitude."""
+    """The wave times -1 .. +1 along the screw; the strength remains the mean amplitude."""
     x = _along(path, at, key)
     return along(axis_of(key), *(x * wave for wave in _waves(at, key, values, 1)))
 
 
 def _modulated_twice(path: Path, at: Places, key: str, values: Values) -> F3:
-    """The same wave strongest in the middle or at the ends of the screw; the strength stays the mean amplitude where tests go."""
+    """The wave, strongest in the middle or at the ends of the screw; the strength remains the mean amplitude where tests go."""
     x = _along(path, at, key)
     return along(axis_of(key), *((x**2 - VISITED) * wave for wave in _waves(at, key, values, 1)))
 
@@ -55,7 +55,7 @@ EFFECT = Effect(
     unit="um",
     per_unit=1.0,
     typical=(0.5, 5.0),
-    shape=(Parameter("pitch_mm", "mm", LOW_MM, HIGH_MM, 10.0, "effects.md 1: screw lead 5...25 mm", STARTS),),
+    shape=(Parameter("pitch_mm", "mm", LOW_MM, HIGH_MM, 10.0, "usual leads of ball screws: 5 to 25 mm", STARTS),),
     signal=of_places(wave),
     strength=amplitude,
     forms=(
@@ -67,7 +67,7 @@ EFFECT = Effect(
     signature="a chirp on the circle: fast across the axis, slow near its reversals, the same in both directions",
     remedy="mechanics",
     remedy_text="align screw, bearing and encoder coupling; a control with pitch-wise compensation can take the rest out",
-    source="effects.md 1",
+    source="usual model: a sine and its harmonic over the pitch",
     separated_by={
         "positioning_nonlinear": ("second_radius", "single_axis_laser"),
         "reversal_spike": ("laser_diagonals",),

@@ -1,4 +1,4 @@
-"""Reversal spike (quadrant glitch): friction changes sign, the axis stays behind and catches up within a fraction of a millimetre."""
+"""Reversal spike (quadrant glitch): friction reverses, so the axis falls behind and catches up within a fraction of a millimetre."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path
 
 SHAPE = (
-    Parameter("d0_mm", "mm", 0.08, 2.0, 0.4, "effects.md 1: 0.15-1 mm", (0.12, 0.3, 0.7, 1.5)),
-    Parameter("p", "", 0.0, 1.0, 0.4, "effects.md 1: 0...0.8", (0.0, 0.6)),
+    Parameter("d0_mm", "mm", 0.08, 2.0, 0.4, "usual range: 0.15 to 1 mm", (0.12, 0.3, 0.7, 1.5)),
+    Parameter("p", "", 0.0, 1.0, 0.4, "usual range: 0 to 0.8", (0.0, 0.6)),
 )
 
 
 def _height(path: Path, key: str, values: Values) -> F1:
-    """Direction times the height at the commanded feed for 1 um at 1000 mm/min."""
+    """Signed height at the commanded feed of a spike of 1 um at 1000 mm/min."""
     return np.asarray(-UM * path.at.sign[:, axis_of(key)] * (path.feed_mm_min / 1000.0) ** values["p"])
 
 
@@ -30,7 +30,7 @@ def _read(path: Path, key: str, *values: F1) -> F2:
 
 
 RISE = 0.15
-"""Share of the decay over which a spike rises: the axis must first come to a stop of its own."""
+"""Length of the rise of a spike as a share of its decay length: the lagging axis stops only after the command reverses."""
 
 
 def _decay(path: Path, key: str, values: Values) -> F1:
@@ -39,30 +39,30 @@ def _decay(path: Path, key: str, values: Values) -> F1:
 
 
 def spike(path: Path, key: str, values: Values) -> F2:
-    """-s h (f / 1000)^p exp(-d / d0) after a short rise, h = 1 um."""
+    """Return -s h (f / 1000)^p exp(-d / d0) after a short rise: direction s, feed f in mm/min, travel d since the reversal, h = 1 um."""
     return _read(path, key, _decay(path, key, values))
 
 
 def _unlike(path: Path, key: str, values: Values) -> F2:
-    """Higher after a turn to +, lower after one to -."""
+    """Higher after a reversal to +, lower after one to -."""
     return _read(path, key, _decay(path, key, values) * path.at.sign[:, axis_of(key)])
 
 
 def _rounded(path: Path, key: str, values: Values) -> F2:
-    """Slower rise and longer or shorter tail: the same with d / d0 and its square in front."""
+    """Slower rise and longer or shorter tail: the decay times d / d0 and its square."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     height = _height(path, key, values) * np.exp(-x)
     return _read(path, key, height * x, height * x**2)
 
 
 def _at_once(path: Path, key: str, values: Values) -> F2:
-    """A quicker rise than the usual one: the difference in its first part."""
+    """Quicker rise: the difference during the rise."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     return _read(path, key, _height(path, key, values) * np.maximum(1.0 - x / RISE, 0.0))
 
 
 def _run_in(path: Path, key: str, values: Values) -> F2:
-    """The end of a spike that began in the run-in, just before the first reading."""
+    """Tail of a spike that began in the run-in, just before the first reading."""
     past = before_first_turn(path.at, axis_of(key)) / values["d0_mm"]
     return _read(path, key, _height(path, key, values) * np.exp(-np.minimum(past, 60.0)) * (past < 60.0))
 
@@ -88,7 +88,7 @@ EFFECT = Effect(
     signature="a short bump outward just after each reversal of the axis and nothing elsewhere",
     remedy="control parameter",
     remedy_text="set the friction (quadrant glitch) compensation of the axis; check its guide and lubrication if it grows",
-    source="effects.md 1; quadrant step 4.7 um of a drive maker's friction page",
+    source="usual model: exponential decay; a drive maker shows a quadrant step of 4.7 um",
     blind=("laser_diagonal", "laser_linear"),
     separated_by={
         "reversal_spike": ("planar_circles",),

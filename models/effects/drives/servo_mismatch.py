@@ -9,11 +9,11 @@ from abbe.models.effects.path import Places
 
 MS = 1e-3
 USUAL_MM_S = 25.0
-"""1500 mm/min: the strength is the delay there."""
+"""Speed (1500 mm/min) at which the strength is stated."""
 
 
 def late(at: Places, key: str, values: Values) -> F3:
-    """-1 ms times the velocity of the axis."""
+    """Return -1 ms times the velocity of the axis."""
     a = axis_of(key)
     return along(a, -MS * at.v_mm_s[:, a])
 
@@ -24,7 +24,7 @@ def _acceleration(at: Places, key: str, values: Values) -> F3:
 
 
 def _saturated(at: Places, key: str, values: Values) -> F3:
-    """A delay that changes with speed, per 100 mm/s from the usual one on."""
+    """Change of the delay by 1 ms per 100 mm/s of speed from `USUAL_MM_S`."""
     a = axis_of(key)
     v = at.v_mm_s[:, a]
     return along(a, -MS * v * (abs(v) - USUAL_MM_S) / 100.0)
@@ -42,11 +42,11 @@ EFFECT = Effect(
     signal=of_machine(late),
     strength=first,
     forms=(Form("acceleration", of_machine(_acceleration)), Form("with speed", of_machine(_saturated))),
-    needs="both directions, two feeds, and three planes or a helix to say which axis",
+    needs="both directions, two feeds, and three planes or a helix to tell which axis",
     signature="an oval at 45 degrees that turns by 90 degrees with the direction and grows with the feed",
     remedy="control parameter",
     remedy_text="match the position gain (Kv) or feed-forward of the axis to that of the other two",
-    source="effects.md 1; Kakino et al. 1993",
+    source="Kakino et al. 1993",
     blind=("laser_diagonal", "laser_linear"),
     separated_by={
         "servo_mismatch": ("planar_circles", "ballbar"),

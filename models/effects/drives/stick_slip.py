@@ -11,7 +11,7 @@ from abbe.models.effects.path import Path
 
 
 def rough(path: Path, key: str, values: Values) -> F2:
-    """Extra variance of a saw-tooth of 1 um (1 um^2 / 3) that fades as the axis gets faster than v_c, as the bar sees it."""
+    """Return the extra variance of the bar's reading by a saw-tooth of 1 um (1 um^2 / 3) that fades above the axis speed v_c."""
     a = axis_of(key)
     if np.ptp(path.at.q_mm[:, a]) == 0.0:
         return np.zeros((path.n, 1))
@@ -27,14 +27,14 @@ EFFECT = Effect(
     unit="um",
     per_unit=1.0,
     typical=(1.0, 6.0),
-    shape=(Parameter("v_c", "mm/s", 0.5, 5.0, 2.0, "effects.md 1: 1-4 mm/s", (0.8, 1.3, 2.0, 3.2, 4.5)),),
+    shape=(Parameter("v_c", "mm/s", 0.5, 5.0, 2.0, "usual range: 1 to 4 mm/s", (0.8, 1.3, 2.0, 3.2, 4.5)),),
     signal=of_kind("bar", rough, 1),
     strength=size,
     needs="a ball-bar run at a low feed",
     signature="bursts of roughness where the axis creeps, around its reversals, worse at low feed",
     remedy="mechanics",
     remedy_text="check lubrication and guide of the axis; friction compensation helps at creeping speed",
-    source="effects.md 1",
+    source="usual model: a saw-tooth at creeping speed",
     kind="variance",
     blind=("laser_diagonal", "laser_linear"),
     separated_by={"vibration": ("second_feed",), "reversal_spike": ("second_feed",), "stick_slip": ("planar_circles",)},

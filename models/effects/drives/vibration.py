@@ -11,14 +11,14 @@ from abbe.models.effects.path import Path
 
 
 def swinging(path: Path, key: str, values: Values) -> F2:
-    """Extra variance of a sine of 1 um (1 um^2 / 2) as the bar sees it; its phase differs from run to run."""
+    """Return the extra variance of the bar's reading by a sine of 1 um (1 um^2 / 2) of unknown phase."""
     return np.asarray(UM**2 / 2.0 * path.look[:, axis_of(key)] ** 2)[:, None]
 
 
 def line(paths: tuple[Path, ...], key: str, f_hz: float) -> list[F2]:
-    """Sine and cosine of one frequency along the axis, 1 um, with columns of their own for every ball-bar run (its phase is not known).
+    """Return sine and cosine columns of one frequency along the axis, 1 um, separate for every ball-bar run, whose phases are unknown.
 
-    Mean signal of a steady vibration, for a search over frequencies: shape (n, 2 runs) per path, runs in order of their labels.
+    A search over frequencies uses them as the mean signal of a steady vibration: shape (n, 2 runs) per path, runs in order of their labels.
     """
     a, place = axis_of(key), order_of(path.label for path in paths if path.kind == "bar")
     out = []
@@ -46,7 +46,7 @@ EFFECT = Effect(
     signature="a line in the spectrum of the readings over time, folded by the sampling, strongest along the axis",
     remedy="control parameter",
     remedy_text="lower the gain or set a notch filter at the frequency; look for a loose motor mount, an unbalanced spindle, a pump nearby",
-    source="effects.md 1",
+    source="usual model: a sine of unknown phase",
     kind="variance",
     blind=("laser_diagonal", "laser_linear"),
     separated_by={"stick_slip": ("second_feed",), "vibration": ("planar_circles", "ballbar")},

@@ -1,1 +1,1 @@
-"""Shapes of axes beyond smooth error motions: one file an effect."""
+"""Geometric errors of axes: one file per effect."""

@@ -14,7 +14,7 @@ KEYS = tuple(f"E{turn}{axis}" for axis in AXES for turn in "ABC")
 
 
 def _columns(path: Path, at: Places, key: str, first: int, last: int) -> F3:
-    """Legendre orders of the position, 1 urad rms over the stroke each, times the arm of the carriage (rule G)."""
+    """Return Legendre orders of the position, 1 urad rms over the stroke each, times the arm of the carriage (rule G)."""
     a, turn = AXES.index(key[2]), np.eye(3)["ABC".index(key[1])]
     arm = np.cross(turn, levers_mm(path.machine, at.q_mm)[:, a])
     return np.asarray(PPM * arm[:, :, None] * smooth(at.q_mm[:, a], path.machine.stroke_mm[a], first, last)[:, None, :])
@@ -26,7 +26,7 @@ def _turns(path: Path, at: Places, key: str, first: int, last: int) -> F3:
 
 
 def _orders(first: int, last: int) -> Signal:
-    """Columns of some Legendre orders: arm and mirror."""
+    """Make the signal of Legendre orders ``first`` to ``last``, through the lever arm and the turning mirror."""
     return of_body(
         lambda path, at, key, values: _columns(path, at, key, first, last), lambda path, at, key, values: _turns(path, at, key, first, last)
     )
@@ -49,7 +49,7 @@ EFFECT = Effect(
     signature="like straightness or positioning of the axis, but growing with the distance from its guide",
     remedy="table",
     remedy_text="a spatial or angular compensation table; realign the guide if it is large",
-    source="effects.md 2; Pahk: bands of 11-39 urad",
+    source="Pahk: bands of 11 to 39 urad",
     absorbed_by=("rigid21",),
     separated_by={
         "straightness": ("second_tool_length", "angular_interferometer"),

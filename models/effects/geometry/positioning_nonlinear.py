@@ -1,4 +1,4 @@
-"""Positioning error that is not a pure scale: a smooth function of the axis' own position, along it."""
+"""Non-linear positioning error: a smooth deviation along an axis as a function of its own position."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ EFFECT = Effect(
     per_unit=1.0,
     typical=(1.0, 20.0),
     shape=(),
-    signal=shifts(axis_of, 2, 6),  # order 1 is the line that the present model knows
+    signal=shifts(axis_of, 2, 6),  # the present model contains order 1, the scale
     strength=rms,
     forms=finer_shifts(axis_of),
     unseen=WITH_LINE,
     needs="two positions of the other axes, to tell it from angular errors; several places on the axis",
-    signature="a smooth curve over the axis, along it, the same at all positions of the others",
+    signature="a smooth curve of the deviation along the axis, the same at all positions of the other axes",
     remedy="table",
     remedy_text="enter it as screw (pitch) error compensation of the axis",
-    source="effects.md 2; Pahk: positioning bands of 6-71 um",
+    source="Pahk: positioning bands of 6 to 71 um",
     absorbed_by=("rigid21",),
     separated_by={
         "angular_error": ("second_tool_length", "angular_interferometer"),

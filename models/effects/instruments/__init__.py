@@ -1,1 +1,1 @@
-"""Effects of instruments and their set-up: one file an effect."""
+"""Effects of instruments and their set-up: one file per effect."""

@@ -1,4 +1,4 @@
-"""Refraction of air: the laser's wavelength follows the air's temperature and pressure."""
+"""Refraction of air: the wavelength of the laser follows the temperature and pressure of the air."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _waves(path: Path, period_s: float) -> F2:
 
 
 def breathing(path: Path, key: str, values: Values) -> F2:
-    """-0.93e-6 times the displacement times sine and cosine of the hall's cycle, 1 K: warmer air reads short."""
+    """Return -0.93e-6 times the displacement times sine and cosine of the hall's temperature cycle, 1 K: warm air reads short."""
     return _waves(path, values["period_s"])
 
 
@@ -25,7 +25,7 @@ def _second(path: Path, key: str, values: Values) -> F2:
 
 
 def _offset(path: Path, key: str, values: Values) -> F2:
-    """A constant (the wavelength was set for other air) and a slow drift, K and K/h."""
+    """A constant (the wavelength was set for air of another temperature), 1 K, and a slow drift, 1 K/h."""
     base = AIR_PER_K * path.travel_mm
     return np.column_stack([base, base * path.at.t_s / 3600.0])
 
@@ -56,7 +56,7 @@ EFFECT = Effect(
     signature="the scale of the diagonals changes from set-up to set-up: short in warm air, 1 um per metre and kelvin",
     remedy="warm up or sensor",
     remedy_text="measure air temperature and pressure at the beam and let the laser's software correct the wavelength",
-    source="effects.md 4; Edlen: the reading changes by -0.93 ppm/K, +0.27 ppm/hPa",
+    source="Edlen: the reading changes by -0.93 ppm/K, +0.27 ppm/hPa",
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={
         "axis_thermal_growth": ("ballbar", "longer_session"),

@@ -11,12 +11,12 @@ from abbe.models.effects.path import Path
 
 
 def constant(path: Path, key: str, values: Values) -> F2:
-    """+1 um in every ball-bar reading."""
+    """Return +1 um for every ball-bar reading."""
     return np.full((path.n, 1), UM)
 
 
 def _with_radius(path: Path, key: str, values: Values) -> F2:
-    """Another error of another bar, as far as it goes with the radius (100 mm)."""
+    """The part of the error that is proportional to the length of the bar, 1 um per 100 mm."""
     return np.full((path.n, 1), UM * path.radius_mm / 100.0)
 
 
@@ -33,10 +33,10 @@ EFFECT = Effect(
     strength=first,
     forms=(Form("with radius", of_kind("bar", _with_radius, 1)),),
     needs="two radii, or laser diagonals",
-    signature="one constant in all ball-bar readings, at all feeds and places",
+    signature="the same constant in all ball-bar readings, at all feeds and places",
     remedy="set-up",
     remedy_text="calibrate the bar on its reference, or let its length be fitted",
-    source="effects.md 4",
+    source="usual model: a constant",
     absorbed_by=("bar_length_error",),
     blind=("laser_diagonal", "laser_linear"),
     separated_by={

@@ -1,4 +1,4 @@
-"""Thermal state of the ball-bar: a bar warmed by the hand is too long at first and comes back to its length."""
+"""Thermal state of the ball-bar: a bar warmed by the hand is too long at first and shrinks back to its length."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _cooling(path: Path, tau_s: float) -> F2:
 
 
 def relaxing(path: Path, key: str, values: Values) -> F2:
-    """-alpha R exp(-(t - t_set) / tau), 1 K: a longer bar between the same two balls reads less."""
+    """Return -alpha R exp(-(t - t_set) / tau) for 1 K: a longer bar between the same two balls reads less."""
     return _cooling(path, values["tau_s"])
 
 
@@ -33,7 +33,7 @@ EFFECT = Effect(
     unit="K",
     per_unit=1.0,
     typical=(1.0, 6.0),
-    shape=(Parameter("tau_s", "s", 150.0, 4000.0, 900.0, "effects.md 3: minutes after handling", (250.0, 600.0, 1500.0)),),
+    shape=(Parameter("tau_s", "s", 150.0, 4000.0, 900.0, "minutes after handling", (250.0, 600.0, 1500.0)),),
     signal=of_kind("bar", relaxing, 1),
     strength=first,
     forms=(Form("second time constant", of_kind("bar", _second_time, 2)),),
@@ -41,7 +41,7 @@ EFFECT = Effect(
     signature="all readings of a set-up relax together from the moment it was mounted",
     remedy="set-up",
     remedy_text="let the bar lie by the machine before the test, handle it with gloves, wait some minutes after mounting",
-    source="effects.md 3",
+    source="usual model: exponential decay; steel grows by 11.5 ppm/K",
     blind=("laser_diagonal", "laser_linear"),
     separated_by={
         "bar_length_error": ("longer_session", "second_radius"),

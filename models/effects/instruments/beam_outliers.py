@@ -1,4 +1,4 @@
-"""Beam outliers: few laser readings are off because the beam was broken or bent for a moment."""
+"""Beam outliers: a few laser readings are wrong because the beam was broken or bent for a moment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.models.effects.path import Path
 
 
 def struck(path: Path, key: str, values: Values) -> F2:
-    """Extra variance of any laser reading, that of 1 um (before its small share of the readings)."""
+    """Return the extra variance of every laser reading, 1 um^2; the small share of readings that are outliers is not counted in."""
     return np.full((path.n, 1), UM**2)
 
 
@@ -30,7 +30,7 @@ EFFECT = Effect(
     signature="isolated readings far from their neighbours, 1 to 4 in 100, in no order",
     remedy="set-up",
     remedy_text="clean the optics, keep chips and coolant mist off the beam, repeat the run",
-    source="effects.md 4",
+    source="usual model: rare readings with a large variance",
     kind="variance",
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={"backlash": ("longer_session",)},

@@ -1,4 +1,4 @@
-"""Dead path: air that drifts in the part of the beam that is never travelled shifts the laser's zero."""
+"""Dead path: drifting air in the part of the beam that the mirror never travels shifts the laser's zero."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def _hours(path: Path) -> F2:
 
 
 def zero_drift(path: Path, key: str, values: Values) -> F2:
-    """-0.93e-6 times the dead path times the hours since the first record, 1 K/h: air that warms up (above 0) reads short."""
+    """Return -0.93e-6 times the dead path times the hours since the first record, 1 K/h: while the air warms up, the laser reads short."""
     return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path))
 
 
 def _bent(path: Path, key: str, values: Values) -> F2:
-    """A drift that is not straight in time."""
+    """A drift that is not linear in time."""
     return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path) ** 2)
 
 
@@ -36,11 +36,11 @@ EFFECT = Effect(
     signal=of_kind("laser", zero_drift, 1),
     strength=first,
     forms=(Form("bent", of_kind("laser", _bent, 1)),),
-    needs="a diagonal there and back, so that time is not position",
-    signature="the reading drifts in a run whatever the position, down while the air warms up (above 0 K/h): forth and back make a loop",
+    needs="a diagonal out and back, which separates time from position",
+    signature="the reading drifts during a run at every position, down while the air warms up (above 0 K/h): forth and back make a loop",
     remedy="set-up",
     remedy_text="bring the interferometer near the start of the travel, shield the beam, set the zero when the air has settled",
-    source="effects.md 4",
+    source="usual model: linear drift; Edlen: -0.93 ppm/K",
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={
         "backlash": ("opposite_direction", "ballbar"),

@@ -1,4 +1,4 @@
-"""Cosine error of the laser: the beam is not along the nominal direction, so its whole displacement is scaled."""
+"""Cosine error of the laser: the beam deviates from the nominal direction, which scales the whole displacement."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from abbe.models.effects.path import Path
 
 
 def scaled(path: Path) -> F2:
-    """+1/2 mrad^2 times the displacement; one coefficient per laser set-up, theta^2 - 2 theta tilt in mrad^2."""
+    """Return half the displacement times 1 mrad^2; the coefficient of each laser set-up is theta^2 - 2 theta tilt in mrad^2."""
     return np.asarray(0.5 * PPM * path.travel_mm)[:, None]
 
 
 def strength(coefficients: F1, values: Values) -> float:
-    """Misalignment in mrad from the mean over the set-ups (the mirror's tilt enters with either sign); negative: the beam reads short."""
+    """Return the misalignment in mrad from the mean coefficient of the set-ups; negative if the laser reads short.
+
+    The tilt of the mirror enters a coefficient with either sign.
+    """
     nonzero = coefficients[coefficients != 0.0]
     mean = float(nonzero.mean()) if nonzero.size else 0.0
     return float(np.sign(mean) * np.sqrt(abs(mean)))
@@ -34,10 +37,10 @@ EFFECT = Effect(
     signal=per_setup("laser", 1, scaled),
     strength=strength,
     needs="a ball-bar scale as reference: with a laser alone it is part of the axes' scales",
-    signature="one scale error per diagonal, constant over time and direction",
+    signature="a scale error of each diagonal, constant over time and direction of motion",
     remedy="set-up",
     remedy_text="align the beam again over the full travel before the next diagonal",
-    source="effects.md 4; Wang: 1 mrad makes 0.5 um/m",
+    source="Wang: 1 mrad makes 0.5 um/m",
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={
         "contour_lag": ("second_feed",),

@@ -11,14 +11,14 @@ from abbe.models.effects.path import Path
 
 
 def across(beam: F1) -> F2:
-    """Two unit vectors across the beam, shape (2, 3): along beam x (unit vector of its smallest component), and beam x that one."""
+    """Return two unit vectors across the beam n, shape (2, 3): e1 along n x (unit vector of its smallest component), and e2 = n x e1."""
     one = np.cross(beam, np.eye(3)[int(np.argmin(np.abs(beam)))])
     one /= np.linalg.norm(one)
     return np.stack([one, np.cross(beam, one)])
 
 
 def tilted(path: Path) -> F2:
-    """1 urad times the way across the beam since the first record, in two directions: two coefficients per laser set-up."""
+    """Return 1 urad times the displacement across the beam since the first record, in two directions: two coefficients per laser set-up."""
     return np.asarray(PPM * (path.at.q_mm - path.reference.q_mm) @ across(path.look[0]).T)
 
 
@@ -37,7 +37,7 @@ EFFECT = Effect(
     signature="a saw-tooth with a period of three steps that returns to zero at every point of the diagonal",
     remedy="set-up",
     remedy_text="not an error of the machine: square the mirror to the beam, or let its tilt be fitted as an unknown of the set-up",
-    source="effects.md 4; Wang: 0.5 mrad times 50 mm makes 25 um",
+    source="Wang: 0.5 mrad times 50 mm makes 25 um",
     absorbed_by=("mirror_tilt",),
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={"laser_cosine": ("laser_diagonals",), "straightness": ("ballbar",)},

@@ -11,7 +11,7 @@ from abbe.models.effects.path import Path
 
 
 def offset(path: Path) -> F2:
-    """-u, 1 um in x, y, z: three coefficients per ball-bar set-up, set-ups in order of their names."""
+    """Return minus the bar's direction for an offset of 1 um in X, Y, Z: three coefficients per ball-bar set-up."""
     return np.asarray(-UM * path.look)
 
 
@@ -27,10 +27,10 @@ EFFECT = Effect(
     signal=per_setup("bar", 3, offset),
     strength=setup_length(3),
     needs="nothing: every ball-bar run shows it",
-    signature="one wave per turn, of another size and direction in every set-up",
+    signature="one wave per revolution, with another amplitude and direction in every set-up",
     remedy="set-up",
     remedy_text="not an error of the machine: let it be fitted as an unknown of the set-up",
-    source="effects.md 4",
+    source="ISO 230-4; usual model: a constant vector per set-up",
     absorbed_by=("setup_centre_offset",),
     blind=("laser_diagonal", "laser_linear"),
     separated_by={"spindle_thermal_drift": ("longer_session",), "backlash": ("opposite_direction",)},

@@ -1,1 +1,1 @@
-"""Effects of bed, ram and guides: one file an effect."""
+"""Effects of bed, ram and guides: one file per effect."""

@@ -1,4 +1,4 @@
-"""Lateral play: a carriage jumps sideways when its axis turns."""
+"""Lateral play: a carriage jumps sideways when its axis reverses."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ SETTLING_MM = (0.1, 0.5, 3.0)
 
 
 def jump(at: Places, key: str, values: Values) -> F3:
-    """+(P/2) times the direction of the moving axis, sideways, P = 1 um."""
+    """Return a sideways +P/2 times the direction of the moving axis, P = 1 um."""
     return along(direction_of(key), 0.5 * UM * at.sign[:, axis_of(key)])
 
 
 def _settling(at: Places, key: str, values: Values) -> F3:
-    """The jump comes late: over some travel of the axis."""
+    """A jump that takes some travel of the axis."""
     a = axis_of(key)
     return along(direction_of(key), *(0.5 * UM * at.sign[:, a] * np.exp(-at.since_mm[:, a] / d) for d in SETTLING_MM))
 
 
 def _along_guide(path: Path, at: Places, key: str, values: Values) -> F3:
-    """A guide worn at one end, or in the middle: the jump changes along it."""
+    """A jump that changes along the guide, worn at one end or in the middle."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     half = 0.5 * UM * at.sign[:, a]
@@ -44,10 +44,10 @@ EFFECT = Effect(
     strength=first,
     forms=(Form("settling", of_machine(_settling)), Form("along the guide", of_path(_along_guide))),
     needs="runs in both directions",
-    signature="a step across the axis where it turns, so a pair of spikes or steps that does not lie on the axis' own ends",
+    signature="a step across the axis where it reverses: a pair of steps or spikes away from the ends of the deviating axis",
     remedy="mechanics",
     remedy_text="adjust gib or preload of the carriage's guide",
-    source="effects.md 2",
+    source="usual model: a step with the direction of motion",
     separated_by={
         "lateral_play": ("ballbar", "planar_circles"),
         "backlash": ("planar_circles", "ballbar"),

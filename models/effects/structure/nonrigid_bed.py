@@ -11,7 +11,7 @@ from abbe.models.effects.path import Path, Places
 
 
 def _shares(path: Path, at: Places, key: str) -> tuple[F1, F1]:
-    """0 .. 1 along the moving axis and -1 .. +1 across, on the axis that the key does not name."""
+    """Return the position along the moving axis as 0 .. 1, and on the axis that the key does not name as -1 .. +1."""
     stroke = path.machine.stroke_mm
     x = 0.5 * (1.0 + share_of_stroke(at.q_mm[:, axis_of(key)], stroke[axis_of(key)]))
     other = third_axis(key)
@@ -19,7 +19,7 @@ def _shares(path: Path, at: Places, key: str) -> tuple[F1, F1]:
 
 
 def twisted(path: Path, at: Places, key: str, values: Values) -> F3:
-    """sin(pi x / L) (2 y / L_y - 1), 1 um."""
+    """Return sin(pi x / L) (2 y / L_y - 1), 1 um."""
     x, y = _shares(path, at, key)
     return along(direction_of(key), UM * np.sin(np.pi * x) * y)
 
@@ -46,11 +46,11 @@ EFFECT = Effect(
     signal=of_path(twisted),
     strength=first,
     forms=(Form("double bow", of_path(_double_bow)), Form("curved across", of_path(_curved_across))),
-    needs="at least two origins on the other axis and laser diagonals; inside 21 error motions little of it remains",
-    signature="the straightness of an axis turns over from one side of the table to the other",
+    needs="at least two origins on the other axis and laser diagonals; a model with 21 error motions absorbs most of it",
+    signature="the straightness of an axis changes its sign from one side of the table to the other",
     remedy="mechanics",
     remedy_text="level the machine, check feet and foundation, put heavy loads in the middle; a spatial table can take the rest out",
-    source="effects.md 2",
+    source="usual model: sin(pi x / L) (2 y / L_y - 1)",
     separated_by={
         "nonrigid_bed": ("laser_diagonals", "second_radius"),
         "ram_sag": ("laser_diagonals", "ballbar"),

@@ -1,4 +1,4 @@
-"""Sag of a horizontal ram: the farther it reaches out, the more its end sinks and tilts down."""
+"""Sag of a horizontal ram: its end sinks and tilts down, the more the farther it reaches out."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Signal, Values
 from abbe.models.effects.path import Path, Places
 from abbe.models.machine import levers_mm, split_chain
 
-SHAPE = (Parameter("beta", "1", 0.3, 1.0, 0.7, "growth from mid height to the top; above 1 it would hang upwards below", (0.5, 0.8)),)
+SHAPE = (
+    Parameter("beta", "1", 0.3, 1.0, 0.7, "growth from mid height to the top; above 1 the ram would bend up at the bottom", (0.5, 0.8)),
+)
 
 
 def ram_axis(path: Path) -> int | None:
-    """The horizontal axis that carries the tool; None on a machine whose last carriage is vertical or on the work side."""
+    """Return the horizontal axis that carries the tool; None if the last carriage is vertical or there is none on the tool side."""
     tool_side = split_chain(path.machine.chain)[1]
     return tool_side[-1] if tool_side and tool_side[-1] != path.vertical else None
 
 
 def _sagging(path: Path, *shapes: tuple[F1, F1]) -> tuple[F3, F3]:
-    """Displacement and rotation for sags (um) and their slopes (um per mm of reach): downwards, and about the third axis."""
+    """Return displacement (downwards) and rotation (about the third axis) for sags, um, and their slopes, um per mm of reach."""
     moved = np.zeros((len(shapes[0][0]), 3, len(shapes)))
     turned = np.zeros_like(moved)
     ram = ram_axis(path)
@@ -36,14 +38,14 @@ def _sagging(path: Path, *shapes: tuple[F1, F1]) -> tuple[F3, F3]:
 
 
 def _tool(path: Path, at: Places, parts: tuple[F3, F3]) -> F3:
-    """Deviation of the tool: displacement plus rotation times the arm of the ram's carriage."""
+    """Return the deviation of the tool: displacement plus rotation times the arm of the ram's carriage."""
     moved, turned = parts
     ram = ram_axis(path)
     return moved if ram is None else np.asarray(moved + np.cross(turned, levers_mm(path.machine, at.q_mm)[:, ram][:, :, None], axis=1))
 
 
 def _reach(path: Path, at: Places) -> tuple[F1, float, F1]:
-    """Reach as 0 .. 1 of the stroke, its length, and the head's height as -1 .. +1."""
+    """Return the reach as 0 .. 1 of the ram's stroke, the length of this stroke in mm, and the height of the head as -1 .. +1."""
     ram, stroke = ram_axis(path), path.machine.stroke_mm
     ram = 0 if ram is None else ram
     low, high = (float(v) for v in stroke[ram])
@@ -51,14 +53,14 @@ def _reach(path: Path, at: Places) -> tuple[F1, float, F1]:
 
 
 def sag(path: Path, at: Places, key: str, values: Values) -> tuple[F3, F3]:
-    """(z / L)^2 (1 + beta y) downwards, 1 um at full reach and mid height, with the slope about the third axis."""
+    """Return a downward sag of (z / L)^2 (1 + beta y), 1 um at full reach z = L and mid height y = 0, and the rotation by its slope."""
     z, length, y = _reach(path, at)
     more = 1.0 + values["beta"] * y
     return _sagging(path, (z**2 * more, 2.0 * z / length * more))
 
 
 def _bent(path: Path, at: Places, key: str, values: Values) -> tuple[F3, F3]:
-    """Another curve of bending, and another growth with the height."""
+    """Another bending curve, and another growth with the height."""
     z, length, y = _reach(path, at)
     return _sagging(path, (z**3 * y, 3.0 * z**2 / length * y), (z**2 * y**2, 2.0 * z / length * y**2))
 
@@ -86,7 +88,7 @@ EFFECT = Effect(
     signature="a parabola over the ram's reach, growing with the height of the head",
     remedy="mechanics",
     remedy_text="check the ram's guide, clamping and counterweight; a spatial table (reach by height) can take the rest out",
-    source="effects.md 2: -A (z / L)^2 (1 + beta y)",
+    source="usual model: -A (z / L)^2 (1 + beta y)",
     separated_by={
         "nonrigid_bed": ("laser_diagonals", "ballbar", "second_tool_length"),
         "straightness": ("laser_diagonals", "second_radius", "ballbar"),

@@ -1,1 +1,1 @@
-"""Effects of warming: one file an effect."""
+"""Effects of warming: one file per effect."""

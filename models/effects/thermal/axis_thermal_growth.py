@@ -1,4 +1,4 @@
-"""Thermal growth of an axis: screw or scale gets warm where it works, so the axis becomes longer from its fixed end on."""
+"""Thermal growth of an axis: its screw or scale warms up and grows away from the fixed end."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
 SHAPE = (
-    Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "effects.md 3: 20-120 min", (900.0, 2500.0, 7000.0)),
+    Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "usual range: 20 to 120 min", (900.0, 2500.0, 7000.0)),
     Parameter("fixed", "1", 0.0, 1.0, 0.0, "share of the stroke where the axis is held: mostly an end", (0.0, 0.5, 1.0)),
 )
 SLOW, FAST = 3.0, 1.0 / 3.0
 
 
 def _from_fixed(path: Path, at: Places, key: str, values: Values) -> F1:
-    """Distance from the fixed point, mm."""
+    """Return the distance from the fixed point, mm."""
     a = axis_of(key)
     low, high = (float(v) for v in path.machine.stroke_mm[a])
     return at.q_mm[:, a] - (low + values["fixed"] * (high - low))
 
 
 def growth(path: Path, at: Places, key: str, values: Values) -> F3:
-    """alpha (x - x_fixed) (1 - exp(-t / tau)), 1 K."""
+    """Return alpha (x - x_fixed) (1 - exp(-t / tau)) for a rise of 1 K."""
     return along(axis_of(key), STEEL_PER_K * _from_fixed(path, at, key, values) * warmth(at.t_s, values["tau_s"]))
 
 
@@ -33,7 +33,7 @@ def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _uneven(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Hotter where the nut works: growth that is not proportional to the distance."""
+    """A screw that is hotter where the nut works: growth not proportional to the distance."""
     a = axis_of(key)
     low, high = (float(v) for v in path.machine.stroke_mm[a])
     x = (at.q_mm[:, a] - low) / (high - low)
@@ -42,7 +42,7 @@ def _uneven(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _sensed(path: Path, at: Places, key: str, values: Values, rise_k: F1) -> F3:
-    """The same growth, from the temperature of the axis's own sensor."""
+    """The same growth, from the temperature sensor of the axis."""
     return along(axis_of(key), STEEL_PER_K * _from_fixed(path, at, key, values) * rise_k)
 
 
@@ -66,7 +66,7 @@ EFFECT = Effect(
     signature="the scale of the axis changes from run to run as the machine warms up",
     remedy="warm up or sensor",
     remedy_text="warm the axis up before work, or let the control correct its scale by a temperature sensor; a glass scale cures it",
-    source="effects.md 3; local heating of a recirculating screw in semi-closed loop",
+    source="ISO 230-3; local heating of a ball screw in semi-closed loop",
     separated_by={
         "axis_thermal_growth": ("longer_session", "single_axis_laser"),
         "spindle_thermal_drift": ("laser_diagonals", "longer_session", "single_axis_laser"),

@@ -9,7 +9,7 @@ from abbe.models.effects.path import Path, Places
 
 
 def drift(at: Places, key: str, values: Values) -> F3:
-    """1 - exp(-t / tau), 1 um; readings show only the change since the cup was set or the laser was zeroed."""
+    """Return 1 - exp(-t / tau), 1 um; readings show only the change since the cup was set or the laser was zeroed."""
     return along(axis_of(key), UM * warmth(at.t_s, values["tau_s"]))
 
 
@@ -19,7 +19,7 @@ def _second_time(at: Places, key: str, values: Values) -> F3:
 
 
 def _sensed(path: Path, at: Places, key: str, values: Values, rise_k: F1) -> F3:
-    """The same drift, from the spindle's temperature, um per K."""
+    """The same drift, from the temperature of the spindle, 1 um per K."""
     return along(axis_of(key), UM * rise_k)
 
 
@@ -31,15 +31,15 @@ EFFECT = Effect(
     unit="um",
     per_unit=1.0,
     typical=(5.0, 60.0),
-    shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "effects.md 3: minutes to two hours", (900.0, 2500.0, 7000.0)),),
+    shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "minutes to two hours", (900.0, 2500.0, 7000.0)),),
     signal=of_machine(drift),
     strength=first,
     forms=(Form("second time constant", of_machine(_second_time)), Form("sensor", with_sensor(_sensed, lambda key: "spindle"))),
     needs="a long set-up without a new zero, early in the warm-up",
-    signature="the centre wanders within one set-up, alike at all positions",
+    signature="the centre drifts within one set-up, equally at all positions",
     remedy="warm up or sensor",
     remedy_text="warm up the spindle, cool the head, or let the control shift the axis by a spindle sensor; probe again before finishing",
-    source="effects.md 3; ISO 230-3",
+    source="ISO 230-3",
     separated_by={
         "axis_thermal_growth": ("laser_diagonals", "longer_session", "single_axis_laser"),
         "squareness_thermal": ("second_radius", "longer_session", "laser_diagonals"),

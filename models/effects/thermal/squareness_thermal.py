@@ -17,7 +17,7 @@ def _travel(path: Path, at: Places, key: str) -> tuple[int, F1]:
 
 
 def leaning(path: Path, at: Places, key: str, values: Values) -> F3:
-    """C0Y, B0Z or A0Z of 1 urad, times 1 - exp(-t / tau)."""
+    """Return the deviation by a squareness C0Y, B0Z or A0Z of 1 urad, times 1 - exp(-t / tau)."""
     direction, travel = _travel(path, at, key)
     return along(direction, travel * warmth(at.t_s, values["tau_s"]))
 
@@ -29,7 +29,7 @@ def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _bent(path: Path, at: Places, key: str, values: Values) -> F3:
-    """The column bends as it leans."""
+    """A column that bends as it leans."""
     axis, direction, sign = CARRIED[key]
     low, high = (float(v) for v in path.machine.stroke_mm[axis])
     bow = share_of_stroke(at.q_mm[:, axis], path.machine.stroke_mm[axis]) ** 2 - VISITED
@@ -44,7 +44,7 @@ EFFECT = Effect(
     unit="urad",
     per_unit=1.0,
     typical=(5.0, 60.0),
-    shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "effects.md 3: as the growth of axes", (900.0, 2500.0, 7000.0)),),
+    shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "as for the growth of axes", (900.0, 2500.0, 7000.0)),),
     signal=of_path(leaning),
     strength=first,
     forms=(Form("second time constant", of_path(_second_time)), Form("bent", of_path(_bent))),
@@ -52,7 +52,7 @@ EFFECT = Effect(
     signature="an oval at 45 degrees that drifts from run to run",
     remedy="warm up or sensor",
     remedy_text="warm up before work, keep sun and draught off the column; a sensor-driven squareness correction if the control has one",
-    source="effects.md 3; Procedia CIRP 58 (2017) 457: tilt of about 50 urad",
+    source="Procedia CIRP 58 (2017) 457: tilt of about 50 urad",
     separated_by={
         "axis_thermal_growth": ("laser_diagonals", "longer_session"),
         "spindle_thermal_drift": ("second_radius", "longer_session", "laser_diagonals"),

@@ -164,9 +164,9 @@ def sampled(
     ----------
     machine : Machine
     functions : mapping
-        ``"EXX"`` .. ``"ECZ"``: positions in mm, shape (nodes,), to values in mm or rad; what is missing is zero.
+        ``"EXX"`` .. ``"ECZ"``: positions in mm, shape (nodes,), to values in mm or rad; missing ones are zero.
     squareness_rad : mapping, optional
-        ``"C0Y"``, ``"B0Z"``, ``"A0Z"``; what is missing is zero.
+        ``"C0Y"``, ``"B0Z"``, ``"A0Z"``; missing ones are zero.
     nodes : int
         Evenly spaced positions per axis, ends included. Between them the tables are straight: a function that bends is met the better the
         more there are (error at most curvature times spacing squared over 8).

@@ -223,7 +223,7 @@ def test_slopes_become_the_squareness_of_the_lines():
         (lambda: ErrorMotions().motions(np.zeros((2, 3)), np.zeros(3)), r"direction: expected -1, 0 or \+1 in shape \(2, 3\)"),
         (lambda: ErrorMotions().motions(np.zeros((1, 3)), [[0.5, 0, 0]]), "direction"),
         (lambda: ErrorMotions().sensitivities(["EXX.0"], np.zeros((1, 3))), "'EXX.0' is not a parameter"),
-        (lambda: ErrorMotions({"EYX@reverse": Polynomial([1.0])}).straightened(STROKE), "has no one slope"),
+        (lambda: ErrorMotions({"EYX@reverse": Polynomial([1.0])}).straightened(STROKE), "has two slopes and cannot be straightened"),
     ],
 )
 def test_what_is_no_machine_error_is_refused(call, message):
