@@ -21,9 +21,9 @@ from abbe.service.storage.engine import parse_url as parse_database
 Positive = Annotated[float, Field(gt=0.0)]
 
 SHORTEST_MM, LONGEST_MM = 50.0, 50_000.0
-"""Range of real machines' strokes. A machine of a metre or two, given in inches, falls below the shortest."""
+"""Range of real machines' strokes. A stroke up to 1.27 m, given in inches, falls below the shortest."""
 COLDEST_C, WARMEST_C = -20.0, 50.0
-"""Air temperatures of measurements; 68 to 72 is Fahrenheit."""
+"""Plausible air temperatures; a window such as 68 to 72 is in Fahrenheit."""
 CERTIFICATES = (date(2000, 1, 1), date(2199, 12, 31))
 """Earliest and latest plausible last day of a certificate; the demonstration's are of 2099."""
 
@@ -125,7 +125,7 @@ class StoreSection(Section):
     capture_reserve_mib: Annotated[float, Field(ge=0.0625, le=1024.0)] = Field(
         default=16.0, description="disk space reserved so that a run can be closed when the disk is full"
     )
-    keep_segments: bool = Field(default=False, description="keep the capture files after the database has everything")
+    keep_segments: bool = Field(default=False, description="keep the capture files after their samples are in the database")
 
 
 class Limits(Section):
@@ -134,8 +134,8 @@ class Limits(Section):
     table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=100.0, description="largest correction at any grid point")
     table_change_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
         default=50.0,
-        description="largest change of a correction against the active table; the first push on a raw machine, which replaces nothing by "
-        "everything, may need more: look at the proposal first",
+        description="largest change of a correction against the active table; the first push on an uncorrected "
+        "machine may need more: look at the proposal first",
     )
     table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(
         default=20.0, description="largest change between neighbouring grid points"
@@ -153,7 +153,7 @@ class Limits(Section):
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
     temperature_c: Temperatures = Field(default=(18.0, 24.0), description="permitted air temperature of a measurement")
     run_temperature_c: Temperatures | None = Field(
-        default=None, description="air temperature (of the laser) outside which a running measurement stops; absent: not watched"
+        default=None, description="air temperature, read from the laser, outside which a running measurement stops; absent: not watched"
     )
     continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
         default_factory=list,
@@ -215,8 +215,8 @@ class Mqtt(Section):
         description="authority that signed the broker's certificate, PEM file (relative to the machine file's folder); empty: the "
         "authorities that this computer trusts",
     )
-    certificate: str = Field(default="", description="our certificate, PEM file, if the broker asks for one")
-    key: str = Field(default="", description="private key of our certificate, PEM file")
+    certificate: str = Field(default="", description="client certificate of Abbe, PEM file, if the broker asks for one")
+    key: str = Field(default="", description="private key of this certificate, PEM file")
 
     @model_validator(mode="after")
     def _encrypted(self) -> Self:
@@ -233,7 +233,7 @@ class Web(Section):
     host: str = Field(
         default="127.0.0.1",
         min_length=1,
-        description="address to listen on; other than this computer's own (127.0.0.1, ::1, localhost) only with users and a certificate",
+        description="address to listen on; any but this computer's own (127.0.0.1, ::1, localhost) needs users and a certificate",
     )
     port: int = Field(default=8080, ge=0, le=65535, description="0: any free port")
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9.:\[\]-]{1,253}$")]] = Field(
@@ -268,7 +268,7 @@ class OpcUa(Section):
     host: str = Field(
         default="127.0.0.1",
         min_length=1,
-        description="address to listen on; other than this computer's own only with certificate, key and clients",
+        description="address to listen on; any but this computer's own needs certificate, key and clients",
     )
     port: int = Field(default=4840, ge=0, le=65535, description="0: any free port")
     certificate: str = Field(
@@ -288,7 +288,7 @@ class OpcUa(Section):
 
     @property
     def exposed(self) -> bool:
-        """Whether other computers can reach it: then every client needs encryption and a known certificate."""
+        """Whether other computers can reach the server: then every client needs encryption and a known certificate."""
         try:
             return not ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -307,7 +307,7 @@ def _public_key(text: str) -> str:
 
 
 class Signatures(Section):
-    """Whose signature makes a compensation file more than a candidate."""
+    """Keys whose signature makes a compensation file more than a candidate."""
 
     trusted: list[Annotated[str, AfterValidator(_public_key)]] = Field(
         default_factory=list, description="public keys of metrologists, 64 hex digits each, as `abbe key new` prints them"
@@ -321,11 +321,13 @@ class AlarmSection(Section):
         default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within this many days (lower end, 95 %); 0: never"
     )
     campaign: str = Field(
-        default="identification", min_length=1, description="what on_alarm measures: identification, or a recipe FILE.toml beside this file"
+        default="identification",
+        min_length=1,
+        description="what a schedule with on_alarm measures: identification, or a recipe FILE.toml beside this file",
     )
     push: Literal["never", "approved"] = Field(
         default="never",
-        description="approved: the service pushes a proposal that a person has approved when the machine is idle, and verifies it",
+        description="approved: when the machine is idle, the service pushes a proposal that a person has approved, and verifies it",
     )
     watch_table: bool = Field(
         default=True, description="check every 10 s whether another program activated a compensation table, and raise an alarm"

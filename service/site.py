@@ -19,9 +19,9 @@ from abbe.service.sequences.nc.write import NcSettings
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What a workflow needs to know about a machine. ``doc`` is the machine object of run-format.md 1.
+    """What a workflow needs to know about a machine. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
-    ``calibrated_until``: last days of the certificates of ``ballbar`` and ``laser``; an instrument without certificate is absent.
+    ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``control``: identity of the control
     (`control_of`); empty without a control.
     """
@@ -45,7 +45,7 @@ class Site:
 
 
 def machine_from_doc(doc: dict[str, Any]) -> Machine:
-    """Return the nominal geometry of a machine object (run-format.md 1); pivots and tool default to zero.
+    """Return the nominal geometry of a machine object (docs/schemas/machine.schema.json); pivots and tool default to zero.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def machine_from_doc(doc: dict[str, Any]) -> Machine:
 
 
 def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[str, Any]:
-    """Return the machine object of run-format.md 1 for a nominal geometry."""
+    """Return the machine object (docs/schemas/machine.schema.json) for a nominal geometry."""
     return {
         "name": name,
         "chain": machine.chain,

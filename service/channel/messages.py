@@ -1,7 +1,7 @@
 """The channel between core and web process: all messages, and its two ends (`Wire`).
 
 Messages are frozen, validated at both ends, and bounded in length. They travel as four bytes of length, then JSON, over a socket pair that
-the parent created: without a file, a port or a name no other process can connect to it.
+the parent created; it has no file, port or name to which another process could connect.
 
 The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`); the web process forwards what a person
 requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
@@ -53,7 +53,7 @@ class RulesSummary:
 
 @dataclass(frozen=True, slots=True)
 class MachineSummary:
-    """Nominal geometry of the machine (run-format.md 1) and its largest feed: the input of a dry run."""
+    """Nominal geometry of the machine and its largest feed: the input of a dry run."""
 
     chain: Word
     stroke_mm: dict[str, tuple[float, float]]
@@ -64,7 +64,7 @@ class MachineSummary:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """First message of the core: the configuration of the web process. Other users could read arguments or environment variables."""
+    """First message of the core: the configuration of the web process. Arguments or environment variables would be readable for others."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["begin"]
@@ -115,7 +115,7 @@ class Jobs:
 
 @dataclass(frozen=True, slots=True)
 class LivePath:
-    """The path that is being recorded; number 0: none."""
+    """The path that is being recorded; number 0: no path."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["path"]
@@ -193,7 +193,7 @@ class SteerJob:
 
 @dataclass(frozen=True, slots=True)
 class ConfirmPrompt:
-    """Confirm that prompt number ``prompt`` of a job, and no other prompt, is done."""
+    """Confirm a job's prompt with the number ``prompt``: its manual task is done. Refused if another prompt is open."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["hand"]
@@ -241,7 +241,7 @@ FROM_WEB: TypeAdapter[FromWeb] = TypeAdapter(Annotated[FromWeb, Field(discrimina
 
 
 def encode(message: FromCore | FromWeb) -> bytes:
-    """A message as bytes.
+    """Return a message as JSON bytes, after checking it.
 
     Raises
     ------
@@ -269,13 +269,13 @@ def from_web(body: bytes) -> FromWeb:
 
 def _checked(adapter: TypeAdapter[T], body: bytes) -> T:
     if len(body) > LARGEST_B:
-        raise ChannelBroken(f"a message of {len(body)} bytes on the channel of the service; allowed are {LARGEST_B}")
+        raise ChannelBroken(f"a message of {len(body)} bytes between core and web process; allowed are {LARGEST_B}")
     try:
         return adapter.validate_json(body)
     except ValidationError as wrong:
         first = wrong.errors(include_input=False, include_url=False)[0]
         location = ".".join(str(part) for part in first["loc"])
-        raise ChannelBroken(f"invalid message on the channel of the service: {location}: {first['msg']}") from None
+        raise ChannelBroken(f"invalid message between core and web process: {location}: {first['msg']}") from None
 
 
 _LENGTH = struct.Struct(">I")
@@ -297,7 +297,7 @@ class Wire:
 
     @property
     def is_full(self) -> bool:
-        """Whether so much waits for the reader that updates should be skipped."""
+        """Whether more than `FULL_B` bytes wait for the reader: skip updates then."""
         return self._writer.transport.get_write_buffer_size() > FULL_B
 
     def send(self, message: FromCore | FromWeb) -> None:
@@ -323,7 +323,7 @@ class Wire:
         try:
             (size,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
             if size > LARGEST_B:
-                raise ChannelBroken(f"a message of {size} bytes was announced on the channel of the service; allowed are {LARGEST_B}")
+                raise ChannelBroken(f"a message of {size} bytes was announced between core and web process; allowed are {LARGEST_B}")
             return await self._reader.readexactly(size)
         except (asyncio.IncompleteReadError, ConnectionError):
             return None

@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     ``arguments``: replaces the command line's, for tests.
     """
-    # For matrices of some hundred unknowns BLAS threads cost more than they save: minutes where other programs compute too.
+    # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = run(arguments)
@@ -50,7 +50,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         code = int(app(args=arguments, prog_name="abbe", standalone_mode=False) or 0)
         sys.stdout.flush()
         return code
-    except (AbbeError, DriverError) as err:  # before OSError: a device that does not answer raises a TimeoutError, which is one
+    except (AbbeError, DriverError) as err:  # before OSError, to which a device's ReplyTimeout belongs too
         return complain(err.code, "; ".join([str(err), *getattr(err, "__notes__", [])]))
     except OSError as err:
         return _unwritten(err)
@@ -82,7 +82,7 @@ def _unwritten(err: OSError) -> int:
         os.close(nowhere)
     if err.errno == errno.EPIPE:
         return 1  # the reader has closed the pipe; typer does the same
-    return complain("USE-002", f"the output cannot be written: {err.strerror} - give stdout a place to go")
+    return complain("USE-002", f"the output cannot be written: {err.strerror} - redirect stdout to a file or pipe that can be written")
 
 
 def complain(code: str, text: str) -> int:
@@ -129,7 +129,7 @@ PLAIN = {
 
 
 def _degrade() -> None:
-    """Make stdout and stderr replace characters missing in their encoding: by plain letters, or ``?`` where there are none."""
+    """Make stdout and stderr replace characters that their encoding lacks by plain letters, or by ``?``."""
     codecs.register_error(PLAIN_ERRORS, _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -130,7 +130,7 @@ def print_json(value: Any) -> None:
 
 
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> None:
-    """Write a table to stdout; when piped, at full width and without lines."""
+    """Write a table to stdout; when piped, 400 columns wide, so that rows rarely wrap."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table

@@ -38,7 +38,7 @@ def demo(
     """Measure a simulated machine tool over real wires, correct it, and prove that it became better.
 
     With --serve: the service checks the machine by a timetable; the machine drifts, an alarm reports it, and a proposal waits in the page
-    for a person; after approval the service pushes and verifies it. With --hidden: find the physical effect that the simulation of the
+    for a person; after approval the service pushes and verifies it. With --hidden: find the physical effect that the model of the
     machine lacks, prove it on a new measurement, and reveal the truth.
     """
     if hidden is not None:
@@ -84,7 +84,7 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     report = folder / "discovery.html"
     assert result.job is not None
     assert result.journal is not None
-    # The truth is not in the report: at a real machine there is none.
+    # The report leaves out the truth, which nobody knows of a real machine.
     write_document(found_report(result.job, result.journal, result.finding, result.started_utc), report)
     if as_json:
         sys.stdout.write(json.dumps({"seed": seed, "speed": speed} | hidden_json(result), indent=2) + "\n")
@@ -115,7 +115,7 @@ def _folder(keep: Path | None) -> Path:
 
 @contextmanager
 def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
-    """Yield the folder of database and links: the kept one, which must not hold another demonstration, or a temporary one."""
+    """Yield the folder for database and device links: ``folder``, which must not hold another demonstration, or a temporary one."""
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="abbe-") as name:
             yield Path(name)
@@ -145,5 +145,5 @@ def print_result(out: Console, result: DemoResult) -> None:
     out.print(table)
     found = demo_json(result)
     best, share = found["best_nine_tables_rms_um"], 100 * found["volumetric_factor"]["share"]
-    out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; {share:.0f} % of their factor was reached")
+    out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; {share:.0f} % of their improvement factor was reached")
     out.print(("kept: " if found.get("kept") else "rolled back: ") + str(found.get("verdict", "")))

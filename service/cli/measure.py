@@ -50,7 +50,7 @@ def measure(  # noqa: PLR0913 - one argument for each option
     picture: Annotated[Path | None, typer.Option(metavar="FILE.html", help="With --dry-run: a page with the paths in three views.")] = None,
     nc: Annotated[str, typer.Option(help="Write an NC program: siemens, fanuc, heidenhain, linuxcnc or iso; with --out.")] = "",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where --nc writes.")] = None,
-    resume: Annotated[str, typer.Option(help="Resume this interrupted campaign; its recipe is known.")] = "",
+    resume: Annotated[str, typer.Option(help="Resume this interrupted campaign; its recipe is in the store.")] = "",
     untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: the mounted instruments were not touched.")] = False,
     accept_table: AcceptTable = False,
 ) -> None:
@@ -123,7 +123,7 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
 def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
     """Refuse a plan that the machine file lacks devices for; warn of an expired certificate and of a timetable that cannot be kept.
 
-    With a controller, `measure` refuses the plan itself, after it has rolled back an interrupted push.
+    If a controller is configured, `abbe.service.campaigns.measure` refuses such a plan, after an interrupted push was rolled back.
     """
     from abbe.service.campaigns.plausibility import certificates, check_configured, needed_by, unattended
     from abbe.service.clock import SystemClock
@@ -218,7 +218,7 @@ def correct(
     with Store.open(loaded.database_url) as store:
         try:
             found = run_job(work(store))
-        except TakenBack as error:  # the answer is no, not a fault
+        except TakenBack as error:  # a negative answer, not a fault
             typer.echo("; ".join([f"rolled back: {error.detail}", *getattr(error, "__notes__", [])]))
             raise typer.Exit(1) from None
     typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
@@ -247,7 +247,7 @@ async def verification_before(session: Session, store: Store, site: Site, campai
 
 @asynccontextmanager
 async def ready_session(store: Store, site: Site, *, accept_table: bool = False) -> AsyncIterator[Session]:
-    """Open the machine's devices, after an interrupted push was rolled back: nothing is measured with its table.
+    """Open the machine's devices; roll back an interrupted push first, so that nothing is measured with its table.
 
     ``accept_table``: the person at the console vouches for a table in force that this database did not push.
     """
@@ -266,8 +266,9 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
 
 
 def warn_of_open_push(url: str, site: Site) -> None:
-    """Warn on stderr, without a connection, of unfinished pushes in the journals: into this control, or into another that may be this one
-    under another address (`open_pushes`).
+    """Warn on stderr of unfinished pushes, as the push journals show them: nothing connects to the control.
+
+    Pushes into this control count, and pushes into another address that may be the same control (`open_pushes`).
     """
     from abbe.service.cli.common import open_store
     from abbe.service.errors import StoreError
@@ -285,11 +286,11 @@ def warn_of_open_push(url: str, site: Site) -> None:
 
 def listen(
     machine: MachineArgument,
-    recipe: Annotated[Path, typer.Option(metavar="FILE.toml", help="The recipe that the NC program was written from; laser tests.")],
+    recipe: Annotated[Path, typer.Option(metavar="FILE.toml", help="The recipe from which the NC program was written; laser tests only.")],
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
     accept_table: AcceptTable = False,
 ) -> None:
-    """Listen to the laser while the operator runs the NC program of a recipe; its standstills become the readings."""
+    """Record the laser while the operator runs the NC program of a recipe; each standstill of the program becomes a reading."""
     from abbe.service.campaigns.listen import listen_campaign
     from abbe.service.cli.running import run_job
     from abbe.service.clock import SystemClock
@@ -321,7 +322,7 @@ HAIR = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """The request: a dry run (with every position, with a picture), or an NC program in a dialect."""
+    """What to do instead of measuring: a dry run, with every position or a picture, or an NC program in a dialect."""
 
     dry_run: bool
     path: bool
@@ -365,7 +366,7 @@ class Rehearsal:
         if self.nc and self.out is not None:
             made = nc_program(site.name, site.machine, plan, self.nc, site.nc)
             write_page(made.text, self.out)
-            typer.echo(f"NC program: {self.out} ({self.nc}), {made.size}; read it before it runs")
+            typer.echo(f"NC program: {self.out} ({self.nc}), {made.size}; read it before you run it")
             if made.warning:
                 typer.echo(f"warning: {made.warning}", err=True)
             return
@@ -392,7 +393,7 @@ NARROWEST = 8
 
 
 def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
-    """Print one line a test: time, path, extent, largest speed, readings."""
+    """Print one line per test: time, path, extent, largest speed, readings."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text

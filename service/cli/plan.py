@@ -1,4 +1,4 @@
-"""`abbe plan`: the measurements worth the available minutes, as a recipe that `abbe measure` runs."""
+"""`abbe plan` chooses the measurements that tell most in the available minutes, and writes them as a recipe for `abbe measure`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def plan(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan a campaign: what to measure, in which order, what each measurement buys in µm. Nothing moves."""
+    """Plan a campaign: what to measure, in which order, and how far each measurement lowers U. Nothing moves."""
     from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report, read_instruments
     from abbe.service.cli.running import display
     from abbe.service.config import load_machine
@@ -56,7 +56,7 @@ def plan(
 
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
-    """Refuse a target that is a folder, an input of this command, or used twice: before half a minute of planning."""
+    """Refuse, before half a minute of planning, a target that cannot be written, is an input of this command, or is used twice."""
     from abbe.service.errors import ConfigError
 
     taken = [p.resolve() for p in sources if p is not None]

@@ -1,4 +1,4 @@
-"""`abbe papers` and `abbe vectors`: computed numbers beside those of four papers and of independent vector files."""
+"""`abbe papers` and `abbe vectors`: compare computed numbers with those printed in four papers and in independent files of test vectors."""
 
 from __future__ import annotations
 
@@ -34,15 +34,14 @@ NAME = 12
 
 PARTS: dict[Source, tuple[str, str]] = {
     "paper": ("", "printed numbers"),
-    "math.md": ("Stated by math.md", "numbers of math.md"),
-    "own check": ("Own checks on its numbers: what comes back is what was put in", "own checks (no printed numbers)"),
+    "math.md": ("Stated by math.md, the specification of Abbe's formulas", "numbers of math.md"),
+    "own check": ("Own checks: numbers that are put in must come back", "own checks (no printed numbers)"),
 }
-"""Title of the table of each source, empty for the title of the paper, and the name of what is counted."""
+"""For each source, the title of its table (empty: the paper's title) and the name of its entries in the counts."""
 
 LEGEND = (
-    "reproduced: computed from independent inputs and equal to the last printed digit; consistent: apart by no more than what rounded"
-    " inputs allow (within), or a bound that holds; input: given, nothing to compute; not reproducible: the paper does not hold what it"
-    " takes"
+    "reproduced: computed from independent inputs, and equal to the last printed digit; consistent: off by no more than rounded inputs"
+    " allow (within), or a bound that holds; input: given, nothing to compute; not reproducible: the paper does not give the inputs"
 )
 
 
@@ -62,7 +61,7 @@ def papers(
         Path | None, typer.Option("--html", metavar="FILE", help="Also write a report with the papers' pictures.", show_default=False)
     ] = None,
 ) -> None:
-    """Compute the numbers that the four papers print, beside the printed ones, and state why some cannot be computed."""
+    """Compute the numbers that the four papers print, show both side by side, and state why some cannot be computed."""
     from abbe.service.reference.paper_results import TITLES, document, results
 
     found = results(TITLES if paper is None else (paper.value,))
@@ -82,10 +81,10 @@ def papers(
 
 
 def vectors(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with vector files (*.json).")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with files of test vectors (*.json).")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compute every number of the vector files from the files' own inputs and compare. Exit 1: one is off; 2: a file is unusable."""
+    """Recompute every number of the files from their own inputs, and compare. Exit code 1: a number deviates; 2: a file is unusable."""
     from abbe.service.reference.vector_results import check_file, document, vector_files
 
     checked = []

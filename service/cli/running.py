@@ -39,7 +39,7 @@ def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
     job : coroutine
         Stops the axes by its own motion guards and clean-up.
     control : Control, optional
-        Of a measurement: the first Ctrl-C only asks it to stop at a safe place, and SIGUSR1 pauses or resumes it.
+        Control of a measurement. With it, the first Ctrl-C only asks for a stop at a safe place, and SIGUSR1 pauses or resumes.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
     results: list[T] = []
 
     async def work() -> None:
-        # Not returned: at its end asyncio formats the main task with its result, which takes seconds for a solution.
+        # Not returned: asyncio would format the main task's result at the end, which takes seconds for a solution.
         results.append(await _cancelled_by_signal(job, received, control))
 
     try:
@@ -77,7 +77,7 @@ async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int],
     assert task is not None
 
     def stop(number: int, _frame: FrameType | None) -> None:
-        # A second signal cancels once more: what must reach the machine is shielded from it (abbe.drivers.errors).
+        # A second signal cancels again; `abbe.drivers.errors.run_to_end` shields commands that must reach the machine.
         received.append(number)
         gently = control is not None and number == signal.SIGINT and len(received) == 1
         if control is not None:  # code that mistakes the cancellation for something else still sees the request
@@ -99,7 +99,7 @@ def _handled(stop: Handler, names: tuple[str, ...]) -> Iterator[None]:
     for name in names:
         number = getattr(signal, name, None)  # Windows has no SIGHUP
         if number is None or (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
-            continue  # started with nohup: it must survive the terminal
+            continue  # started with nohup: the process must survive the terminal
         before[number] = signal.signal(number, stop)
     try:
         yield
@@ -204,7 +204,9 @@ async def console_ask(text: str) -> None:
     import termios  # here: a platform without termios still plans and reads
 
     if not sys.stdin.isatty():
-        raise ConfigError(f"no one is at the console to: {text}", "run this from a terminal, or configure a remote fixture")
+        raise ConfigError(
+            f"no one is at the console, but a person has to act: {text}", "run this from a terminal, or configure a remote fixture"
+        )
     # The descriptor itself: Python's buffer would keep a pasted second line for the next question, out of reach of tcflush.
     line = sys.stdin.fileno()
     termios.tcflush(line, termios.TCIFLUSH)
@@ -215,7 +217,7 @@ async def console_ask(text: str) -> None:
 
 
 def person_at_console() -> Ask:
-    """Return how to ask at this console: the person at the terminal, or `no_console`, which refuses before anything moves."""
+    """Return the function that asks a person: `console_ask` at a terminal, else `no_console`, which refuses before anything moves."""
     from abbe.service.devices.session import no_console
 
     return console_ask if sys.stdin is not None and sys.stdin.isatty() else no_console

@@ -140,7 +140,7 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
         patch.setattr(StoreBook, "append", dies)
         kept = asyncio.run(kept_and_open())
     assert run(["comp", "rollback", str(sims.machine_file), "--yes"]) == 0
-    assert "push 2 was open and is finished" in capsys.readouterr().out
+    assert "push 2 was unfinished and is ended now" in capsys.readouterr().out
     table, entries = asyncio.run(now())
     assert (table, entries[-1]) == (kept, (2, PushState.ROLLED_BACK))
     assert run(["comp", "rollback", str(sims.machine_file), "--yes"]) == 0  # ordered once more: further back

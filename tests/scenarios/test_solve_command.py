@@ -127,7 +127,7 @@ def test_grid_and_tables_on_request(command, small, tmp_path):
     assert used.any()
     assert (rows[~used, 3:6] == rows[~used, 3:6][:1]).all()  # no distance between two nodes that are left alone changes
     assert np.allclose(rows[:, 3:6] / 0.1, np.round(rows[:, 3:6] / 0.1), atol=1e-6)  # the machine's unit
-    kinds = text.split("left of errors of distances")[1]
+    kinds = text.split("error of distances left")[1]
     assert len(re.findall(r"\d ± \d", kinds)) >= 9
 
 

@@ -1,1 +1,1 @@
-"""Commands for who runs the service: users, backup, audit, keys, fleet, alarms."""
+"""Commands for the person who runs the service: users, backup, audit, keys, fleet, alarms."""

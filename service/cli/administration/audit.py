@@ -1,7 +1,7 @@
-"""`abbe audit`: who did what, and the proof that no record was changed; and the recorder of every command that changes something.
+"""`abbe audit` shows and verifies the audit; `record_all` makes every command that changes something write a record.
 
-Before a command begins, its record must be possible: what cannot be recorded is not done. A command that no list here names is recorded,
-and a test fails until it is listed.
+A command that cannot be recorded does not begin. A command that is in no list of this module is recorded, and a test fails until it is
+listed.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ def show_audit(
     if as_json:
         print_json([json_value(record) for record in found])
         return
-    # A line break in a target must not look like another record: tables alone would keep it.
+    # Escaped here, since `print_table` keeps line breaks: one in a target must not look like another record.
     rows = [tuple(map(visible, (str(r.id), r.utc[:19], r.who, r.action, r.target, r.outcome))) for r in found]
     print_table(("record", "when (UTC)", "who", "what", "on", "outcome"), rows)
 
 
 @audit.command("verify")
 def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
-    """Prove that no record was changed, removed, exchanged or cut off at the end (exit code 1: one was)."""
+    """Check that no record was changed, removed, exchanged or cut off at the end; exit code 1 if one was."""
     from abbe.service.audit.book import AuditBook
     from abbe.service.secrets import visible
 
@@ -79,7 +79,7 @@ def _always(_: Given) -> bool:
 
 
 def _moves(given: Given) -> bool:
-    """A dry run of `abbe measure`, or one that writes an NC program, changes nothing."""
+    """Return whether `abbe measure` moves the machine: not for a dry run or an NC program."""
     return not (given.get("dry_run") or given.get("nc") or given.get("path") or given.get("picture"))
 
 
@@ -183,7 +183,7 @@ def _recorded(command: str, work: Any) -> Any:
         _check_recordable(command, given)
         try:
             result = work(**given)
-        except typer.Exit as ended:  # most commands that answer by an exit code end like this: it counts as a return
+        except typer.Exit as ended:  # an answer by exit code: a normal end
             _record(command, given, outcome_of(ended))
             raise
         except BaseException as error:
@@ -214,7 +214,7 @@ def _check_recordable(command: str, given: Mapping[str, Any]) -> None:
     Raises
     ------
     AbbeError
-        The machine file or the database is refused anyway, or the audit cannot be written; the latter with its remedy.
+        The machine file or the database is refused, or the audit cannot be written.
     """
     from abbe.service.audit.book import HEADS, KEY, AuditBook, files_base, files_ready
     from abbe.service.cli.common import database_url, open_store
@@ -232,7 +232,7 @@ def _check_recordable(command: str, given: Mapping[str, Any]) -> None:
         with open_store(url) as store:
             AuditBook(store, url).ready()
     except AuditBroken as error:
-        raise AuditBroken(f"abbe {command} was not begun, since it could not be recorded: {error.detail}", error.remedy) from None
+        raise AuditBroken(f"abbe {command} was not started, because it could not be recorded: {error.detail}", error.remedy) from None
 
 
 def _record(command: str, given: Mapping[str, Any], outcome: str, error: BaseException | None = None) -> None:

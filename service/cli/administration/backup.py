@@ -25,7 +25,7 @@ def backup(
     without_key: Annotated[bool, typer.Option("--without-key", help="Leave out the audit's key; keep it elsewhere.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Copy the database, samples that it does not have yet, and the audit into a new folder while the service runs. The copy is checked."""
+    """Copy the database, samples that are not yet in it, and the audit into a new folder, and check the copy. The service may run."""
     from abbe.service.backup.backup import back_up
     from abbe.service.clock import SystemClock
     from abbe.service.domain.document import document
@@ -40,7 +40,7 @@ def backup(
         for text in made.audit.faults[:3]:
             typer.echo(f"audit: {text}")
         if made.audit.records and not made.audit.key:
-            typer.echo("without the key of the audit: abbe restore will ask for it (--audit-key)")
+            typer.echo("the backup does not contain the audit's key: abbe restore needs it (--audit-key FILE)")
     raise typer.Exit(1 if made.audit.faults else 0)
 
 
@@ -55,7 +55,7 @@ def restore(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Restore a backup, after checking its files, its schema and its audit. Refused over a database that exists or is in use."""
+    """Check a backup's files, schema and audit, then restore it. A database in use, or existing without --replace, is refused."""
     from abbe.service.backup.restore import restore as restore_backup
     from abbe.service.clock import SystemClock
     from abbe.service.domain.document import document
@@ -70,9 +70,9 @@ def restore(
     typer.echo(f"{done.database}: as of {done.backup.listed.made_utc}, {rows['runs']} runs, {rows['verifications']} checks")
     typer.echo(f"audit: {done.records} records, all there and as written")
     if done.segments:
-        typer.echo(f"{done.segments} segments: the next command that connects to the machine takes them over")
+        typer.echo(f"{done.segments} files of samples: the next command that connects to the machine stores them in the database")
     for path in aside:
-        typer.echo(f"put aside: {path}")
+        typer.echo(f"set aside: {path}")
 
 
 def _places(places: list[Path], store: str | None, last: str) -> tuple[BackupSource, Path]:

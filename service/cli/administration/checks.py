@@ -21,7 +21,7 @@ def list_alarms(
     every: Annotated[bool, typer.Option("--all", help="Also those that are over and acknowledged.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
+    """List alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
     from abbe.service.config import load_machine
     from abbe.service.queries.reader import json_value
     from abbe.service.queries.status import alarms
@@ -50,7 +50,7 @@ def acknowledge(
         str, typer.Option("--as", metavar="NAME", help="Who has seen the alarm. Default: the account.", show_default=False)
     ] = "",
 ) -> None:
-    """Note that a person has seen an alarm. It stays active until a check clears it."""
+    """Note that a person has seen an alarm. The alarm stays active until a check clears it."""
     from abbe.service.compensation.proposals import login
     from abbe.service.config import load_machine
     from abbe.service.verification.alarms import acknowledge as work
@@ -68,7 +68,7 @@ def fleet(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List every machine of a database: state, last check with figures and U, next due, and which limit comes first."""
+    """List every machine of a database: state, last check with figures and U, next check, and which limit is reached first."""
     from abbe.service.cli.common import database_url
     from abbe.service.clock import SystemClock
     from abbe.service.queries.fleet import HEADINGS, as_doc, row
@@ -82,7 +82,7 @@ def fleet(
     if as_json:
         print_json(as_doc(lines))
     elif not lines:
-        typer.echo("no machine is in this database yet: abbe serve, or abbe measure")
+        typer.echo("no machine is in this database yet: run abbe serve or abbe measure")
     else:
         print_table(HEADINGS, [row(one) for one in lines])
 
@@ -100,7 +100,7 @@ def trend(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the trend of each judged figure: in control or drifting since when, and days until the limit with their uncertainty."""
+    """Show the trend of each judged figure: in control, or drifting since when; days until its limit, with their uncertainty."""
     from abbe.service.cli.common import reader_of
     from abbe.service.queries.reader import json_value
     from abbe.service.queries.results import trends
@@ -117,10 +117,10 @@ def trend(
     if not known.holds:
         typer.echo(f"{known.text}: {measure_now(str(machine))}" if known.state == "unverified" else known.text)
     if not found.figures and known.changes:
-        typer.echo(f"no check of {found.machine} has figures since the table in force came: --after shows those before it")
+        typer.echo(f"no check of {found.machine} has figures since the present table came into force: --after UTC shows older ones")
         return
     if not found.figures:
-        typer.echo(f"no check of {found.machine} has figures yet: abbe serve, or abbe serve --once")
+        typer.echo(f"no check of {found.machine} has figures yet: run abbe serve, or abbe serve --once")
         return
     print_table(HEADINGS, [row(one) for one in found.figures])
 

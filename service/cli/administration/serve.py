@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 LONGEST_NAME = 180
-"""Longest name of a recipe that a person starts: page and core exchange texts of 200 characters, and a rate follows the name."""
+"""Longest name, characters, of a recipe that a person may start: messages between core and page hold 200, and a rate is appended."""
 
 
 def serve(
@@ -61,8 +61,8 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     Raises
     ------
     AbbeError
-        A schedule names no recipe, its paths leave the machine's strokes, or a device that it needs is not configured: reported now rather
-        than at the first slot, at night.
+        A schedule names an unknown recipe, its paths leave the machine's strokes, or a device that it needs is not configured. Reported
+        now, not at the first slot in the night.
     """
     from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
     from abbe.service.capture.live import LiveFeed
@@ -168,7 +168,7 @@ def duties_on(
 ) -> Callable[[Store], Duties]:
     """Return what the service does about alarms, given its store.
 
-    ``plan``: the full campaign; ``rate_hz``: of verifications; ``live``: gets the samples of the campaign's paths.
+    ``plan``: the full campaign; ``rate_hz``: ball-bar rate of verifications; ``live``: gets the samples of the campaign's paths.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved

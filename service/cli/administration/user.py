@@ -1,4 +1,4 @@
-"""`abbe user`: users of the page and the interface, and their roles; `abbe key`: keys that sign compensation files."""
+"""`abbe user`: users of the pages and the HTTP interface, and their roles; `abbe key`: keys that sign compensation files."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from abbe.service.users.people import People
 
 
-user = typer.Typer(help="Users of the page and of the interface: viewer, operator, metrologist, approver, admin.", no_args_is_help=True)
-token = typer.Typer(help="Tokens of programs: the rights of a user, at most those of their scopes.", no_args_is_help=True)
+user = typer.Typer(help="Users of the pages and the HTTP interface: viewer, operator, metrologist, approver, admin.", no_args_is_help=True)
+token = typer.Typer(help="Tokens for programs: each gives the rights in its scopes, as far as its user has them.", no_args_is_help=True)
 user.add_typer(token, name="token")
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the user.", show_default=False)]
@@ -50,7 +50,7 @@ def list_users(db: DbOption = None, machine: MachineOption = None, as_json: Json
 
 @user.command("role")
 def set_role(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None) -> None:
-    """Give a user another role. The user's sessions end; tokens keep the part of their scopes that the new role has."""
+    """Give a user another role. The user's sessions end; tokens keep those of their scopes that the new role allows."""
     with _people(db, machine) as (people, _):
         people.set_role(name, role)
     typer.echo(f"user {name!r} is {role}")
@@ -136,7 +136,7 @@ def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) ->
 
 
 def _password() -> str:
-    """Read a password: from a terminal, typed twice and not shown; else the first line of stdin. Never an argument: others see those."""
+    """Read a password: from a terminal, typed twice and not shown, else the first line of stdin; not an argument, which others see."""
     from abbe.service.errors import PasswordRefused
 
     if not sys.stdin.isatty():
@@ -158,7 +158,7 @@ def new(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Create a key. The private one stays in FILE, readable by its owner only; the public one is printed, for [signatures] trusted."""
+    """Create a key pair. FILE gets the private key, readable by its owner only; the public key is printed, for [signatures] trusted."""
     from abbe.service.signed.keys import new_key
 
     typer.echo(new_key(file))

@@ -1,4 +1,4 @@
-"""`abbe discover`: find, size and prove what the simulation of a machine lacks; nothing is written to the machine."""
+"""`abbe discover`: find, size and prove the effects that the model of a machine lacks; nothing is written to the machine."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
 
 @contextmanager
 def opened(campaign: str, db: str | None, machine: Path | None, without: list[str]) -> Iterator[tuple[Campaign, Store | None]]:
-    """Yield a campaign and its store; for a folder None if no database is named."""
+    """Yield a campaign and its store; the store is None for a folder if no database is named."""
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder
 
     if is_folder(campaign):
@@ -110,7 +110,7 @@ def _check_live(campaign: str, machine: Path | None) -> None:
 def _run_live(
     store: Store, machine: Path, at: tuple[DiscoveryJob, DiscoveryJournal, Finding], *, accept_table: bool = False
 ) -> tuple[DiscoveryJob, DiscoveryJournal, Finding]:
-    """Measure what was proposed and search again, until nothing is proposed or a person has to look; nothing is measured twice."""
+    """Measure the proposed test and search again, until no test is proposed or a person must act; measure nothing twice."""
     from dataclasses import replace
     from datetime import timedelta
 
@@ -133,7 +133,7 @@ def _run_live(
         about = replace(finding.location, runs=(test.like,)) if finding.verdict == "unknown" and test.like else None
         wanted = next_plan(test.adds, site.machine, job.campaign.runs, name=name, max_feed_mm_min=site.max_feed_mm_min, about=about)
         if wanted.plan is None:
-            typer.echo(f"by hand: Abbe cannot run {', '.join(wanted.by_hand)} on this machine")
+            typer.echo(f"measure by hand: Abbe cannot run {', '.join(wanted.by_hand)} on this machine")
             break
         addition = find_addition(store, job.campaign, wanted.plan, wanted.after_s)
         wait_s = _measured(store, site, job.campaign, addition, accept_table=accept_table)
@@ -186,7 +186,7 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
             kept = (
                 f"discovery {journal.id} is in state {state}; the same command resumes there"
                 if journal.id
-                else "without --db nothing of a folder is kept"
+                else "nothing is kept: the discovery of a folder is stored only with --db or --machine"
             )
             typer.echo(f"stopped: {kept}", err=True)
             raise

@@ -28,7 +28,7 @@ def list_models(
     machine_file: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the versions of models, oldest first; the last one of a machine is its current one."""
+    """List the versions of models, oldest first; the last version of a machine is its current one."""
     from abbe.service.effects.model_book import versions
 
     with open_store(database_url(db, machine_file)) as store:
@@ -112,7 +112,7 @@ def revert_model(
 
     with open_store(database_url(db, machine_file)) as store:
         number = revert(store, machine, version)
-    typer.echo(f"machine {machine}: version {number} is version {version} again")
+    typer.echo(f"machine {machine}: version {number} is current; it equals version {version}")
 
 
 def _size(size: LabelSize | None) -> dict[str, float] | None:
@@ -150,7 +150,7 @@ def effects(
             print_json([effect_doc(e) for e in found])
             return
         print_table(HEADINGS, [effect_row(e) for e in found])
-        typer.echo("one effect's page: abbe effects NAME")
+        typer.echo("details of an effect: abbe effects NAME")
         return
     effect = effect_named(name)
     if as_json:

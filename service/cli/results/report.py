@@ -19,7 +19,7 @@ def report(
         str,
         typer.Argument(
             metavar="RUN|CAMPAIGN|FOLDER|push|discovery|verification",
-            help="What the report is about: as for abbe show, or a kind and its number.",
+            help="A run or campaign as for abbe show, a folder, or a kind with its number.",
         ),
     ],
     number: Annotated[
@@ -32,15 +32,15 @@ def report(
         ),
     ] = None,
     of: Annotated[
-        str | None, typer.Option("--of", metavar="MACHINE", help="Whose push, where several machines are stored.", show_default=False)
+        str | None, typer.Option("--of", metavar="MACHINE", help="Machine of the push, if the database holds several.", show_default=False)
     ] = None,
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
-    --machine FILE takes its database, and adds limits, certificates and the allowed temperature. Nothing is measured or computed again;
-    the same data give the same bytes.
+    --machine FILE: use this machine file's database, limits, certificates and allowed temperature. Nothing is measured or computed
+    again; the same data give the same bytes.
     """
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document

@@ -48,9 +48,9 @@ def _print_incidents(found: CampaignDetail) -> None:
     if found.incidents:
         heads = ("link", "code", "times", "how it ended", "runs", "latest")
         times = sum(one.times for one in found.incidents)
-        print_table(heads, [_row(one) for one in found.incidents], title=f"incidents of the links: {times}")
+        print_table(heads, [_row(one) for one in found.incidents], title=f"incidents on the links to devices: {times}")
     else:
-        typer.echo("no incident of a link")
+        typer.echo("no incident on a link to a device")
     if found.incidents_not_written:
         typer.echo(f"{found.incidents_not_written} incidents could not be written: the database was locked or gone")
 
@@ -124,7 +124,7 @@ def show(
 
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
-    """Return the account of all ball-bar samples: stored, flagged, or in which gap."""
+    """Account for all ball-bar samples of a run: stored, flagged, or missing in a gap."""
     from abbe.drivers.api import BAR_REASONS
     from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 
@@ -156,7 +156,7 @@ def export_campaign(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Write a campaign as a folder with campaign.json and one file a run."""
+    """Write a campaign as a folder with campaign.json and one file for each run."""
     from abbe.service.runs.exchange import export_folder
 
     with open_store(database_url(db, machine)) as store:

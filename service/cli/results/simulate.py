@@ -1,4 +1,4 @@
-"""`abbe simulate` and `abbe errors`: readings, and actual positions of the tool, from known errors."""
+"""`abbe simulate` predicts readings with the present model; `abbe errors` computes the tool's deviation from known error functions."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def errors(
     exact: Annotated[bool, typer.Option("--exact", help="Finite rotations instead of first order.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Deviation of the tool at points, for a machine whose error functions are known. Points outside the strokes are refused."""
+    """Compute the tool's deviation at given points of a machine whose error functions are known. Points outside the strokes are refused."""
     from abbe.service.verification.deviations import deviations, deviations_json
 
     found = deviations(machine, errors_file, points, exact=exact)

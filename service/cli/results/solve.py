@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 STAGES = 10
-"""Stages that the display counts; the last ones share one if the solver needs more rounds."""
+"""Stages of the progress display; if the solver needs more, the rest share the last one."""
 
 
 SIDE_BY_SIDE = 3
@@ -47,8 +47,8 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         ModelName | None,
         typer.Option(
             "--model",
-            help="Three scales and three squareness; 21 error motions; or what held-out runs ask for. "
-            "Default: rigid21, or rigid6 where there are too few readings for it.",
+            help="rigid6: three scales and three squareness errors; rigid21: 21 error motions; auto: held-out runs decide. "
+            "Default: rigid21, or rigid6 if the readings are too few.",
             show_default=False,
         ),
     ] = None,
@@ -138,7 +138,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
 
 
 def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
-    """Return the account of the solution and its document, with progress on stderr."""
+    """Solve a campaign; return the assessment of the solution and its document. Progress goes to stderr."""
     from abbe.service.cli.running import display
     from abbe.service.domain.progress import Progress
     from abbe.service.identification.solve import solve_runs
@@ -206,7 +206,7 @@ def _print(summary: Assessment, solution: SolutionFile) -> None:
     if solution.verdict is not None:
         typer.echo(f"{solution.verdict.word.capitalize()}. {solution.verdict.text}")
         typer.echo(solution.verdict.layout)
-    typer.echo(f"The readings show {o.rank} of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well.")
+    typer.echo(f"The readings determine {o.rank} of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well.")
     typer.echo(worst_line(summary))
     _tables(solution)
     if solution.table_removal is not None:
@@ -214,7 +214,10 @@ def _print(summary: Assessment, solution: SolutionFile) -> None:
     if solution.table_not_removed is not None:
         typer.echo(f"look at this: {solution.table_not_removed}")
     if solution.machine_model is not None:
-        _lines("model book, not for tables (taken out of the readings where it lasts):", solution.machine_model.not_for_tables)
+        _lines(
+            "model book: effects that tables cannot correct (lasting ones are subtracted):",
+            solution.machine_model.not_for_tables,
+        )
     _lines("noise found:", noise_lines(summary.joint))
     _lines("outliers:", outlier_lines(summary.solved))
     _lines("residuals that are not noise:", residual_lines(summary.joint))
@@ -276,7 +279,7 @@ def _figure(value: float) -> str:
 
 def _tables(solution: SolutionFile) -> None:
     if solution.tables:
-        headings = ["left of errors of distances (± U, k = 2)", "numbers", "rms (µm)", "95 % below (µm)", "largest (µm)"]
+        headings = ["error of distances left by this table (± U, k = 2)", "numbers", "rms (µm)", "95 % below (µm)", "largest (µm)"]
         rows = []
         for t in solution.tables:
             figures = ((t.rms_um, t.u_rms_um), (t.q95_um, t.u_q95_um), (t.max_um, t.u_max_um))
@@ -296,7 +299,7 @@ def _helix_row(estimate: Any) -> list[str]:
 
 
 def _step_rows(figures: dict[str, float]) -> list[list[str]]:
-    """Return the papers' figures; keys end in their unit, ``u_`` + key is the standard uncertainty."""
+    """Return the rows of the step-diagonal figures; keys end in their unit, ``u_`` + key is the standard uncertainty."""
     rows = []
     for key in (k for k in figures if not k.startswith("u_")):
         name, _, unit = key.rpartition("_")

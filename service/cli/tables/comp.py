@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from abbe.service.formats.controls import FormatChoice
     from abbe.service.formats.model import Compensation
 
-comp = typer.Typer(help="Compensation tables: as files of controls, and back.", no_args_is_help=True)
+comp = typer.Typer(help="Compensation tables: files of controls, proposals, pushes and rollbacks.", no_args_is_help=True)
 
 FormatOption = Annotated[
     str, typer.Option("--format", metavar="F", help="Format or control; abbe comp formats lists them.", show_default=False)
@@ -54,9 +54,12 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         bool, typer.Option("--without-table", help="I know that no correction was in force while this was measured.")
     ] = False,
     sign: Annotated[
-        Path | None, typer.Option("--sign", metavar="KEY", help="Sign for the machine of --machine: FILE.sig.", show_default=False)
+        Path | None,
+        typer.Option(
+            "--sign", metavar="KEY", help="Private key that signs for the machine of --machine; writes FILE.sig.", show_default=False
+        ),
     ] = None,
-    days: Annotated[float, typer.Option("--days", help="With --sign: how long the files may be imported.")] = 30.0,
+    days: Annotated[float, typer.Option("--days", help="With --sign: days in which the files may be imported.")] = 30.0,
     base: Annotated[str, typer.Option("--base", help="With --sign: fingerprint of the table that was active while measuring.")] = "none",
     db: DbOption = None,
     machine: MachineOption = None,
@@ -90,7 +93,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         return
     headings = ("tables", "left: rms (µm)", "largest (µm)", "numbers", "")
     rows = [(c.kind, f"{c.rms_mm * 1e3:.2f}", f"{c.max_mm * 1e3:.2f}", str(c.numbers), "written" if c.best else "") for c in made.choices]
-    print_table(headings, rows, title="left of the identified error over the volume, both directions, rigid motion removed")
+    print_table(headings, rows, title="identified error that is left over the volume, both directions, rigid motion removed")
     for note in made.notes:
         typer.echo(f"- {note}")
     typer.echo(f"wrote {', '.join(written)}")
@@ -101,7 +104,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File, or the folder of several.", show_default=False)],
     form: FormatOption,
     solution: Annotated[
-        str | None, typer.Option("--solution", metavar="SOLUTION", help="Compare with what this solution would give.", show_default=False)
+        str | None, typer.Option("--solution", metavar="SOLUTION", help="Compare with the tables of this solution.", show_default=False)
     ] = None,
     reference: ReferenceOption = None,
     trust: Annotated[
@@ -165,7 +168,7 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 
 
 def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none: bool) -> bool:
-    """Return whether a solution is known to be measured without a correction; refused if one was in force."""
+    """Return whether a solution's runs are known to be measured without a correction; refuse it if a correction was in force."""
     from abbe.service.compensation.comp_export import solution_document
     from abbe.service.tables.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
 
@@ -183,7 +186,7 @@ def _machine_file(file: Path | None) -> MachineFile | None:
 
 
 def _machine(file: Path | None) -> Any:
-    """Return the nominal geometry of a machine file; without one, a machine that only defines where zero is."""
+    """Return the nominal geometry of a machine file; without one, a stand-in that only places the reference at zero."""
     import numpy as np
 
     from abbe.models.machine import Machine

@@ -63,7 +63,7 @@ def _print_made(store: Store, made: StoredProposal, *, as_json: bool) -> None:
     for line in found.not_for_tables:
         typer.echo(f"not in the tables: {line}")
     if found.reasons:
-        typer.echo("it is stored for review, and cannot be approved or pushed")
+        typer.echo("the proposal is stored for review; it cannot be approved or pushed")
 
 
 def show_proposals(
@@ -111,7 +111,12 @@ def _print_list(found: list[ProposalSummary], *, as_json: bool) -> None:
 def diff(
     proposal: ProposalArgument,
     other: Annotated[
-        str, typer.Option("--with", metavar="ACTIVE|PROPOSAL", help="The table in force when it was made, or another proposal.")
+        str,
+        typer.Option(
+            "--with",
+            metavar="ACTIVE|PROPOSAL",
+            help="ACTIVE: the table in force when the proposal was made; or the number of another proposal.",
+        ),
     ] = "ACTIVE",
     html: Annotated[Path | None, typer.Option("--html", metavar="FILE.html", help="Write numbers and picture.", show_default=False)] = None,
     db: DbOption = None,
@@ -144,11 +149,13 @@ def diff(
 def approve(
     proposal: ProposalArgument,
     name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who approves. Default: the account.", show_default=False)] = "",
-    hours: Annotated[float, typer.Option("--hours", metavar="H", help="How long the approval holds, at most.", min=0.01, max=720.0)] = 24.0,
+    hours: Annotated[
+        float, typer.Option("--hours", metavar="H", help="Longest validity of the approval, hours.", min=0.01, max=720.0)
+    ] = 24.0,
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Approve exactly this table on exactly this base, for this machine, under these limits (exit code 1: it cannot be approved)."""
+    """Approve exactly this table, in place of exactly the present one, for this machine and its limits (exit code 1: not approved)."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposal_decisions import approve as work_approve
     from abbe.service.compensation.proposals import login

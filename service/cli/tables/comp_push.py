@@ -57,7 +57,7 @@ def push(
     with Store.open(loaded.database_url) as store:
         try:
             found = run_job(work(store))
-        except TableRefused as error:  # the answer is no, not a fault
+        except TableRefused as error:  # a negative answer, not a fault
             for reason in (*error.reasons, *getattr(error, "__notes__", [])):
                 typer.echo(f"not pushed: {reason}")
             raise typer.Exit(1) from None
@@ -98,7 +98,7 @@ def rollback(
             raise ConfigError("nothing was rolled back", "answer yes, or add --yes if no one is at the console")
         async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
             if finished and to is None:
-                return f"push {last[0].push} was open and is finished; to go further back, run the command again"
+                return f"push {last[0].push} was unfinished and is ended now; to go further back, run the command again"
             return await work_rollback(session.controller, store, site, to)
 
     with Store.open(loaded.database_url) as store:
@@ -124,8 +124,8 @@ def accept_table(
     machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     yes: Annotated[bool, typer.Option("--yes", help="I have checked the controller: its active table is right.")] = False,
 ) -> None:
-    """Accept the active table as right, so that work can continue: after an interrupted push that Abbe could not resolve, under any name,
-    or if this database did not push the table. The push journal records who and when.
+    """Accept the active table as right, so that work can continue: after an interrupted push that Abbe could not resolve, or if this
+    database did not push the table. Closes open pushes under any machine name. The push journal records who and when.
     """
     from abbe.service.compensation.proposals import by_whom
     from abbe.service.compensation.recover import accept
@@ -163,9 +163,9 @@ def commission(
     accept_table: AcceptTable = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Try what the controller must refuse; then write a small known step for each axis and measure it with the ball-bar.
+    """Send requests that the controller must refuse; then write a small known step for each axis and measure it with the ball-bar.
 
-    This proves its level for pushes, and sign, axis and unit of its tables. Exit code 1: something was not proved.
+    This proves the controller's level for pushes, and sign, axis and unit of its tables. Exit code 1: something was not proved.
     """
     from abbe.service.cli.running import display, rollback_when_safe, run_job
     from abbe.service.compensation.commission import commission as work_commission
@@ -231,4 +231,4 @@ def _show_proof(found: SignCommissioning) -> None:
     for text in proof.faults:
         typer.echo(f"not proved: {text}")
     if proof.proved:
-        typer.echo("proved: a positive correction moves its own axis in its positive sense, by what was written")
+        typer.echo("proved: a positive correction moves its own axis in its positive sense, by the written amount")

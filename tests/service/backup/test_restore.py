@@ -155,7 +155,7 @@ def test_what_was_changed_on_purpose_is_refused(
 def test_without_its_key_it_is_asked_for(shop: Shop, tmp_path: Path, elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
     backup = str(tmp_path / "backup")
     assert run(["backup", str(shop.machine), backup, "--without-key"]) == 0
-    assert "abbe restore will ask for it" in capsys.readouterr().out
+    assert "abbe restore needs it" in capsys.readouterr().out
     assert not (tmp_path / "backup" / "audit-key").exists()
     assert run(["restore", str(elsewhere), backup]) == 2
     assert "give --audit-key FILE" in capsys.readouterr().err

@@ -118,7 +118,7 @@ def test_a_command_that_could_not_be_recorded_does_nothing(folder: Path, capsys:
     (folder / "abbe.sqlite3.audit-head").mkdir()
     assert run(["key", "new", "key.pem"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("error AUD-001: abbe key new was not begun, since it could not be recorded: ")
+    assert said.startswith("error AUD-001: abbe key new was not started, because it could not be recorded: ")
     assert said.count("\n") == 1
     assert not (folder / "key.pem").exists()
 
