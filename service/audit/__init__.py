@@ -1,1 +1,1 @@
-"""The audit: who did what, when, on what, how it ended; each record chained to the one before it and sealed with a key outside."""
+"""The audit: who did what to what, when, and how it ended. Each record is chained to the one before and sealed with a key kept outside."""

@@ -1,6 +1,7 @@
-"""The audit of a database and its two files beside it: the key of the seals (0600), and the heads, one line per record.
+"""The audit of a database, and its two files outside the database: the key and the heads.
 
-First the chain of records, and the proof that it is complete and unchanged, as pure functions.
+Each record holds the digest of the record before it, and a seal: the HMAC of its own digest with the key. A head is the id, digest and seal
+of a record. The file of heads has one line per record, so that removed records are noticed.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from abbe.service.storage.store import Store
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """A head of the audit kept outside of the database: id, digest and seal of a record."""
+    """A head, kept outside the database: id, digest and seal of a record."""
 
     id: int
     digest: str
@@ -37,17 +38,17 @@ class Anchor:
 
 
 def key_name(key: bytes) -> str:
-    """Name of a key in a record; it reveals nothing about the key."""
+    """Return the name by which records refer to a key; it reveals nothing about the key."""
     return hashlib.sha256(b"abbe audit key " + key).hexdigest()[:16]
 
 
 def mac_of(key: bytes, digest: str) -> str:
-    """Seal of a record: without the key a chain cannot be forged."""
+    """Return the seal of a digest: nobody can forge it without the key."""
     return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
 
 
 def digest_of(event: AuditEvent) -> str:
-    """SHA-256 of an event's content and of the digest before it."""
+    """Return the SHA-256 of a record's content, which includes the digest of the record before it."""
     content = [event.id, event.utc, event.who, event.action, event.target, event.outcome, event.doc, event.prev, event.key]
     return hashlib.sha256(canonical(content)).hexdigest()
 
@@ -61,9 +62,9 @@ def follow(last: AuditEvent | None, utc: str, event: AuditEvent, key: bytes) -> 
 
 
 def faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
-    """All faults of an audit; an empty list: it is complete and unchanged.
+    """Return all faults of an audit; none if it is complete and unchanged.
 
-    ``records``: all records, in the order of their ids; ``anchors``: the heads kept outside of the database; ``key``: of the seals.
+    ``records``: all records, in the order of their ids; ``anchors``: the heads kept outside the database; ``key``: key of the seals.
     """
     found, head, own_key = [], GENESIS, key_name(key)
     for number, record in enumerate(records, 1):
@@ -75,7 +76,7 @@ def faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes)
         if record.digest != _digest_or_none(record):
             found.append(f"record {number} was changed after it was written")
         if record.key != own_key:
-            found.append(f"record {number} is sealed with a key that is not here ({record.key})")
+            found.append(f"record {number} is sealed with another key ({record.key})")
         elif not hmac.compare_digest(record.mac, mac_of(key, record.digest)):
             found.append(f"record {number} was not sealed by this service")
         head = record.digest
@@ -90,30 +91,30 @@ def _digest_or_none(record: AuditEvent) -> str | None:
 
 
 def _anchor_faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key: bytes) -> list[str]:
-    """Faults found by comparing the records with the heads kept outside of the database."""
+    """Compare the records with the heads kept outside the database; return the faults."""
     found, stored = [], {record.id: record.digest for record in records}
     for anchor in anchors:
         if not hmac.compare_digest(anchor.mac, mac_of(key, f"{anchor.id} {anchor.digest}")):
             found.append(f"the head kept for record {anchor.id} was not sealed by this service")
         elif anchor.id not in stored:
-            found.append(f"the audit ended with record {anchor.id} at least, and holds {len(records)}")
+            found.append(f"record {anchor.id} was written and is missing: the audit holds {len(records)} records")
         elif stored[anchor.id] != anchor.digest:
-            found.append(f"record {anchor.id} is not the one whose head was kept")
+            found.append(f"record {anchor.id} differs from the head kept for it")
     if records and not anchors:
-        found.append("no head was kept outside of the database: the length of the audit is not proved")
+        found.append("no heads are kept outside the database: removed records would not be noticed")
     return found
 
 
 def anchor_of(record: AuditEvent, key: bytes) -> Anchor:
-    """The head to keep of a record."""
+    """Return the head of a record."""
     return Anchor(record.id, record.digest, mac_of(key, f"{record.id} {record.digest}"))
 
 
-# The two files of the audit: created for their owner only, append-only; a refusal names their owner.
+# The two files of the audit: only their owner may read them; errors name the owner.
 
 
 def create(path: Path, content: bytes) -> None:
-    """Write a new file under another name and link it: a second process finds the complete file of the first."""
+    """Create a file with all its content at once; keep the existing file if another process was faster."""
     aside = Path(f"{path}.{secrets.token_hex(4)}")
     file = private_file(aside)
     try:
@@ -162,7 +163,7 @@ def append_line(path: Path, text: str) -> None:
 
 
 def refusal(path: Path, error: OSError) -> AuditBroken:
-    """The error for an unusable file of the audit: system message, owner of the file, own account, remedy."""
+    """Return the error for an unusable file of the audit: system message, owner of the file, account of this process, remedy."""
     owner, details = "", ""
     with suppress(OSError, KeyError, NotImplementedError):
         there = path if path.exists() else path.parent
@@ -195,9 +196,9 @@ KEY, HEADS = ".audit-key", ".audit-head"
 
 
 class AuditBook:
-    """Writes and proves the audit. Any thread may call.
+    """Writes and verifies the audit of the database ``url``. Any thread may call.
 
-    The files lie beside a SQLite file (``url``). For a server they lie in the folder that `ABBE_AUDIT_FOLDER` names, otherwise in
+    The files lie in the folder that `ABBE_AUDIT_FOLDER` names. Without it they lie beside a SQLite file; for a database server in
     ``~/.local/state/abbe``, named after the id of the database.
     """
 
@@ -222,7 +223,7 @@ class AuditBook:
         self._store.check_writable()
 
     def write(self, event: AuditEvent) -> AuditEvent:
-        """Append a record; on return it is on disk and its head is kept outside.
+        """Append a record; on return the record and its head are on disk.
 
         Raises
         ------
@@ -242,7 +243,7 @@ class AuditBook:
         return record
 
     def verify(self) -> list[str]:
-        """All faults; an empty list: the audit is complete and unchanged, or was never begun."""
+        """Return all faults; none if the audit is complete and unchanged, or was never begun."""
         heads = self._heads if self._memory else heads_in(self.head_file)
         records = self._store.audit.events()
         try:
@@ -275,12 +276,12 @@ class AuditBook:
             append_line(self.head_file, f"{anchor.id} {anchor.digest} {anchor.mac}")
         except OSError as error:
             raise AuditBroken(
-                refusal(self.head_file, error).detail, "the record is in the database, its head is not kept; make the file writable"
+                refusal(self.head_file, error).detail, "the record is in the database, but its head is not kept; make the file writable"
             ) from None
 
 
 def heads_in(file: Path) -> list[Anchor]:
-    """The heads in a file, in their order.
+    """Return the heads in a file, in their order; none if there is no file.
 
     Raises
     ------
@@ -302,7 +303,7 @@ def files_of(base: str) -> tuple[Path, Path]:
 
 
 def sqlite_base(database: Path) -> str:
-    """Path of a SQLite file's audit files without suffix; in a shared folder a hash separates databases of the same name."""
+    """Return the path of a SQLite file's audit files, without suffix; in a shared folder a hash separates databases of the same name."""
     folder, path = os.environ.get(ENVIRONMENT), database.resolve()
     if not folder:
         return str(path)
@@ -310,7 +311,7 @@ def sqlite_base(database: Path) -> str:
 
 
 def _sqlite_files_base(store: Store | None, database: Path) -> str:
-    """`sqlite_base`, or the path of earlier versions in a shared folder, if its key sealed this database's last record."""
+    """Return `sqlite_base`; or an earlier version's path in a shared folder, if the key there sealed this database's last record."""
     base, folder = sqlite_base(database), os.environ.get(ENVIRONMENT)
     if store is None or not folder or files_of(base)[0].exists():
         return base
@@ -335,11 +336,11 @@ def read_key(file: Path, *, make: bool) -> bytes:
             create(file, secrets.token_bytes(KEY_BYTES))
         key = file.read_bytes()
     except FileNotFoundError:
-        raise AuditBroken(f"the key of the audit, {file}, is missing", "bring it back from the backup") from None
+        raise AuditBroken(f"the key of the audit, {file}, is missing", "restore it from the backup") from None
     except OSError as error:
         raise refusal(file, error) from None
     if len(key) != KEY_BYTES:
-        raise AuditBroken(f"{file} is not a key of an audit", "bring it back from the backup")
+        raise AuditBroken(f"{file} is not a key of an audit", "restore it from the backup")
     return key
 
 
@@ -364,7 +365,10 @@ def files_ready(key_file: Path, head_file: Path) -> None:
 
 
 def files_base(store: Store | None, url: str) -> str | None:
-    """Path of the audit's files without suffix; None for a database in memory. ``store`` is read only for the id of a server database."""
+    """Return the path of the audit's files, without suffix; None for a database in memory.
+
+    ``store`` None: ``url`` names a SQLite file.
+    """
     parsed = parse_url(url)
     folder = os.environ.get(ENVIRONMENT)
     if parsed.drivername == "sqlite" or store is None:
@@ -376,7 +380,7 @@ def files_base(store: Store | None, url: str) -> str | None:
         home.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         raise AuditBroken(
-            f"the folder of the audit's key, {home}, cannot be made: {error.strerror}", f"name another with {ENVIRONMENT}"
+            f"the folder of the audit's key, {home}, cannot be created: {error.strerror}", f"name another folder in {ENVIRONMENT}"
         ) from None
     return str(home / store.database_id())
 

@@ -1,5 +1,7 @@
-"""Address of the MQTT broker, ``mqtt://host:port`` or ``mqtts://host:port``, with ``user:password@`` if the broker requires it; and the
-topics of one machine: ``{prefix}/{machine}/state`` is retained, the others are not.
+"""The address of the MQTT broker, and the topics of one machine.
+
+Address: ``mqtt://host:port`` or ``mqtts://host:port``, with ``user:password@`` before the host if the broker requires it. Only messages of
+the topic ``{prefix}/{machine}/state`` are retained.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The outbox and the one connection to the broker that empties it. Without a broker messages wait, and nothing else is affected.
+"""The outbox of MQTT messages, and the one connection that sends them to the broker.
 
-Messages wait in the database. One leaves the outbox only after the broker's acknowledgement (QoS 1). aiomqtt does not reconnect: every
-connection here is a new client, and the back-off is implemented here.
+Messages wait in the database, and leave it only after the broker's acknowledgement (QoS 1). Without a broker they wait; nothing else is
+affected. aiomqtt does not reconnect: every connection here is a new client, and the back-off is implemented here.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from abbe.service.mqtt.broker import Broker, Topics, client_id
 KEPT_DELIVERED = 1000
 """Number of delivered messages that stay in the database, for inspection."""
 MOST_ALARMS, DOWN_TO_ALARMS = 10_000, 9_000
-"""If more alarms than the first number wait, the oldest are dropped down to the second. Results are never dropped:
-they are one message for each check, which the database keeps anyway."""
+"""If more alarms than the first number wait, the oldest are dropped until the second number is left. Results are never dropped: there is
+only one for each check, and the database keeps the checks anyway."""
 PRUNED_AT_ONCE = 1000
 DROPPED = "MQT-001"
 
@@ -87,7 +87,7 @@ class OutboxStore(Protocol):
 
 
 class StoreOutbox:
-    """The outbox table, off the event loop.
+    """The outbox in the database. Its calls run in threads, off the event loop.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ KEEPALIVE_S = 15
 REPLY_S = 10.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 STEADY_S = 5.0
-"""A connection that lived this long resets the pause, s. A broker that accepts and closes does not."""
+"""A connection that lived this long, s, resets the pause before the next attempt; one that the broker closes at once does not."""
 LOOK_S = 30.0
 """Time between two looks into the outbox without a wake-up, s: other processes write into it too."""
 FAREWELL_S = 1.0
@@ -207,7 +207,7 @@ class Publisher:
         self._wake.set()
 
     def set_verified(self, verified: dict[str, Any]) -> None:
-        """Change the state message's part about the table in force; it goes with every state except offline."""
+        """Change the part of the state message about the table in force. Every state except offline carries it."""
         if verified != self._verified:
             self._verified = verified
             self._wake.set()
@@ -228,7 +228,7 @@ class Publisher:
             if self._clock.monotonic_s() - started_s >= STEADY_S:
                 self._pause_s = FIRST_PAUSE_S
             if not self._warned:
-                log.warning("broker not reachable; messages wait in the store", broker=str(self._broker), reason=reason)
+                log.warning("broker not reachable; messages wait in the database", broker=str(self._broker), reason=reason)
                 self._warned = True
             await self._tidy()
             await self._pause()
@@ -247,7 +247,7 @@ class Publisher:
         return ended
 
     async def _probe(self) -> None:
-        """Fail early and cancellably if nothing listens, or something that is not our broker.
+        """Fail early if nothing listens, or something that is not our broker; unlike aiomqtt's connecting, this can be cancelled.
 
         aiomqtt connects in a thread that cannot be interrupted, and leaves a socket open if it refuses the broker's certificate.
         """

@@ -1,6 +1,4 @@
-"""Facts of the machine that OPC UA and MTConnect show, gathered from the status page's data, the slots that were not run, and the journal
-of pushes.
-"""
+"""Gather the facts that OPC UA and MTConnect show about the machine: status, scheduled checks that were not run, and the push journal."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ class PlantUnit:
 
     @property
     def number(self) -> int:
-        """UNECE code as a number of OPC UA (Part 8, 5.6.3.3): its characters, one a byte."""
+        """UNECE code as the number that OPC UA uses (Part 8, 5.6.3.3): one byte per character."""
         return int.from_bytes(self.unece.encode(), "big")
 
 
@@ -47,7 +45,7 @@ UNITS = {
 
 
 def unit_of(key: str) -> PlantUnit | None:
-    """Return the unit at the end of a figure's name; None: it has none."""
+    """Return the unit that ends a figure's name, e.g. ``um``; None if no unit does."""
     return UNITS.get(key.rpartition("_")[2]) if "_" in key else None
 
 
@@ -63,7 +61,7 @@ class PlantAlarm:
 
 @dataclass(frozen=True, slots=True)
 class ActiveTable:
-    """The active compensation table by the push journal: the last known one, the controller is not asked."""
+    """The active compensation table as the push journal last knew it. The controller is not asked."""
 
     bank: int
     crc: int
@@ -73,8 +71,10 @@ class ActiveTable:
 
 @dataclass(frozen=True, slots=True)
 class PlantFacts:
-    """Facts of one instant; checks and alarms newest first. ``table``: None when the journal does not know; ``verified``: which
-    measurement verified it, None: unknown."""
+    """Facts of one instant; checks and alarms newest first.
+
+    ``table``: None if the journal does not know it; ``verified``: which measurement verified it, None if unknown.
+    """
 
     machine: str
     version: str
@@ -89,7 +89,7 @@ class PlantFacts:
 
     @property
     def verdict(self) -> str | None:
-        """Verdict of the last check, if that is about the table in force; else the state of that table. None: no check yet."""
+        """Verdict of the last check if it measured the table in force, else the state of that table. None: no check yet."""
         if self.verified is not None and not self.verified.holds:
             return self.verified.state
         return self.checks[0].verdict if self.checks else None
@@ -126,7 +126,7 @@ class Gatherer:
     status : callable
         Returns the status page's data: machine, job, devices, next slots and last checks.
     store : Store, optional
-        Slots and pushes. Without it there are only the alarms of failed checks, and no table.
+        Source of scheduled checks that were not run, and of pushes. Without it there are only alarms of failed checks, and no table.
     """
 
     def __init__(self, status: Callable[[], Awaitable[Status]], store: Store | None = None, control: str = "") -> None:
@@ -135,7 +135,7 @@ class Gatherer:
         self._cached: tuple[tuple[PlantAlarm, ...], ActiveTable | None] = ((), None)
 
     async def facts(self) -> PlantFacts:
-        """Return the current facts. Slots and pushes are read again when the status or the minute has changed.
+        """Return the current facts. The store is read again only when the status or the minute has changed.
 
         Raises
         ------
@@ -181,10 +181,10 @@ def _slot_alarm(slot: SlotRecord) -> PlantAlarm:
 
 
 def table_in_force(journal: Sequence[PushEntry]) -> ActiveTable | None:
-    """Return the active table, as far as the journal of the last push knows it.
+    """Return the active table according to the journal of the last push; None if unknown.
 
-    Before activation and after a push that failed it is the old one, after KEEP the new one, after a person's acceptance the accepted one.
-    Between activation and the end, and where a person has to look, it is unknown: None.
+    Before activation and after a failed push the old table is active, after KEEP the new one, after a person's acceptance the accepted one.
+    It is unknown between activation and the end of a push, and while a person has to look.
     """
     if not journal:
         return None

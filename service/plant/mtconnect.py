@@ -1,7 +1,8 @@
-"""MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for its sequence numbers.
+"""MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for the sequence numbers.
 
-It works like an agent, without assets, the agent as a device, XPath (``path``) and streaming (``interval``). Observations are made at each
-request: changes of a running check between two requests are not seen, but every check that ended is, up to ten at once.
+`Agent` implements an MTConnect agent without assets, without the agent as a device, and without XPath (``path``) and streaming
+(``interval``). It observes at each request: it misses changes of a running check between two requests, but no check that ended, up to ten
+at once.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Observation:
 
 
 class Agent:
-    """Buffer of observations of one machine, numbered without gaps from 1 for each start (``instanceId``)."""
+    """Buffer of observations of one machine, numbered from 1 without gaps. ``instance``: ``instanceId``, another one after each start."""
 
     def __init__(self, instance: int, buffer: int = BUFFER) -> None:
         self._instance, self._size = instance, buffer
@@ -115,7 +116,7 @@ class Agent:
         return _bytes(root)
 
     def current(self, facts: PlantFacts, query: Mapping[str, str]) -> bytes:
-        """Return the Streams document of the current values, or of those when observation ``at`` was made."""
+        """Return the Streams document of the current values, or of the values when observation ``at`` was made."""
         _only(query, {"at"})
         at = self._number(query, "at", self._next - 1, self._first, self._next - 1)
         latest = self._before | {one.item: one for one in self._buffer if one.sequence <= at}
@@ -191,7 +192,7 @@ def _write(parent: ET.Element, one: Observation) -> None:
 
 
 def _result(check: Verification, verdict: str) -> Entries:
-    """Return the figures, with the unit at the end of the key; beside each its expanded uncertainty (k = 2) and its limit."""
+    """Return a check's figures, each with its expanded uncertainty (k = 2) and limit. The names end with the unit."""
     head = {"number": str(check.id), "verdict": verdict, "schedule": check.schedule, "recipe": check.recipe}
     for figure in check.figures:
         three = {figure.name: figure.value, f"{figure.name}.expanded": figure.expanded, f"{figure.name}.limit": figure.limit}
@@ -218,7 +219,7 @@ def _only(query: Mapping[str, str], allowed: set[str]) -> None:
         if name in {"path", "interval", "heartbeat", "to"}:
             raise MtconnectRefusal("UNSUPPORTED", f"{name} is not supported here")
         if name not in allowed:
-            raise MtconnectRefusal("INVALID_REQUEST", f"{name[:40]!r} is not known here")
+            raise MtconnectRefusal("INVALID_REQUEST", f"unknown parameter {name[:40]!r}")
 
 
 def _root(kind: str, header: Mapping[str, str]) -> ET.Element:

@@ -1,7 +1,7 @@
-"""Compensation tables that were in force while the runs of a solution were measured. Exported files need runs without any.
+"""Find the tables that were in force while a solution's runs were measured, and refuse an export if one of them corrected the machine.
 
 A machine that is measured with a table in force shows only the error that the table leaves. Files made from that error alone would replace
-the old correction and make the machine worse, so they are refused. `abbe correct` adds the old and the new correction instead.
+the old correction and make the machine worse. `abbe correct` adds the old and the new correction instead.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0
-"""Bytes of an image that hold its kind (docs/protocols/cnc.md, word 2), and the kind without correction."""
+"""Where an image holds the kind of its table (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
 Images = Callable[[int], bytes | None]
-REMEDY = "measure again without a table in force; or, where the control has Abbe's register map, let abbe correct add the tables"
+REMEDY = "measure again without a table in force; or, if the control has Abbe's register map, add the tables with `abbe correct`"
 CONFIRM_REMEDY = "if no correction was in force, confirm with --without-table"
 
 
 def distinct(tables: Iterable[Doc]) -> list[TableInForce]:
-    """Tables of runs, sorted by CRC, with the controller's statement whether each one acts (None in runs of older versions)."""
+    """Return the tables of runs, sorted by CRC. ``acting``: whether the table corrects, as the controller states; None in older runs."""
     acting: dict[int, bool | None] = {}
     for table in tables:
         crc, acts = int(table["crc"]), table.get("acting")
@@ -44,7 +44,7 @@ def stored_tables(store: Store, solution_id: int) -> list[TableInForce]:
 
 
 def images_of(store: Store) -> Images:
-    """Look-up from CRC to the images in this database: written by a push, or in force before one."""
+    """Return a look-up from CRC to the image of a table that a push of this database wrote or found in force."""
     found = {t.crc: t.image for t in store.tables.all()}
     for name in {store.machines.get(t.machine_id).name for t in store.tables.all()}:
         found |= {push.base_crc: push.base_image for push in JournalView.read(store, name, origins=False).bases() if push.base_image}
@@ -57,7 +57,7 @@ def no_images(crc: int) -> bytes | None:
 
 
 def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: bool = False) -> bool:
-    """Refuse a solution that was measured with a correction in force; return whether it is known that none was.
+    """Refuse a solution that was measured with a correction in force; return True if it is known that there was none.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: b
     images : callable
         Returns the image of a CRC, or None.
     confirmed_none : bool
-        A person states that no correction was in force. Counts only where nothing else is known.
+        A person states that no correction was in force. Decides only if neither image nor controller does.
 
     Raises
     ------
@@ -81,8 +81,8 @@ def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: b
         name = f"table {table.crc:08X}"
         if acts:
             raise FormatRefused(
-                f"this solution was measured while {name} corrected the machine: its files alone would remove that correction", REMEDY
+                f"this solution was measured while {name} corrected the machine: files made from it would remove that correction", REMEDY
             )
         if acts is None and not confirmed_none:
-            raise FormatRefused(f"this solution was measured with {name}, and nothing says whether it corrected anything", CONFIRM_REMEDY)
+            raise FormatRefused(f"this solution was measured with {name}, and nothing records whether that table acted", CONFIRM_REMEDY)
     return bool(tables) or confirmed_none

@@ -1,4 +1,4 @@
-"""Nine tables as bytes and back: encoding, decoding, limits, adding a change to the active tables, and reading the table in force."""
+"""The nine one-axis tables of a controller: encode, decode, check limits, add a change to them, and read those in force."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KIND_NINE = 1
 
 
 def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
-    """Nine tables as the controller stores them: corrections in LSB, input axis X, Y, Z outermost, then output X, Y, Z (cnc.md).
+    """Encode nine tables for the controller: corrections in LSB, input axis outermost, then output (docs/protocols/cnc.md).
 
     Raises
     ------
@@ -48,13 +48,14 @@ def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
 
 
 def check_test_step(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
-    """Refuse, never clamp, the tables of a test step: size, change against the active table, steps, zero at the reference
-    (reliability.md 3.3). Their curvature is not limited.
+    """Refuse the tables of a test step that break a limit or are not zero at the reference; never clamp them.
+
+    Limited are size, change against the active table and steps between neighbours, but not curvature.
 
     Raises
     ------
     TableRefused
-        The message names table, place, excess and limit. Nothing has been written.
+        The message names table, position, excess and limit. Nothing has been written.
     """
     against, limits = [], replace(limits, second_mm=np.inf)
     for a in range(3):
@@ -68,17 +69,18 @@ def check_test_step(tables: NineTables, active: NineTables | None, limits: PushL
             if not np.isfinite(values).all():
                 raise TableRefused(f"{name}: holds values that are not numbers", "check the solution; nothing was written")
             if abs(values[0]) > 5e-7:
-                raise TableRefused(f"{name}: not zero at its reference", "shift the table; nothing was written")
+                raise TableRefused(f"{name}: not zero at its reference", "shift the table so that it is; nothing was written")
             against += [f"{no} ({name})" for no in size_reasons(position.tolist(), values.tolist(), before.tolist(), limits)]
     for i in range(3):
         total_mm = sum(float(np.abs(tables.correction_mm[a][:, i]).max()) for a in range(3))
         against += together_reasons(AXES[i], total_mm, limits)
     if against:
-        raise TableRefused("; ".join(against), "raise the limit in the machine file if the machine is really so. Nothing was written")
+        remedy = "if the machine really needs this, raise the limit in the machine file; nothing was written"
+        raise TableRefused("; ".join(against), remedy)
 
 
 def tables_from_image(image: bytes) -> NineTables | None:
-    """Tables in a bank image by the independent decoder; None for an image without correction (kind 0).
+    """Decode the tables of a bank image with the independent decoder; return None for an image without correction (kind 0).
 
     Raises
     ------
@@ -89,7 +91,7 @@ def tables_from_image(image: bytes) -> NineTables | None:
         curves = read_axis_tables(image)
     except UnreadableImage as error:
         raise TableMismatch(
-            f"a bank holds no table that can be read: {error}", "look at the controller's banks; nothing was activated"
+            f"a bank of the controller holds no readable table: {error}", "look at the controller's banks; nothing was activated"
         ) from None
     if not curves:
         return None
@@ -104,7 +106,10 @@ def tables_from_image(image: bytes) -> NineTables | None:
 
 
 def added(active: NineTables | None, change: NineTables) -> NineTables:
-    """Absolute tables, on the grid of the change: the change was measured with ``active`` in force, so the two corrections add up."""
+    """Return ``active`` plus ``change`` on the grid of the change, zero at its first position.
+
+    The change was measured with ``active`` in force, so the two corrections add up.
+    """
     if active is None:
         return change
     curves = []
@@ -143,5 +148,7 @@ async def read_base(controller: TableController) -> Base:
     status = await controller.comp_status()
     base = Base(status, await controller.read_bank(status.active_bank))
     if crc32(base.image) != base.crc:
-        raise TableMismatch("the active table does not have the CRC the controller states", "read the tables again; nothing was written")
+        raise TableMismatch(
+            "the active table does not have the CRC that the controller states", "read the tables again; nothing was written"
+        )
     return base

@@ -1,4 +1,4 @@
-"""The pushes of one machine from journal and stored tables: how each ended, which table is in force, what can be rolled back.
+"""Evaluate the push journal of one machine: how each push ended, which table is in force, what can be rolled back.
 
 Nothing here talks to a controller. `JournalView.read` reads the database once; its properties need no further reads.
 """
@@ -27,7 +27,7 @@ NOTHING = "nothing was written"
 
 @dataclass(frozen=True, slots=True)
 class TableOrigin:
-    """Why a stored table was pushed: for a proposal (0: none), or on a person's order (``order``: its number) with a reason."""
+    """Why a stored table was pushed: for a proposal (``proposal``; 0: none), or by a person's order (``order``: its number, ``reason``)."""
 
     kind: str = "push"
     proposal: int = 0
@@ -44,7 +44,7 @@ class TableOrigin:
 
 @dataclass(frozen=True, slots=True)
 class TableNames:
-    """Names of a push's two tables in its message: the new one, the new one in short, and the old one."""
+    """How a message about a push calls its two tables: the new one in full and in short, and the old one."""
 
     new: str = "the new table"
     it: str = "the new one"
@@ -56,7 +56,10 @@ BACK = TableNames("the table ordered back", "the one ordered back", "the table f
 
 @dataclass(frozen=True, slots=True)
 class PushSummary:
-    """One push. ``proposal``: 0 for none; ``why``: a person's reason for a rollback; ``by``: who approved or ordered the push."""
+    """One push. ``proposal``: 0 for none; ``word``, ``text``: its outcome as in `JobOutcome`; ``by``: who approved or ordered it.
+
+    ``why``: a person's reason for a rollback.
+    """
 
     push: int
     kind: str
@@ -74,10 +77,10 @@ class PushSummary:
 
 @dataclass(frozen=True, slots=True)
 class CurrentTable:
-    """The table in force by the journal.
+    """The table in force according to the journal.
 
-    ``crc``: None if unknown, for the reason in ``text``. ``how``: "verified" by a measurement; "ordered": restored by a person without one;
-    "accepted" by a person; "before": in force before the first push. ``push``: the push that wrote it, 0 for none.
+    ``crc``: None if unknown, for the reason in ``text``. ``how``: "verified" by a measurement; "ordered": restored by a person, without a
+    measurement; "accepted" by a person; "before": in force before the first push. ``push``: the push that wrote it, 0 for none.
     """
 
     crc: int | None
@@ -149,7 +152,9 @@ class JournalView:
         try:
             check_chain(self.entries)
         except JournalBroken as error:
-            raise JournalChanged(f"the push journal is not what was written: {error}", "restore the database from a backup") from None
+            raise JournalChanged(
+                f"the push journal was changed after it was written: {error}", "restore the database from a backup"
+            ) from None
         numbers = sorted({e.push for e in self.entries} - {NO_PUSH})
         return {n: self._of(n) for n in numbers}
 
@@ -171,9 +176,9 @@ class JournalView:
 
     @property
     def wanted(self) -> tuple[int | None, bool]:
-        """The CRC that should be in force, and whether the last push has ended. None: no push yet, or one is under way.
+        """The CRC that should be in force, and whether the last push has ended. CRC None: no push yet, or the last has not ended.
 
-        A push without effect does not confirm the table that it found in force.
+        A push that changed nothing does not confirm the table that it found in force.
         """
         if not self.entries:
             return None, True
@@ -205,15 +210,15 @@ class JournalView:
         return datetime.fromisoformat(keeps[-1]).timestamp() if keeps else float("-inf")
 
     def bases(self) -> Iterator[PushFacts]:
-        """The table that each push found in force."""
+        """Facts about the table that each push found in force."""
         return (facts((e,)) for e in self.entries if e.state is PushState.SNAPSHOT)
 
     def of_proposal(self, proposal: int, after: int = 0) -> JobOutcome | None:
-        """Outcome of the proposal's last push later than push ``after``; None: the journal has none, nothing was written."""
+        """Outcome of the proposal's last push with a number above ``after``; None: there is none, so nothing was written."""
         return self._last_own(lambda number, origin: number > after and origin.proposal == proposal, TableNames())
 
     def of_order(self, order: str) -> JobOutcome | None:
-        """Outcome of an ordered rollback; None: the journal has none, nothing was written."""
+        """Outcome of an ordered rollback; None: it is not in the journal, so nothing was written."""
         return self._last_own(lambda _, origin: origin.order == order, BACK)
 
     def _last_own(self, own: Callable[[int, TableOrigin], bool], names: TableNames) -> JobOutcome | None:
@@ -250,7 +255,7 @@ class JournalView:
         Raises
         ------
         TableRefused
-            None is possible; the message gives the reason.
+            No rollback is possible; the message gives the reason.
         """
         if not self.entries:
             raise TableRefused("no push of this machine is in the journal: there is nothing to roll back", NOTHING)
@@ -300,7 +305,7 @@ class JournalView:
                 return CurrentTable(crc, "accepted", one.push, entry.utc, one.text)
             if entry.state is PushState.KEEP and one.crc == crc:
                 return CurrentTable(crc, "ordered" if one.kind == KIND else "verified", one.push, entry.utc, one.text)
-        return CurrentTable(crc, "before", 0, "", "it was there before the first push")
+        return CurrentTable(crc, "before", 0, "", "this table was there before the first push")
 
 
 def origins_of(store: Store) -> dict[int, TableOrigin]:
@@ -309,7 +314,7 @@ def origins_of(store: Store) -> dict[int, TableOrigin]:
 
 
 def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
-    """Open pushes: the machine's own last one, and those of other journals whose unverified table may be in force.
+    """Describe the open pushes: the machine's own last one, and those of other journals whose unverified table may be in force.
 
     Another journal may belong to the same control under another name or address.
     """
@@ -320,7 +325,7 @@ def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
 
 def _other(push: PushedTable) -> str:
     at = f" at {push.control}" if push.control else ""
-    what = "its table was never verified; if this is that control, nothing is measured on it"
+    what = "its table was never verified; if this is the same control, Abbe measures nothing on it"
     return f"push {push.push} of machine {push.machine!r}{at} is in state {push.state}: {what}"
 
 
@@ -356,7 +361,7 @@ def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome
 
 
 def reconciled(found: JobOutcome | None, reported: JobOutcome) -> JobOutcome:
-    """Correct the reported outcome of a push by that of the journal (None: no entry), which decides what is in force."""
+    """Correct a push's reported outcome by the one in the journal, ``found`` (None: no entry): the journal decides what is in force."""
     if found is None:
         return reported if reported.word in ("refused", STOPPED) else JobOutcome("failed", reported.text)
     if found.word == reported.word:

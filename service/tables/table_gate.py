@@ -1,8 +1,8 @@
 """The gate before any motion or use of a table: the table in force must be verified, accepted by a person, or correct nothing.
 
-A control is known by its address alone (`control_of`), and each table carries a random number. The CRC is therefore looked up in the
-journals of a database, under any machine name, and a pushed table that was neither kept nor accepted is never built upon. An endorsement
-holds for one control only, because another machine has other errors.
+A control is known by its address alone (`control_of`), which may change. Each table contains a random number, so its CRC identifies it: the
+CRC is looked up in all journals of the database, under any machine name. A pushed table that was neither kept nor accepted is refused. An
+endorsement holds for one control only, because another machine has other errors.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class Endorsement:
 class KnownTables:
     """Tables by their CRC, over all journals of a database.
 
-    ``unverified``: the push that wrote it; ``known_crcs``: every table that a push wrote or found in force, or that a person accepted;
-    ``pushed``: the last push of each; ``endorsed``: endorsements by journal.
+    ``unverified``: tables that were neither kept nor accepted, with the push that wrote each; ``known_crcs``: every table that a push wrote
+    or found in force, or that a person accepted; ``pushed``: the last push of each table; ``endorsed``: its endorsements by journal.
     """
 
     unverified: dict[int, PushedTable]
@@ -84,7 +84,7 @@ class KnownTables:
     endorsed: dict[int, dict[str, Endorsement]]
 
     def elsewhere(self, crc: int, chain: str) -> Endorsement | None:
-        """Best endorsement of a table in other journals; None if this journal endorses it, or none does."""
+        """Best endorsement of a table in other journals; None if the journal ``chain`` endorses it, or no journal does."""
         journals = self.endorsed.get(crc, {})
         return None if chain in journals else max(journals.values(), key=lambda one: (one.how == "verified", one.utc), default=None)
 
@@ -130,7 +130,7 @@ def unverified_crcs(entries: Sequence[PushEntry]) -> dict[int, int]:
 
 
 def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
-    """Unverified tables. A table found in force before a push is a person's, unless an earlier push wrote it and did not keep it."""
+    """Unverified tables. A table found in force counts as endorsed, unless an earlier push wrote it and did not keep it."""
     candidates: dict[int, Hashable] = {}
     pushed: dict[Hashable, int] = {}
     endorsed: set[int] = set()
@@ -151,8 +151,8 @@ def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
 LOOK_REMEDY = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
 STRANGE = "a table that this database did not push"
 ACCEPT_REMEDY = (
-    "find out who wrote it; if it is right: `abbe accept-table MACHINE.toml --yes`, or --accept-table with the command that is to go on; "
-    "nothing has moved"
+    "find out who wrote this table; if it is right, accept it with `abbe accept-table MACHINE.toml --yes`, or repeat the command with "
+    "--accept-table; nothing has moved"
 )
 
 

@@ -11,8 +11,8 @@ FREE = 5
 FREE_OF_ADDRESS = 20
 FIRST_S, LONGEST_S = 2.0, 900.0
 LONGEST_OF_ACCOUNT_S = 60.0
-"""Longest wait of all unknown places together for one account: guesses from ever new addresses get one attempt a minute, and the owner at
-a new place does not have to wait `LONGEST_S`."""
+"""Longest wait, s, that all unknown places of an account share: an attacker with ever new addresses gets one guess a minute, and the owner
+at a new place never has to wait `LONGEST_S`."""
 FORGET_S = 3600.0
 MOST = 10_000
 
@@ -32,7 +32,7 @@ class LoginOrigin:
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """The key of a count (account and place), its free failures and its longest wait."""
+    """Which count an attempt belongs to (account and place), its number of free failures, and its longest wait."""
 
     key: tuple[str, str]
     free: int = FREE
@@ -88,13 +88,13 @@ class Lockout:
         return self.wait_s(account, origin)
 
     def succeeded(self, account: str, origin: LoginOrigin) -> None:
-        """Clear the failures of this account at this place and remember the address. Each attempt was counted as a failure at its begin."""
+        """Clear the failures of this account at this place and remember the address. The caller counted the attempt as failed before."""
         for rule in self._rules(account, origin):
             count = self._counts.get(rule.key)
             if rule.key[0]:
                 self._counts.pop(rule.key, None)
             elif count is not None:
-                # For the address undo this attempt only: otherwise the owner of one account could guess at all others without limit.
+                # At the address, undo this attempt only: otherwise the owner of one account could guess at all others without limit.
                 count.failures = max(count.failures - 1, 0)
                 count.until_s, count.last_s = count.before
         self._known[(_fold(account), _net(origin.address))] = None

@@ -104,13 +104,13 @@ def check_new(name: str, password: str) -> None:
     """
     low = password.lower()
     if not SHORTEST <= len(password) <= LONGEST_PASSWORD:
-        raise PasswordRefused(f"a password has {SHORTEST} to {LONGEST_PASSWORD} characters", "a sentence of a few words does")
+        raise PasswordRefused(f"a password needs {SHORTEST} to {LONGEST_PASSWORD} characters", "use a sentence of a few words")
     if len(set(low)) < LEAST_DIFFERENT:
-        raise PasswordRefused(f"the password has fewer than {LEAST_DIFFERENT} different characters", "take a sentence of a few words")
+        raise PasswordRefused(f"the password has fewer than {LEAST_DIFFERENT} different characters", "use a sentence of a few words")
     if len(name) > 2 and name.lower() in low:
-        raise PasswordRefused("the password holds the name of its user", "take another")
+        raise PasswordRefused("the password contains the user name", "choose another")
     if any(word in low and len(low) - len(word) < 6 for word in COMMON):
-        raise PasswordRefused("the password is one that is tried first", "take a sentence of a few words")
+        raise PasswordRefused("the password is one of the first that attackers try", "use a sentence of a few words")
 
 
 IDLE = timedelta(minutes=15)
@@ -126,8 +126,8 @@ TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 class Principal:
     """The account behind a request, and its permissions.
 
-    ``name``: ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``, as in the audit; ``role`` None: no account; ``by``: ``session``,
-    ``token`` or ``nobody``; ``digest``: SHA-256 of the session's secret.
+    ``name``: ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``, as in the audit; ``role`` None: no account; ``by``: what identified the
+    account, ``session``, ``token`` or ``nobody``; ``digest``: SHA-256 of the session's secret.
     """
 
     name: str = "anonymous"
@@ -158,7 +158,7 @@ class People:
             The name or role is invalid, the password is weak, or the name is taken.
         """
         if not NAME.fullmatch(name):
-            raise UserRefused(f"{name!r} is not a name of a user", "1 to 64 letters, digits and . _ @ -, beginning with a letter or digit")
+            raise UserRefused(f"{name!r} is not a valid user name", "use 1 to 64 letters, digits and . _ @ -; begin with a letter or digit")
         check_new(name, password)
         self._store.people.add(name, role_of(role), self.passwords.hash(password))
 
@@ -261,15 +261,14 @@ class People:
         """
         user = self.get(name)
         if not NAME.fullmatch(title):
-            raise UserRefused(f"{title!r} is not a name of a token", "1 to 64 letters, digits and . _ @ -")
+            raise UserRefused(f"{title!r} is not a valid name of a token", "use 1 to 64 letters, digits and . _ @ -")
         if not 0 < days <= 3660:
-            raise UserRefused(f"{days:g} days is no life of a token", "more than 0, at most 3660")
+            raise UserRefused(f"a token cannot be valid for {days:g} days", "give more than 0 and at most 3660")
         beyond = [s for s in scopes if s not in ALLOWED[Role(user.role)]]
         if beyond or not scopes:
             known = ", ".join(sorted(ALLOWED[Role(user.role)]))
-            raise UserRefused(
-                f"a token of {name!r} cannot have the scope {', '.join(beyond) or 'nothing'}", f"scopes of {user.role}: {known}"
-            )
+            what = f"cannot have the scope {', '.join(beyond)}" if beyond else "needs a scope"
+            raise UserRefused(f"a token of {name!r} {what}", f"scopes of {user.role}: {known}")
         prefix, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
         text = f"abbe_{prefix}_{secret}"
         expires = utc_text(self._clock.utc() + timedelta(days=days))
@@ -319,7 +318,7 @@ def _device_seal(user: UserRecord, label: str) -> str:
 
 
 def digest_of(secret: str) -> str:
-    """SHA-256 of a secret. It has 256 random bits, so no slow hash is needed."""
+    """Return the SHA-256 of a secret. A secret has 256 random bits, so it needs no slow hash."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Roles and their permissions: the one table that decides. What is not in it is forbidden."""
+"""Roles and their permissions. A role may do only what this table lists."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""An OPC UA server that only shows. The only package that knows asyncua, which is an extra (``pip install 'abbe[opcua]'``)."""
+"""A read-only OPC UA server. The only package that imports asyncua, which is an extra (``pip install 'abbe[opcua]'``)."""

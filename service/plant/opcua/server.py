@@ -1,9 +1,8 @@
-"""The OPC UA server as a part of the service: updates its values once a second, accepts none. Its failures affect nothing else.
+"""The OPC UA server as a part of the service: it updates its values once a second and accepts none. Its failures affect nothing else.
 
-asyncua's server is closed here for every service that changes something: network clients can only read. The library decides by user
-roles and by each node's access level, and answers a client on an unencrypted channel even if only encrypted ones are offered (it needs that
-channel for discovery). So the services themselves are closed for every external session, and with known certificates a session is
-activated only on a channel encrypted with one of them.
+asyncua decides only by user roles and by each node's access level. It also answers clients on an unencrypted channel, which it needs for
+discovery, even if only encrypted channels are offered. `ClientSession` therefore refuses every service that changes something. If client
+certificates are configured, it activates a session only on a channel encrypted with one of them.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ READING = ua.AccessLevel.CurrentRead.mask | ua.AccessLevel.HistoryRead.mask
 
 
 class ClientSession(InternalSession):
-    """A client's session."""
+    """A client's session, which can only read."""
 
     async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
         """Refuse every write."""
@@ -80,7 +79,7 @@ class ClientSession(InternalSession):
 
 
 class _Readers(UserManager):
-    """Gives every authenticated client the role of a reader, and no client more."""
+    """Gives every accepted client the right to read, and no other right."""
 
     def __init__(self, trusted: Mapping[bytes, x509.Certificate] | None) -> None:
         self._trusted = trusted
@@ -93,7 +92,7 @@ class _Readers(UserManager):
 
 
 class ReadOnlyServer(InternalServer):
-    """The internal server.
+    """asyncua's internal server, restricted to reading.
 
     Parameters
     ----------
@@ -124,12 +123,12 @@ class ReadOnlyServer(InternalServer):
         return ClientSession(self, self.aspace, self.subscription_service, name, user=User(role=UserRole.Anonymous), external=external)
 
     def register_server(self, server: Any, conf: Any = None) -> None:
-        """Refuse: this is no discovery server, and this service needs no session."""
+        """Refuse: this is no discovery server. Clients can call this without a session, so `ClientSession` cannot refuse it."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
 
 def seal(space: AddressSpace) -> int:
-    """Remove write access from every node and execute access from every method, the standard's own too; return how many."""
+    """Remove write access from all nodes and execute access from all methods, including the standard's; return the number of changes."""
     sealed = 0
     for nodeid in list(space.keys()):
         attributes = space[nodeid].attributes
@@ -155,7 +154,7 @@ MESSAGE_BYTES = 4 * 2**20
 
 
 class OpcUaServer:
-    """Shows one machine.
+    """Shows one machine by OPC UA.
 
     Parameters
     ----------
@@ -180,7 +179,7 @@ class OpcUaServer:
         self._built: tuple[Server, Space] | None = None
 
     async def prepare(self) -> None:
-        """Build the address space, before anything moves: it takes a second or two and blocks the event loop for parts of one."""
+        """Build the address space. Call it before anything moves: it takes 1 to 2 s and blocks the event loop for parts of a second."""
         self._built = await self._build()
         gc.freeze()  # some hundred thousand permanent objects: without this, every full collection would visit them, for 0.2 s
 
@@ -249,7 +248,7 @@ class OpcUaServer:
             facts = await self._source.facts()
         except StoreError as trouble:
             if await space.show_stale(self._clock.utc()):
-                log.warning("facts not available; the last ones are shown as such", reason=trouble.detail)
+                log.warning("facts not available; the last known values are shown and marked as such", reason=trouble.detail)
             return
         await space.show(picture_of(facts), facts.now_utc)
 

@@ -20,12 +20,12 @@ def check_opcua(setup: OpcUa) -> None:
     Raises
     ------
     ConfigError
-        It would listen for other computers unencrypted, or to everyone; a certificate cannot be read; asyncua is not installed.
+        Other computers could connect unencrypted or unknown; a certificate cannot be read; asyncua is not installed.
     """
     if setup.guarded and not (setup.certificate and setup.clients):
         raise ConfigError(
-            f"[opcua] host {setup.host!r} needs certificate, key and clients: others must be known, and be talked to encrypted",
-            "give them, or use 127.0.0.1 without clients",
+            f"[opcua] host {setup.host!r} needs certificate, key and clients: connections must be encrypted and clients known",
+            "give all three, or use 127.0.0.1 without clients",
         )
     trusted(setup.clients)
     for name in (setup.certificate, setup.key):
@@ -36,7 +36,7 @@ def check_opcua(setup: OpcUa) -> None:
 
 
 def trusted(files: Sequence[str]) -> dict[bytes, x509.Certificate]:
-    """Return the certificates of files, by their DER bytes.
+    """Read certificate files; return the certificates by their DER bytes.
 
     Raises
     ------

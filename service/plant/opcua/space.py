@@ -1,4 +1,4 @@
-"""The address space: its content as a flat picture, path to value (pure, tested without a server), and the nodes that follow it."""
+"""The OPC UA address space: its content as a flat mapping from path to value (`Picture`), and the nodes that show it."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ _TYPES: dict[Kind, tuple[ua.VariantType, int]] = {
 
 
 class Space:
-    """The machine's part of the address space; ``index``: of Abbe's namespace."""
+    """The machine's part of the address space; ``index``: index of Abbe's namespace."""
 
     def __init__(self, server: Server, index: int, machine: str) -> None:
         self._server, self._index, self._machine = server, index, machine

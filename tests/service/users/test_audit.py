@@ -96,7 +96,7 @@ def test_every_one_of_a_thousand_tamperings_is_found() -> None:
 def test_kept_heads_that_were_forged_or_removed_are_found() -> None:
     records = chain(5)
     heads = [anchor_of(r, KEY) for r in records]
-    assert faults(records, [], KEY) == ["no head was kept outside of the database: the length of the audit is not proved"]
+    assert faults(records, [], KEY) == ["no heads are kept outside the database: removed records would not be noticed"]
     assert any("not sealed" in text for text in faults(records, [*heads, replace(heads[-1], id=4)], KEY))
     assert faults([], heads, KEY)
 
@@ -139,7 +139,7 @@ def test_the_key_is_the_owners_only_and_its_loss_is_seen(world: World) -> None:
     fresh = AuditBook(world.store, world.url)
     assert "is missing" in fresh.verify()[0]
     fresh.write(event(2))  # the machine goes on being measured, and the audit says that it cannot be proved any more
-    assert any("sealed with a key that is not here" in text for text in fresh.verify())
+    assert any("sealed with another key" in text for text in fresh.verify())
 
 
 def test_writers_do_not_fork_the_chain(world: World) -> None:
