@@ -1,4 +1,4 @@
-"""Scales and axes, from numbers to pixels, with ticks at 1, 2 and 5; layers on a panel; panels side by side; keys of scales."""
+"""Axes of plots: scales from numbers to pixels, ticks, panels with curves and bars, grids of panels, and colour keys."""
 
 from __future__ import annotations
 
@@ -147,13 +147,13 @@ class Panel:
 
 
 def bar_panel(left: float, top: float, size: XY, ends: Iterable[float | None]) -> Panel:
-    """Panel for horizontal bars from zero to at most the largest of ``ends``; ``size``: width and height."""
+    """Panel for horizontal bars from zero; its scale reaches beyond the largest of ``ends``. ``size``: width and height."""
     return Panel(left, top, *size, (0.0, data_range(ends, zero=True)[1]), (0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class PanelGrid:
-    """Panels of one size in rows and columns on one ordinate, with numbers and labels at the outer edges only.
+    """Panels of one size in rows and columns with a common ordinate, and numbers and labels at the outer edges only.
 
     ``rows``, ``columns``: names; ``top``: pixels above the first row, for headings.
     """
@@ -187,7 +187,7 @@ class PanelGrid:
         return Panel(left, top, self._width, self.cell_height, x_range, self.y_range)
 
     def draw_axes(self, svg: Svg, panel: Panel, cell: tuple[str, str], labels: tuple[str, str]) -> None:
-        """Grid lines of a cell (row, column), numbers and ``labels`` (x, y) if it is at the edge."""
+        """Grid lines of a ``cell`` (row, column), with numbers and ``labels`` (x, y) if the cell is at the edge."""
         last, first = cell[0] == self.rows[-1], cell[1] == self.columns[0]
         panel.draw_y(svg, labels[1] if first else "", count=4, numbers=first)
         panel.draw_x(svg, labels[0] if last else "", count=5, numbers=last)

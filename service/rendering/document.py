@@ -28,7 +28,7 @@ SIGNATURES = ("Measured by", "Checked by", "Approved by")
 
 @dataclass(frozen=True, slots=True)
 class ReportFigure:
-    """One numeric result. ``symbol``: of the standard; ``method``: rule of evaluation; ``limit``, ``verdict``: of a judged figure."""
+    """One numeric result. ``symbol``: its symbol in the standard; ``method``: rule of evaluation; ``limit``, ``verdict``: if judged."""
 
     group: str
     symbol: str

@@ -29,7 +29,7 @@ from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, plain, print
 COLUMNS = ("group", "symbol", "name", "value", "expanded", "k", "unit", "limit", "verdict", "method")
 _NUMBER = r"(?:n/a|[+−-]?\d[\d.]*(?:e[+−-]?\d+)?)"
 _NUMERIC = re.compile(rf"{_NUMBER}(?: (?:±|to) {_NUMBER})?(?: ?[×%])?")
-NOTHING_HIDDEN = "Nothing was found that this measurement should have shown and could not."
+NOTHING_HIDDEN = "No gap was found: this measurement shows everything that it should."
 
 
 def document_json(document: Document) -> str:
@@ -154,7 +154,7 @@ def _pairs(facts: Mapping[str, str]) -> list[dict[str, str]]:
 
 
 def _right(columns: int, rows: Sequence[Sequence[str]]) -> list[bool]:
-    """For each column whether it holds numbers only (never the first one)."""
+    """For each column, whether to align it right because it holds numbers only; never the first column."""
     cells = [[row[k] for row in rows if row[k]] for k in range(columns)]
     return [k > 0 and bool(some) and all(_NUMERIC.fullmatch(c) for c in some) for k, some in enumerate(cells)]
 

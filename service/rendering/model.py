@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Floats = Sequence[float] | NDArray[np.float64]
 
 SETUP_NOTE = "set-up"
-"""Note of a parameter of the set-up (cup, bar, mirror) instead of the machine; the report folds these."""
+"""Note of a parameter that belongs to the set-up (cup, bar, mirror), not to the machine; the report collapses these."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,10 @@ class Correlations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """Measured minus simulated along one run, before and after, arrays of shape (n,). ``why``: reason for showing this run."""
+    """Measured minus simulated along one run, before and after the found effects are added to the simulation; arrays of shape (n,).
+
+    ``why``: reason for showing this run.
+    """
 
     label: str
     x_label: str
@@ -128,10 +131,10 @@ class Trace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceMap:
-    """Size of the gap over one plane of the volume.
+    """Size of the gap (measured minus simulated) over one plane of the volume.
 
-    ``x_mm``, ``y_mm``: centres of measured cells, shape (n,); ``times_noise``: rms of the gap divided by its noise; ``spot``: centre and
-    radius of the located area.
+    ``x_mm``, ``y_mm``: centres of measured cells, shape (n,); ``times_noise``: rms of the gap divided by the noise; ``spot``: centre and
+    radius of the located area, mm.
     """
 
     x_axis: str

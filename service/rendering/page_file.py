@@ -32,4 +32,4 @@ def write_page(text: str | bytes, target: Path) -> None:
     except OSError as error:
         if aside is not None:
             aside.unlink(missing_ok=True)
-        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a folder that may be written") from None
+        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a writable folder") from None

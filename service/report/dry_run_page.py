@@ -35,7 +35,7 @@ def dry_run_report(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[
         "Nothing has moved."
     )
     drawn = Picture(caption, [picture(machine, plan)], "wide")
-    note = "Machine time without the minutes that a person needs for mounting."
+    note = "Machine time, without the time that a person needs for mounting."
     sections = (Section("Paths", [*lead, drawn]), Section("Tests in order", [TextTable(headings, rows), note]))
     return Document(kind="dry-run", title=f"Dry run: {plan.name}", sections=sections, signatures=())
 

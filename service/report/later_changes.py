@@ -15,7 +15,7 @@ NOT_JUDGED = "Not judged"
 
 
 def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[Run]) -> Document:
-    """Return the report with a note if its table is not in force now, in the headline if nothing has measured the machine since.
+    """Return the report, with a note if its table is not in force now. The verdict says so, too.
 
     ``begun_utc``: time of the measurement, or end of the push. ``runs``: of the report; empty: only the time counts.
     """
@@ -24,7 +24,7 @@ def with_later_changes(document: Document, store: Store, machine: str, begun_utc
         return document
     sign, word, text = document.verdict
     now = known.text[:1].upper() + known.text[1:]
-    remark = f"this report is of a table that was in force then, not of the one that is in force now: {known.text}"
+    remark = f"this report is about the table in force at that time, not about the table in force now: {known.text}"
     verdict = document.verdict
     if known.state == "unverified" and word != NOT_JUDGED:
         verdict = ("open", "Unverified now", f"{now}. When this was measured: {word}. {text}".strip())

@@ -33,7 +33,7 @@ def rules_of(config: MachineFile | None) -> Rules:
 
 
 def numbered_report(store: Store, what: str, number: int, rules: Rules, machine: str | None = None) -> Document:
-    """Report of push, discovery or verification ``number``; ``machine``: whose push, where several machines have one.
+    """Report of push, discovery or verification ``number``; ``machine``: owner of the push, needed if several machines have this number.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
     having = [n for chain, n in chains.items() if any(e.push == number for e in store.pushes.entries_of(chain))]
     if len(having) != 1:
         if not having:
-            raise NotStored(f"no push {number} in the database", "abbe correct pushes tables; pushes count from 1")
+            raise NotStored(f"no push {number} in the database", "`abbe correct` pushes tables; their numbers begin with 1")
         raise StoreError(f"machines {', '.join(having)} each have a push {number}", "name the machine: --of NAME")
     return push_report(store, having[0], number, rules)
 

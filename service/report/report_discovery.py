@@ -40,16 +40,16 @@ from abbe.service.storage.store import Store
 
 AXES = "XYZ"
 CELLS = 24
-"""Cells of the map along the longer side of what was measured."""
+"""Cells of the map along the longer side of the measured area."""
 FEWEST = 3
 """Fewest readings of a cell."""
 REJECTED = 40
 DECIDED = "How it was decided"
 SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
 STATEMENTS = (
-    "U of a named effect is that of its refit together with everything else that these runs leave free.",
-    "Gap: measured minus simulated; deviation = actual − nominal, tool relative to workpiece (ISO 230-1). Identify: fitted. Holdout: never "
-    "fitted, only judge. Sealed: predicted, their readings are unknown here.",
+    "U of a named effect is from a fit of the effect together with all other parameters that these runs leave free.",
+    "Gap: measured minus simulated; deviation = actual − nominal, tool relative to workpiece (ISO 230-1). Runs by role: identify, fitted; "
+    "holdout, never fitted and used to judge only; sealed, predicted without knowledge of the readings.",
 )
 
 
@@ -167,11 +167,11 @@ def _sections(found: _Found) -> list[Section]:
     if changed := changed_lines(finding.changed):
         out.append(Section("What has changed", [Lines([line.strip() for line in changed])]))
     if located := location_lines(finding.location):
-        out.append(Section("Where the gap lives", [Lines(located)]))
+        out.append(Section("Where the gap is", [Lines(located)]))
     out.append(Section("The gap before and after", [gap_table(finding), *_pictures(found)]))
     following = next_of(finding)
     if following or finding.effects:
-        text = Lines([line.strip() for line in following]) if following else "Nothing is needed to tell suspects apart."
+        text = Lines([line.strip() for line in following]) if following else "No further measurement is needed to separate the suspects."
         out.append(Section("What to measure next", [text]))
     return out
 
@@ -179,12 +179,12 @@ def _sections(found: _Found) -> list[Section]:
 def _card(effect: EffectFound) -> dict[str, str]:
     """Remedy, signature, rivals and parameters of a named effect."""
     there = "; ".join(location_lines(effect.location))
-    out = {"What to do": effect.remedy_text, "Who takes it out": REMEDIES[effect.remedy]}
+    out = {"What to do": effect.remedy_text, "What removes it": REMEDIES[effect.remedy]}
     out |= ({"Where": there} if there else {}) | {"How it looks": effect.signature, "What else it could be": "; ".join(rival_lines(effect))}
     out |= {name.replace("_", " ").capitalize(): parameter_text(p) for name, p in effect.parameters.items()}
-    out["Evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much more likely the readings are with it, after its price)"
+    out["Evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much likelier the effect makes the readings, less its penalty)"
     if effect.forms:
-        out["Form"] = "not quite the textbook's: " + ", ".join(effect.forms)
+        out["Form"] = "differs from the textbook's: " + ", ".join(effect.forms)
     return out | {"Source": effect.source}
 
 
@@ -199,12 +199,12 @@ def gap_table(finding: Finding) -> TextTable:
         rows.append((role, plain(g.before_um), plain(g.after_um), plain(g.floor_um), closed, ROLES.get(role, "")))
     sealed = sum(r.role == "sealed" for r in finding.runs.values())
     if sealed:
-        rows.append(("sealed", *[NOT_AVAILABLE] * 4, f"{sealed} runs predicted, their readings are unknown here"))
+        rows.append(("sealed", *[NOT_AVAILABLE] * 4, f"{sealed} runs predicted; their readings are unknown here"))
     return TextTable(head, rows)
 
 
 def _what(finding: Finding) -> str:
-    """What was added to the model for the gap after; empty if nothing was."""
+    """Name what was added to the model between the gaps before and after; empty if nothing was."""
     return {"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict]
 
 
@@ -221,7 +221,7 @@ def _pictures(found: _Found) -> list[Block]:
         out.append(Picture(f"{text}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
     places = [place_plot(p, key=f"place-{i}") for i, (a, b) in enumerate(((0, 1), (0, 2))) if (p := _place(found, a, b)) is not None]
     if places:
-        text = "Gap before, cell by cell of what was measured, over the noise of one reading. A ring marks what was located."
+        text = "Gap before, divided by the noise of one reading, for each cell of the measured area. A ring marks the located area."
         out.append(Picture(text, places))
     return out
 
@@ -242,7 +242,7 @@ def _figures(finding: Finding) -> list[ReportFigure]:
 
 
 def _open(finding: Finding) -> list[str]:
-    out = ["these runs cannot tell it from: " + ", ".join(finding.confounded_with)] if finding.confounded_with else []
+    out = ["these runs cannot tell the finding from: " + ", ".join(finding.confounded_with)] if finding.confounded_with else []
     out += [f"{e.full_title} could also be: {line}" for e in finding.effects for line in rival_lines(e)]
     return out + unseen_lines(finding)
 
@@ -257,14 +257,14 @@ def _appendix(found: _Found) -> list[Section]:
     if finding.location.table:
         tests = [(t.kind, t.value, plain(t.statistic), f"{t.p:.2g}") for t in finding.location.table]
         table = TextTable(("Against", "Which", "Statistic", "p (all tests together)"), tests)
-        out.append(Section(f"Tests of where the gap lives: {len(tests)}", [table], folded=True))
+        out.append(Section(f"Tests of where the gap is: {len(tests)}", [table], folded=True))
     if rejected := finding.rejected[:REJECTED]:
         out.append(Section(f"What was tried and why not: {len(rejected)}", [TextTable(("Effect", "Why"), rejected)], folded=True))
     return [*out, Section(DECIDED, [TextTable(("State", "Why"), found.states)])]
 
 
 def telling_run(finding: Finding) -> str | None:
-    """The run in which most of the gap over its noise closes; without a finding, the run with the largest gap."""
+    """Return the run whose gap, relative to its noise, closes most; without a finding, the run with the largest such gap."""
     shows = {}
     for label, run in finding.runs.items():
         if run.rms_before_um is not None and run.rms_after_um is not None:
@@ -313,7 +313,7 @@ def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
 
 
 def _points(found: _Found) -> tuple[F1, F1]:
-    """Positions of all judged readings, shape (n, 3), and their gap over the noise, shape (n,)."""
+    """Positions of all judged readings, shape (n, 3), mm, and their gap divided by the noise, shape (n,)."""
     places, ratios = [np.zeros((0, 3))], [np.zeros(0)]
     for label, run in found.measured.items():
         before = found.finding.series[label].before

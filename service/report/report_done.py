@@ -51,7 +51,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     """
     record = next((v for v in store.verifications.latest(limit=MANY) if v.id == number), None)
     if record is None:
-        raise NotStored(f"no verification {number} in the database", "abbe serve and abbe correct store verifications; count from 1")
+        raise NotStored(f"no verification {number} in the database", "`abbe serve` and `abbe correct` store them; numbers begin with 1")
     machine = store.machines.get(record.machine_id)
     campaign = None if record.campaign_id is None else from_store(store, store.campaigns.find(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
@@ -73,7 +73,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
         figures=[*figures, *evaluated.figures],
         instruments=_instruments(campaign, rules),
         conditions=condition,
-        not_observable=evaluated.not_observable if campaign is not None else ["its readings: no campaign is stored with it"],
+        not_observable=evaluated.not_observable if campaign is not None else ["the readings: no campaign is stored with this verification"],
         remarks=[*table.remarks, *evaluated.remarks, *remarks],
         statements=[parts.VERIFICATION_STATEMENT, *evaluated.statements],
         provenance=parts.provenance(parts.data_digest(runs) if runs else parts.doc_digest(record.doc)),
@@ -90,7 +90,7 @@ def verification_figures(record: VerificationRecord, rules: Rules) -> list[Repor
 
 
 def _stored_rows(doc: Doc) -> dict[str, tuple[float, float]]:
-    """Figures and standard uncertainties, µm, as stored by a correction or by a scheduled check (which stores expanded ones)."""
+    """Figures and standard uncertainties, µm. A correction stores standard uncertainties, a scheduled check expanded ones."""
     if "figures" in doc:
         return {k: (float(v["value"]), float(v["u"])) for k, v in doc["figures"].items()}
     expanded = doc.get("uncertainties") or {}
@@ -120,7 +120,9 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     entries = history.entries
     journal = tuple(e for e in entries if e.push == number != NO_PUSH)
     if not journal:
-        raise NotStored(f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {NO_PUSH})}, counted from 1")
+        raise NotStored(
+            f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {NO_PUSH})}; their numbers begin with 1"
+        )
     known = facts(journal)
     machine = known.machine or machine  # name of the machine at the time of the push
     doc = _machine_doc(store, machine)
@@ -141,7 +143,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
         not_observable=[] if verified else ["whether the machine became better: no verification is stored for this push"],
         remarks=[*_chain(entries), *remarks],
         statements=[
-            "Corrections are what the controller adds to the command, as the independent decoder reads them; they have no U of their own."
+            "The controller adds the corrections to the command. They are shown as the independent decoder reads them, and have no U."
         ],
         provenance=parts.provenance(parts.doc_digest([e.digest for e in journal]))
         | {"Last entry of the journal (SHA-256)": journal[-1].digest, "Meaning of the table (SHA-256)": known.semantic_digest},
@@ -168,7 +170,7 @@ def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict
         table = store.tables.get(known.table)
         out["Stored as"] = f"table {table.id}" + ("" if table.solution_id is None else f", from solution {table.solution_id}")
     out["Capability of the control"] = f"level {'unknown' if known.level == NOT_YET else known.level}" + (
-        ", a person is there" if known.attended else ""
+        ", a person is present" if known.attended else ""
     )
     found = {"Approved by": known.approved_by, "Proof of sign, axis and unit": known.probe, "Verification": known.verify}
     return out | {name: text for name, text in found.items() if text}
@@ -178,7 +180,7 @@ def _verdict(journal: Sequence[PushEntry], known: PushFacts) -> tuple[Sign, str,
     state = journal[-1].state
     sign, word = ENDS.get(state, ("open", "Not ended"))
     why = known.why or known.verify or "; ".join(known.reasons)
-    return sign, word, (why or f"it is in state {state}") + ("" if state in TERMINAL else f" (state {state})")
+    return sign, word, (why or f"the push is in state {state}") + ("" if state in TERMINAL else f" (state {state})")
 
 
 def _chain(entries: Sequence[PushEntry]) -> list[str]:

@@ -38,7 +38,7 @@ NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine
 
 @dataclass(frozen=True)
 class SolutionResult:
-    """A solution. ``number``: of a stored one; ``account``: of a new one, the source of its pictures."""
+    """A solution. ``number``: None unless it is stored; ``account``: source of the pictures, None unless it is new."""
 
     solution: SolutionFile
     number: int | None = None
@@ -122,7 +122,7 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
 
 
 def _verification(runs: Sequence[Run], rules: Rules) -> tuple[list[ReportFigure], Verdict | None]:
-    """Figures of a verification and their verdict, if these runs hold the four body diagonals, once out and back."""
+    """Figures of a verification and their verdict, if these runs contain all four body diagonals, measured once out and back."""
     known = [r for r in runs if not r.is_sealed and (r.is_bar or r.laser.cycles == 1) and not not_judged(r)]
     body = {r.laser.diagonal for r in known if r.test == "laser_diagonal" and not r.laser.order}
     if not body >= DIAGONALS:
@@ -228,18 +228,18 @@ def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Run]) -> list[st
     for label, _, _, state, why in states:
         reason = f": {why}" if why else ""
         if label in whole:
-            out.append(f"run {label} is {state}{reason}; {whole[label]} continued it, and its readings count there")
+            out.append(f"run {label} is {state}{reason}; run {whole[label]} continued it and contains its readings")
         elif label in short:
-            out.append(f"run {label} is {short.pop(label)}, it is not in the figures{reason}")
+            out.append(f"run {label} is {short.pop(label)}; the figures do not use it{reason}")
         elif state != "complete":
-            out.append(f"run {label} is {state}, it is not in the figures{reason}")
-    return [*out, *(f"run {label} is {why}, it is not in the figures" for label, why in short.items())]
+            out.append(f"run {label} is {state}; the figures do not use it{reason}")
+    return [*out, *(f"run {label} is {why}; the figures do not use it" for label, why in short.items())]
 
 
 def _own(run: Run) -> Evaluated:
     """Figures and pictures of any run: its readings and their range; for a helix also its rms."""
     if run.is_sealed:
-        return Evaluated(not_observable=["its readings: the run is sealed"])
+        return Evaluated(not_observable=["the readings: the run is sealed"])
     try:
         data = run_data(run)
     except AbbeError as error:
@@ -273,9 +273,9 @@ def _own(run: Run) -> Evaluated:
         try:
             axis = path_axis(run, data.axes_mm)
         except MeasurementFault as error:
-            return Evaluated(figures=rows, pictures=pictures, not_observable=[f"its picture: {error.detail}"])
+            return Evaluated(figures=rows, pictures=pictures, not_observable=[f"the picture of the helix: {error.detail}"])
         angle = np.degrees(about_axis(data.axes_mm - np.asarray(data.centre_mm), axis))
-        text = f"Deviation of the helix around its axis ({AXES[axis]}), centre and length of the bar fitted away."
+        text = f"Deviation of the helix around its axis ({AXES[axis]}), after a fit of centre and bar length."
         pictures.append(Picture(text, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
     return Evaluated(figures=rows, pictures=pictures)
 

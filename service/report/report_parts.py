@@ -97,7 +97,7 @@ def conditions(runs: Sequence[Run], rules: Rules) -> tuple[dict[str, str], list[
                 low, high = rules.temperature_c
                 out["Allowed"] = f"{low:g} to {high:g} °C"
                 if min(read) < low or max(read) > high:
-                    remarks.append(f"the air was outside of the allowed {low:g} to {high:g} °C: the figures cannot be judged")
+                    remarks.append(f"the air was outside the allowed {low:g} to {high:g} °C: the figures cannot be judged")
     if not any(name.startswith("temp") and values.size for columns in further for name, values in columns.items()):
         remarks.append("no temperature is on record")
     feeds = [float(v) for r in runs for v in r.columns.feed_mm_min]

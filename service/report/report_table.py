@@ -1,4 +1,4 @@
-"""Remarks about the table that the runs of a report were measured with: unverified, verified elsewhere, or unknown to this database."""
+"""Remarks about the tables in force during the runs of a report: unverified, verified elsewhere, or unknown to this database."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WORD = "Unverified table"
 
 @dataclass(frozen=True, slots=True)
 class TableRemarks:
-    """``unverified``: why the verdict by the limits does not count, empty if it does; ``remarks``: for the reader."""
+    """Remarks about the tables in force. ``unverified``: why the verdict by the limits does not count; empty if it does."""
 
     unverified: str = ""
     remarks: tuple[str, ...] = ()
@@ -33,7 +33,7 @@ NO_TABLE_REMARKS = TableRemarks()
 
 
 def table_remarks(store: Store, machine: str, runs: Sequence[Run]) -> TableRemarks:
-    """Compare the tables that runs of a machine were measured with to the current journals of this database."""
+    """Judge the tables in force during these runs of a machine by the current journals of this database."""
     used = {r.table.crc: r.table for r in runs if r.table.crc is not None}
     if not used:
         return TableRemarks()
@@ -48,7 +48,7 @@ def table_remarks(store: Store, machine: str, runs: Sequence[Run]) -> TableRemar
 
 
 def _corrects(crc: int, table: RunTable, images: Images) -> bool:
-    """Whether a table corrects anything: by its image, else by the statement of the control."""
+    """Whether a table corrects anything: according to its image or, without one, to the control."""
     image = images(crc)
     return bool(table.acting) if image is None else int.from_bytes(image[KIND_AT], "big") != NO_CORRECTION
 

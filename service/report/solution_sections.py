@@ -53,7 +53,7 @@ def solution_sections(found: Assessment, solution: SolutionFile) -> list[Section
     return [
         Section("Parameters", _parameters(found)),
         Section("Error motions", _motions(found)),
-        Section("What these runs tell of each error motion", _observability(found, shares)),
+        Section("What these runs tell about each error motion", _observability(found, shares)),
         Section("Uncertainty in the volume", _volume(found)),
         *_tables(solution),
     ]
@@ -94,8 +94,8 @@ def _motions(found: Assessment) -> list[Block]:
 
 def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Block]:
     caption = (
-        "Full bar: these runs tell the motion by themselves. Outline only: part of it looks like something else in every reading, however "
-        "long the bar; it belongs in no table of its own."
+        "Filled: these runs show the motion by itself. Outline only: in every reading, part of the motion looks like another error, however"
+        " long its bar; do not put it into a compensation table of its own."
     )
     out: list[Block] = [layout_line(found.observability.number), Picture(caption, [share_plot(shares)])]
     if found.observability.advice:
@@ -119,8 +119,8 @@ def _volume(found: Assessment) -> list[Block]:
         worst_line(found),
         Picture("Half-axis of the 95 % region of the predicted deviation vector, best-fit rigid motion removed. One colour scale.", maps),
         Picture(
-            "Micrometres of predicted deviation that one micrometre of reading noise makes: high where the readings are few or far "
-            "away. More or better readings help there; elsewhere what is assumed about machines decides.",
+            "Predicted deviation, µm, per µm of reading noise: high where readings are few or far away. More or better readings help "
+            "there; elsewhere the assumptions about machines decide.",
             gains,
         ),
     ]
@@ -134,8 +134,8 @@ def _tables(solution: SolutionFile) -> list[Section]:
             for t in solution.tables
         ]
         text = (
-            f"Errors of distances over the inner 80 % of the strokes that are left, µm, with {U_OF}. What is unknown of this machine is in "
-            "every row."
+            f"Remaining errors of distances over the inner 80 % of the strokes, µm, with {U_OF}. Every row includes what is unknown about "
+            "this machine."
         )
         table = TextTable(("Table", "Numbers", "rms", "95 % below", "Largest"), cells)
         out.append(Section("What each kind of table can reach", [text, table]))

@@ -46,7 +46,7 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
         assert [f.symbol for f in screen.document.figures] == ["n"]
         assert any(re.search(WHY, line) for line in screen.document.not_observable)
         campaign = stored_report(store, store.campaigns.find("june"), Rules())
-        assert any(re.match("run helix is stopped, it is not in the figures", line) for line in campaign.remarks)
+        assert any(re.match("run helix is stopped; the figures do not use it", line) for line in campaign.remarks)
     cli(["show", "helix", "--machine", str(sims.machine_file)])
     assert re.search(WHY, " ".join(capsys.readouterr().out.split()))
 
@@ -59,7 +59,7 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
         assert "helix rms" in [f.symbol for f in stored_report(store, whole, Rules()).figures]
         campaign = stored_report(store, store.campaigns.find("june"), Rules())
         pieces = run.timing.pieces
-        said = "continued it, and its readings count there" if pieces else "it is not in the figures"
+        said = "continued it and contains its readings" if pieces else "the figures do not use it"
         assert any(said in line for line in campaign.remarks)
     capsys.readouterr()
     cli(["show", "june/helix", "--machine", str(sims.machine_file), "--json"])

@@ -235,7 +235,7 @@ def test_the_campaign_report_holds_what_the_standards_ask_for(stored):
     assert by["diagonal, worst"]["verdict"] == "fail"
     assert by["M_d"]["value"] == pytest.approx(by["diagonal, worst"]["value"], abs=1e-9)  # the same figure, found on two ways
     assert doc["verdict"]["word"] == "Out of limits then"  # a push brought another table since
-    assert any(r.startswith("this report is of a table that was in force then") for r in doc["remarks"])
+    assert any(r.startswith("this report is about the table in force at that time") for r in doc["remarks"])
     assert {i["name"]: i["certificate"] for i in doc["instruments"]} == {
         "telescoping ball-bar": "valid to 2099-12-31", "laser displacement meter": "valid to 2099-12-31",
     }  # fmt: skip

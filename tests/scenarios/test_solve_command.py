@@ -75,7 +75,7 @@ def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(command, folder
         assert words in text
     assert "units, axes, copies, machine" in err
     page = (tmp_path / "page.html").read_text()
-    pictures = ("may stand in a table of their own", "Noise gain, Z = ", "µm per µm")
+    pictures = ("can have a compensation table of their own", "Noise gain, Z = ", "µm per µm")
     for words in (
         "Error motions",
         "Uncertainty in the volume",

@@ -122,11 +122,11 @@ def _stated(side: tuple[float, float] | None, unit: Unit) -> str:
     return "–" if side is None else "{} ± {} {}".format(*with_uncertainty(*side), unit.sign)
 
 
-def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str = "What the readings tell of each error motion") -> str:
+def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str = "What the readings tell about each error motion") -> str:
     """Share of information from readings per error motion, with its status, in the given order; the bar is empty if not observable."""
     width, row_height, top, labels, texts = 500.0, 20.0, 54.0, 64.0, 118.0
     kept = [r.name for r in rows if r.status == "observed"]
-    count = f"{len(kept)} of {len(rows)} may stand in a table of their own"
+    count = f"{len(kept)} of {len(rows)} can have a compensation table of their own"
     height = row_height * max(len(rows), 1)
     svg = Svg(width, top + height + 50.0, key, heading, f"{heading}: {count}: {', '.join(kept) or 'none'}.")
     svg.text((10.0, 18.0), heading, "t-head")

@@ -1,4 +1,4 @@
-"""Measured against simulated: gap of every run over its noise, gap along one run before and after, and gap over the volume."""
+"""The gap, measured minus simulated: of every run, along one run, and over the volume; before and after effects are added to the model."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ ROW, TOP, BOTTOM, LABELS = 20.0, 52.0, 46.0, 190.0
 TRACE_HEIGHT = 400.0
 MAX_POINTS = 1500
 STEPS = (1.5, 2.5, 4.0, 7.0)
-"""Limits between the five colours of a cell: rms of the gap over the noise."""
+"""Limits between the five colours of a cell: rms of the gap divided by the noise."""
 
 
 def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
-    """One row per run: gap before (hollow) and after (filled), and the noise floor as a tick. Sealed runs are left out."""
+    """One row per run: gap before (upper bar) and after (lower bar), and the noise floor as a tick. Sealed runs are left out."""
     rows = [
         (label, r, r.rms_before_um, r.rms_after_um)
         for label, r in runs.items()
@@ -73,8 +73,8 @@ def trace_plot(trace: Trace, *, key: str) -> str:
 
 
 def place_plot(place: PlaceMap, *, key: str) -> str:
-    """Cells of one plane, darker for a larger gap over its noise; a ring marks the located area."""
-    heading = f"Where the gap lives, {place.x_axis} and {place.y_axis}"
+    """Cells of one plane, coloured by their gap divided by the noise; a ring marks the located area."""
+    heading = f"Where the gap is, {place.x_axis} and {place.y_axis}"
     worst = float(place.times_noise.max()) if place.times_noise.size else math.nan
     svg = Svg(HALF, 380.0, key, heading, f"rms of the gap over its noise, up to {plain(worst, 2)}")
     svg.text((10.0, 18.0), heading, "t-head")

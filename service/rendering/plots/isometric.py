@@ -19,10 +19,9 @@ from abbe.service.rendering.svg import XY, Svg
 
 F2 = NDArray[np.float64]
 
-# Rows: right and up on the paper, and towards the viewer, for a right-handed frame seen from (+1, -1, +1).
 _ROOT2, _ROOT6, _ROOT3 = math.sqrt(2.0), math.sqrt(6.0), math.sqrt(3.0)
 VIEW: F2 = np.array([[1 / _ROOT2, 1 / _ROOT2, 0.0], [-1 / _ROOT6, 1 / _ROOT6, 2 / _ROOT6], [1 / _ROOT3, -1 / _ROOT3, 1 / _ROOT3]])
-"""Rows: right and up on the paper, towards the viewer."""
+"""Rows: right and up on the paper, and towards the viewer, for a right-handed frame seen from (+1, -1, +1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,7 @@ class Paper:
 
 
 def depth(points: F2) -> NDArray[np.float64]:
-    """Distance towards the viewer, shape (n,): draw in rising order, near over far."""
+    """Distance towards the viewer, shape (n,). Draw in rising order, so that near covers far."""
     towards: NDArray[np.float64] = points @ VIEW[2]
     return towards
 
@@ -142,7 +141,7 @@ def surface_plot(surface: Surface, scale: SignedScale, *, key: str, heading: str
 
 
 def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scale: SignedScale, *, key: str, heading: str) -> str:
-    """A map over the upper hemisphere as a ball: every node is moved outwards by its magnified value.
+    """The probe error over the upper hemisphere, as relief on a ball: every node is moved outwards by its magnified value.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ def common_step(slices: Sequence[Slice]) -> float:
 
 
 def cell_map(found: Slice, step: float, *, key: str, heading: str) -> str:
-    """One plane of the volume, a cell per node; dark is large. ``step``: width of a colour band, µm, from `common_step`."""
+    """One plane of the volume, a coloured cell per node. ``step``: width of a colour band, µm, from `common_step`."""
     height = 420.0
     low, high = float(np.nanmin(found.values)), float(np.nanmax(found.values))
     summary = f"from {plain(low)} to {plain(high)} µm, {found.at}"
@@ -108,7 +108,7 @@ def correlation_plot(found: Correlations, *, key: str = "correlations") -> str:
     ]
     width = max(labels + side + 20.0, labels + 350.0)
     svg = Svg(width, top + side + labels + 40.0, key, "Correlation of parameters", "Above 0.9: " + ("; ".join(strong) or "none") + ".")
-    svg.text((10.0, 18.0), "Correlation of the parameters that go together most", "t-head")
+    svg.text((10.0, 18.0), "The most correlated parameters", "t-head")
     for i, name in enumerate(found.names):
         svg.text((labels - 8.0, top + (i + 0.7) * cell), name[:20], "t-small", anchor="end")
         svg.text((labels + (i + 0.7) * cell, top + side + 8.0), name[:20], "t-small", anchor="end", turn=-90.0)
@@ -167,7 +167,7 @@ def level_lines(x: Array, y: Array, values: Array, level: float) -> list[list[XY
     Returns
     -------
     list of lists of (x, y)
-        One list per line; a closed line ends at its first point. The lines of a saddle put its centre on the side of the cell's mean.
+        One list per line; a closed line ends at its first point. In a saddle cell the mean of the corners decides which crossings connect.
     """
     segments: list[Segment] = []
     for j in range(len(y) - 1):

@@ -21,7 +21,7 @@ MAX_POINTS = 900
 def residual_plot(series: ResidualSeries, *, noise_um: float | None, y_range: tuple[float, float] | None = None, key: str) -> str:
     """Residual against time or position along the path.
 
-    ``noise_um``: standard deviation of the reading, drawn as a band of ± 2 of them. ``y_range``: common range of several runs.
+    ``noise_um``: standard deviation of the reading, drawn as a band of ± 2 standard deviations. ``y_range``: common range of several runs.
     """
     x, y = _paired(series)
     good = y[np.isfinite(y)]

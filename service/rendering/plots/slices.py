@@ -118,5 +118,5 @@ def _key(svg: Svg, y: float, top: float, texts: SliceTexts) -> None:
 
 
 def steps(top: float) -> list[str]:
-    """Upper ends of the five colours as text."""
+    """Ends of the five colours as text, from zero to ``top``."""
     return [tidy(i * top / SEQUENCE) for i in range(SEQUENCE + 1)]

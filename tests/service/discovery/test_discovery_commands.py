@@ -107,7 +107,7 @@ def test_every_verdict_has_words_a_page_and_exit_code_0(
         assert "measure next: repeat it where it lives (seen in ballbar circle; axis X; about X 310" in out
     page = (tmp_path / "a.html").read_text()
     assert sign in page
-    assert "Nothing is needed" not in page
+    assert "No further measurement is needed" not in page
     assert ("What to measure next" in page) == (verdict == "unknown")
     assert ("Gap closed by a structure without a name" in page) == (verdict == "unknown")
     assert "with what was found" not in page

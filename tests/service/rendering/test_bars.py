@@ -31,7 +31,7 @@ SHARES = [MotionShare("EXX", 0.99, "observed"), MotionShare("EYX", 0.4, "weak"),
 def test_bars_are_as_long_as_the_share_and_only_observed_motions_are_called_fit_for_a_table():
     picture = share_plot(SHARES)
     ET.fromstring(picture)
-    assert "1 of 3 may stand in a table of their own: EXX." in picture
+    assert "1 of 3 can have a compensation table of their own: EXX." in picture
     width = {tip.split(":")[0]: float(w) for w, tip in re.findall(r'<rect [^>]*width="([\d.]+)"[^>]*><title>([^<]*)</title>', picture)}
     assert abs(width["EYX"] / width["EXX"] - 0.4 / 0.99) < 1e-3
     # what is not observable has an outline only, however large its share
