@@ -1,6 +1,6 @@
 """Errors of the service, with stable codes. The command line prints one line of cause and remedy and exits with 2.
 
-Also validation errors as text: where the mistake is, what was expected, what the author probably meant.
+The functions turn validation errors into text: where the mistake is, what was expected, what the author probably meant.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ConfigError(AbbeError):
 
 
 class FileFormatError(AbbeError):
-    """An exchange file violates run-format.md; the message names file, key, row and the expected value."""
+    """An exchange file violates its format (docs/reference/formats.md); the message names file, key, row and the expected value."""
 
     code = "FMT-001"
 
@@ -170,7 +170,7 @@ class StatusUnknown(Interlock):
 
 
 class SpindleTurns(Interlock):
-    """The spindle turns and would tear off what is mounted on it or in its cup."""
+    """The spindle turns and would tear off the mounted instrument."""
 
     code = "ILK-011"
     condition = "spindle"
@@ -207,7 +207,7 @@ class SetupDisturbed(AbbeError):
 
 
 class StretchDiffers(SetupDisturbed):
-    """An interrupted path, read again over its overlap, gives different readings: the path cannot be resumed from them."""
+    """The part of an interrupted path that is read twice gives different readings: the path cannot be resumed."""
 
     code = "SEQ-009"
 
@@ -300,7 +300,7 @@ class PushNotBegun(AbbeError):
 
 
 class TakenBack(TableRefused):
-    """A table was active for its probe and failed it; the old table is in force again."""
+    """A new table was active for a test of its effect, and failed it; the old table is in force again."""
 
     code = "CMP-005"
 
@@ -336,7 +336,7 @@ class DiskFull(AbbeError):
 
 
 class CaptureConflict(AbbeError):
-    """The database has a different chunk under this number than the segment. Nothing was overwritten."""
+    """The database has other samples under the number of a chunk in a capture segment. Nothing was overwritten."""
 
     code = "CAP-003"
 

@@ -25,7 +25,7 @@ class NotPlainError(OSError):
 def read_plain(path: Path, most: int) -> bytes:
     """Read a whole file from outside Abbe. A link counts as its target.
 
-    A pipe is not waited for, and a device is not even opened: opening a serial port moves its lines.
+    A pipe is not waited for, and a device is not even opened: opening a serial port switches its control lines.
 
     Parameters
     ----------

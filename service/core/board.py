@@ -1,6 +1,6 @@
 """Current state known to the core: the running check, the devices, the broker. Kept in memory; results are in the store.
 
-Watchers of the running job keep the board (and with it the page) and the broker up to date; `SnapshotSource` makes one message of it all.
+Watchers of the running job keep the board (and with it the page) and the broker up to date. `SnapshotSource` makes the `Snapshot`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Board:
             self.job = replace(self.job, **{field.name: getattr(progress, field.name) for field in fields(Progress)})
 
     def job_ended(self, doc: Doc | None) -> None:
-        """Note how the check ended. A check that was stopped or failed proves nothing about the devices that it does not name."""
+        """Note how the check ended. A check that was stopped or failed proves nothing about devices other than the one that caused it."""
         self.changes += 1
         self.job = None
         cause = doc["cause"] if doc is not None else None
@@ -128,7 +128,7 @@ class StatePublisher:
 
 
 class VerifiedWatch:
-    """Watches which measurement verified the table in force, and updates broker and page when that changes: any process may roll back."""
+    """Watches which measurement verified the table in force, and reports a change to broker and page: any process may roll back."""
 
     def __init__(self, look: Callable[[], VerifiedBy], publisher: Publisher | None, clock: Clock, changed: Callable[[], None]) -> None:
         self._look, self._publisher, self._clock, self._changed = look, publisher, clock, changed
@@ -151,7 +151,7 @@ class VerifiedWatch:
 
 
 AGAIN = timedelta(minutes=1)
-"""The timetable is evaluated at most this often, unless a slot has come due: it changes only then."""
+"""Shortest time between two evaluations of the timetable, unless a slot has come due."""
 
 
 class SnapshotSource:

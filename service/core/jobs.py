@@ -31,7 +31,7 @@ log = structlog.get_logger("abbe.jobs")
 
 MOST_KEYS = 1000
 BY_HAND = "by hand"
-AGAIN = "asked for before, with this key"
+AGAIN = "already requested with this key"
 """Text of the answer to a repeated request."""
 ASKING = "asking"
 """State of a job that waits for a person to do something by hand."""
@@ -61,7 +61,7 @@ class FullCampaigns:
 
 @dataclass(frozen=True, slots=True)
 class JobRequest:
-    """A request for a job. ``what``: what ``key`` stands for; the same user may repeat the key only for the same thing."""
+    """A request for a job. ``key``: idempotency key; ``what``: the requested work. A user may repeat a key only for the same work."""
 
     request: int
     who: str
@@ -131,7 +131,7 @@ class JobRegistry:
         self.claim, self._tasks = claim, tasks
 
     async def close(self) -> None:
-        """Accept no more jobs, and cancel those started by hand: the devices hold the motion."""
+        """Accept no more jobs, and cancel those started by hand, which stops the axes."""
         self.claim = None
         running = [entry.task for entry in self._jobs.values() if entry.task is not None and not entry.task.done()]
         for task in running:
@@ -252,10 +252,12 @@ class JobRegistry:
     def begin(self, requested: JobRequest, job: Job[Any]) -> Answer:
         """Begin a requested job if the machine is free. The caller has checked the user's rights."""
         if self.claim is None or self._tasks is None:
-            return _answer(requested.request, "busy", "the service starts, ends, or runs its timetable once; it takes no jobs")
+            return _answer(
+                requested.request, "busy", "the service takes no jobs now: it is starting, ending, or running its timetable once"
+            )
         other = self.claim.take(f"{BY_HAND}: {job.terms.recipe}")
         if other:
-            return _answer(requested.request, "busy", f"the machine measures: {other}")
+            return _answer(requested.request, "busy", f"the machine is in use: {other}")
         entry = self._new(job, requested.who)
         if requested.key:
             self._keys[requested.who, requested.key] = (entry.record.id, requested.what)
@@ -274,7 +276,7 @@ class JobRegistry:
         if control.state is State.ENDED:
             return _answer(asked.request, "conflict", "the measurement of this job has ended; its figures are being judged", asked.job)
         if asked.how == "pause" and control.no_pause_reason:
-            return _answer(asked.request, "conflict", f"it cannot be paused now: {control.no_pause_reason}", asked.job)
+            return _answer(asked.request, "conflict", f"the job cannot be paused now: {control.no_pause_reason}", asked.job)
         {"stop": control.stop, "abort": control.abort, "pause": control.pause, "resume": control.resume}[asked.how]()
         log.info("job steered", job=asked.job, how=asked.how, who=asked.who)
         self._changed()
@@ -286,7 +288,7 @@ class JobRegistry:
         if isinstance(entry, Answer):
             return entry
         if not entry.control.prompts.answer(asked.prompt):
-            return _answer(asked.request, "conflict", f"this job does not wait for prompt {asked.prompt}; look at it again", asked.job)
+            return _answer(asked.request, "conflict", f"this job does not wait for prompt {asked.prompt}; look at the job again", asked.job)
         log.info("done by hand", job=asked.job, prompt=asked.prompt, who=asked.who)
         self._changed()
         return _answer(asked.request, "done", "", asked.job)

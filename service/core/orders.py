@@ -142,7 +142,7 @@ class _TableOrderJob(_OrderJob):
         return await super().end(reconciled(await self._retrying(self._look), outcome))
 
     async def interrupted(self) -> None:
-        """Record its state by the journal; the next start rolls back an open push."""
+        """Record the order's outcome by the push journal; the next start rolls back an open push."""
         done = await asyncio.to_thread(self._look) or JobOutcome("failed", "the service ended before anything was written")
         log.warning("order interrupted by the end of the service", kind=self.kind, word=done.word, text=done.text)
         await self._trail.write(done.word, f"{done.text} (stopped with the service)")
@@ -189,7 +189,7 @@ class Orders(RetryingStore):
         """Begin a rollback, once for each key; refused if another table is in force than the user saw, or there is no previous table."""
         requested = JobRequest(asked.request, asked.who, asked.key, f"{ROLLBACK} of push {asked.push}, {asked.crc:08X}: {asked.reason}")
         refused = await self._refused(
-            requested, "order a table back", self._actions.ordered_rollback is None and "this service has no controller"
+            requested, "order a rollback", self._actions.ordered_rollback is None and "this service has no controller"
         )
         if refused is not None:
             return refused
@@ -198,7 +198,7 @@ class Orders(RetryingStore):
         except TableRefused as no:
             return _answer(asked.request, "conflict", str(no))
         if (now.push, now.crc) != (asked.push, asked.crc):
-            what = f"meanwhile another table is in force: {now.crc:08X} of push {now.push}; check it first"
+            what = f"another table has come into force meanwhile: {now.crc:08X} of push {now.push}; check it first"
             return _answer(asked.request, "conflict", what)
         return self._jobs.begin(requested, self._rollback_job(asked))
 
@@ -274,7 +274,7 @@ class Orders(RetryingStore):
             return _answer(requested.request, "conflict", missing)
         running = self._jobs.running
         if running is not None:  # before reading the journal: a running push would look like an interrupted one
-            return _answer(requested.request, "busy", f"the machine measures: {running.schedule or running.recipe}")
+            return _answer(requested.request, "busy", f"the machine is in use: {running.schedule or running.recipe}")
         return None
 
     def _trail(self, begun: AuditEvent) -> _AuditTrail:

@@ -1,6 +1,7 @@
-"""Recover what an earlier end of the service left open - runs in segments, a push under way: at start, and reported until it is closed.
+"""Close what an earlier process left open: runs whose samples are still in capture segments, and an unfinished push.
 
-A push of the running service can be left open too, with an unverified table in force: it is recovered in the same way.
+The service does this at its start, and again when a push is left open with an unverified table in force. A failure is shown until a later
+try succeeds.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ IsOpen = Callable[[], Awaitable[bool]]
 
 
 class PushRecovery:
-    """Tries until nothing is open, and starts again when something is.
+    """Tries until nothing is open, and starts again when a push is left open.
 
     Parameters
     ----------
     recover : callable
         One try.
     is_open : callable
-        Asked after everything was closed.
+        Whether a push is open; called again and again once everything was closed.
     claim : MachineClaim
         Claims the machine during a try, so that no check starts.
     alarms : AlarmSink

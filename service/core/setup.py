@@ -1,4 +1,4 @@
-"""Setup of the service, from the machine file: all that `abbe.service.serve` is built from."""
+"""Setup of the service, from the machine file: all that `abbe.service.serve` needs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class ServiceSetup:
     rules : Rules
         Limits, certificates and temperatures that reports add to the data.
     duties : callable, optional
-        Given the store, returns what the service does about alarms; None: it raises none.
+        Given the store, returns what the service does about alarms; None: it raises no alarms.
     table : callable, optional
         Given the store, returns how to look at the table in force; None: it is not watched.
     live : LiveFeed, optional

@@ -78,7 +78,7 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
 
 
 async def _look_or_strange(controller: TableController, known: KnownTables, chain: str, corrects: dict[int, bool]) -> InForceNow:
-    """Check as the gate does. A table whose bytes do not match the stated CRC is strange."""
+    """Identify the table as `table_gate` does. A table whose bytes do not match the stated CRC is strange."""
     try:
         return await table_gate.identify_table(controller, known, chain, corrects)
     except TableMismatch:

@@ -1,6 +1,6 @@
 """The web process from the core's side: start it, send it updates, receive requests, end it; restart it when it has ended or hangs.
 
-Nothing in it may block or end the core: messages are sent without waiting, and what it sends is checked before use.
+The web process can neither block nor end the core: the core sends without waiting, and checks every message that it receives.
 """
 
 from __future__ import annotations
@@ -43,9 +43,6 @@ from abbe.service.core.orders import Orders
 from abbe.service.domain.progress import RecordedPath
 from abbe.service.errors import AbbeError, ChannelBroken
 
-# Sends the web process the samples of the running path, twenty times a second, and never waits for it.
-
-
 FRAME_S = 0.05
 """Time between two messages, s: 20 Hz, about 50 samples each at 1 kHz."""
 NO_PATH = LivePath("path", RecordedPath())
@@ -53,7 +50,7 @@ NO_PATH = LivePath("path", RecordedPath())
 
 async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
     """Send every path and its samples, until cancelled. A web process that reads too slowly misses samples; the disk misses none."""
-    live.stretches()  # samples without a listener are old: seconds of them at once
+    live.stretches()  # discards samples that gathered while nobody listened
     sent = 0
     while True:
         await live.active.wait()
@@ -121,9 +118,9 @@ log = structlog.get_logger("abbe.web")
 PERIOD_S, SHORTEST_S = 1.0, 0.2
 """Longest and shortest time between two messages to the page, s."""
 PAUSE_S, LONGEST_PAUSE_S, GOOD_LIFE_S = 0.1, 30.0, 30.0
-"""Pause before a restart, doubled each time up to the longest; a process that lived this long resets it, s."""
+"""First and longest pause before a restart, which doubles each time; lifetime of a process after which it is the first again, s."""
 START_S, HANG_S = 60.0, 20.0
-"""Time limits to start serving, and without any message, s: after them the process is ended."""
+"""Longest time until the process serves, and longest silence, s; then the core ends it."""
 GOODBYE_S = 1.2
 PASSED_ON = frozenset({"ABBE_AUDIT_FOLDER"})
 WITHHELD = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"})
@@ -234,7 +231,7 @@ class WebProcess:
         return child
 
     async def _end(self, child: asyncio.subprocess.Process) -> None:
-        """Wait for the process to end, since its channel has closed; kill it after `GOODBYE_S`. It holds nothing that could be lost."""
+        """Wait for the process to end, since its channel has closed; kill it after `GOODBYE_S`: nothing in it can be lost."""
         if self._up:
             with suppress(TimeoutError):
                 async with asyncio.timeout(GOODBYE_S):
@@ -289,7 +286,7 @@ class WebProcess:
                 case ConfirmPrompt():
                     return await self._jobs.done_by_hand(message)
             if self._orders is None:
-                return Answer("answer", message.request, "conflict", "this service takes no orders of tables", "")
+                return Answer("answer", message.request, "conflict", "this service takes no orders for tables", "")
             return await (self._orders.rollback(message) if isinstance(message, RollBack) else self._orders.push(message))
         except AbbeError as error:  # the store does not answer, so no user is known
             return Answer("answer", message.request, "busy", str(error)[:1000], "")

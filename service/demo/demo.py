@@ -33,7 +33,7 @@ MAX_SAMPLES_PER_S = 6000
 CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
 """Simulated instruments need no calibration."""
 FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
-"""Wide limits: the first table of an uncorrected machine replaces no correction by the whole one."""
+"""Wide limits: the first table of an uncorrected machine changes every correction from zero to its full value."""
 
 
 @dataclass
@@ -52,12 +52,12 @@ class DemoResult:
 
 
 def bar_rate_hz(speed: float) -> int:
-    """Fastest ball-bar rate (a divisor of 1000 Hz) that keeps the wall-clock sample rate within `MAX_SAMPLES_PER_S`."""
+    """Return the fastest ball-bar rate (a divisor of 1000 Hz) that keeps the wall-clock sample rate within `MAX_SAMPLES_PER_S`."""
     return next((r for r in (1000, 500, 250, 200, 125, 100, 50, 40, 25, 20, 10) if r * speed <= MAX_SAMPLES_PER_S), 10)
 
 
 def demo_site(ready: dict[str, Any]) -> Site:
-    """Site of a simulated machine: its nominal geometry and the addresses of its devices."""
+    """Return the site of a simulated machine: its nominal geometry and the addresses of its devices."""
     machine = machine_from_doc(ready["machine"])
     urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
     return Site(
@@ -96,7 +96,7 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
     Raises
     ------
     AbbeError, DriverError
-        With one cause and one remedy. The simulators are stopped in any case.
+        The demonstration failed; the error names cause and remedy. The simulators are stopped in any case.
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()
@@ -112,7 +112,7 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
                 await _job(session, store, result, progress)
         finally:
             store.close()
-    progress(Progress("truth", 0.0, 1.0, None, "asking the simulator's sealed truth"))
+    progress(Progress("truth", 0.0, 1.0, None, "reading the simulator's sealed truth"))
     bank = folder / "active_bank.bin"
     result.truth_before = await sealed_truth(simulator_args, None)
     result.truth_after = await sealed_truth(simulator_args, bank)

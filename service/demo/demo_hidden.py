@@ -40,7 +40,7 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 MOST = 5000
-"""Largest number of ball-bar readings in the search: one every 2 to 6 mm, in a quarter of the time."""
+"""Number of ball-bar readings in the search: one every 2 to 6 mm of path, which takes a quarter of the time for all readings."""
 CAMPAIGN, ANEW = "discover", "anew"
 
 
@@ -82,7 +82,7 @@ async def run_hidden_demo(
     Raises
     ------
     AbbeError, DriverError
-        With one cause and one remedy. The simulators are stopped in any case.
+        The demonstration failed; the error names cause and remedy. The simulators are stopped in any case.
     """
     clock = clock or SystemClock()
     start = clock.monotonic_s()
@@ -103,7 +103,7 @@ async def run_hidden_demo(
 
 
 def few(runs: list[Run]) -> list[Run]:
-    """Runs with about `MOST` ball-bar readings."""
+    """Thin the runs to about `MOST` ball-bar readings."""
     return picked(runs, MOST)
 
 
@@ -131,7 +131,7 @@ async def _job(session: Session, store: Store, result: HiddenDemo, progress: Pro
 
 
 async def _search(job: DiscoveryJob, journal: DiscoveryJournal, progress: ProgressSink) -> Finding:
-    """Search in a thread. After a cancellation it ends with its next report of progress."""
+    """Search in a thread. After a cancellation the thread ends at its next report of progress."""
     stopped = threading.Event()
 
     def checked_progress(p: Progress) -> None:
@@ -150,7 +150,7 @@ FORMAT = "abbe-hidden-demo/1"
 
 
 def summary_lines(result: HiddenDemo) -> list[str]:
-    """Results line by line, in the order of the job."""
+    """Return the results line by line, in the order of the job."""
     finding = result.finding
     _, word, text = verdict_of(finding)
     lines = [f"measured: {len(finding.runs)} runs, {sum(r.readings for r in finding.runs.values())} readings"]
@@ -169,8 +169,8 @@ def _gap_text(gap: GapUm) -> str:
 def _model(result: HiddenDemo) -> list[str]:
     version = None if result.journal is None else result.journal.version
     if version is not None:
-        return [f"model book: version {version} of {result.site.name} knows it now"]
-    return book_lines(result.finding) or ["model book: unchanged, nothing was proved that could enter it"]
+        return [f"model book: version {version} of {result.site.name} contains it now"]
+    return book_lines(result.finding) or ["model book: unchanged, since no effect was proved for it"]
 
 
 def _anew(result: HiddenDemo) -> list[str]:
@@ -185,12 +185,12 @@ def _tables(result: HiddenDemo) -> list[str]:
     if c is None:
         return [f"tables: none written: {result.refused}"] if result.refused else []
     kept = "kept" if c.decision.keep else "rolled back"
-    lines = [f"tables for what tables take out (the 21 error motions): {kept}; {c.decision.text}"]
-    return lines + [f"stays: {line}" for line in c.not_for_tables]
+    lines = [f"tables for the 21 error motions: {kept}; {c.decision.text}"]
+    return lines + [f"not in the tables: {line}" for line in c.not_for_tables]
 
 
 def hidden_label(truth: dict[str, Any]) -> str | None:
-    """The hidden effect as ``name:key``; None if nothing was hidden."""
+    """Return the hidden effect as ``name:key``; None if nothing was hidden."""
     secret = truth.get("hidden")
     if secret is None:
         return None
@@ -198,7 +198,7 @@ def hidden_label(truth: dict[str, Any]) -> str | None:
 
 
 def judged(result: HiddenDemo) -> tuple[bool, str]:
-    """Whether the answer was right, and a sentence about it.
+    """Return whether the answer was right, and a sentence about it.
 
     Right answers: exactly the hidden name and key; ``none`` if nothing is hidden; ``unknown`` if the catalogue lacks the hidden effect.
     """
@@ -209,28 +209,28 @@ def judged(result: HiddenDemo) -> tuple[bool, str]:
         return right, "nothing was hidden" + ("" if right else f"; the answer was {', '.join(named) or finding.verdict}")
     if result.truth["hidden"]["name"] not in {e.name for e in catalogue()}:
         right = finding.verdict == "unknown" and not named
-        return right, f"hidden was {label}, which no catalogue names; the answer was {', '.join([finding.verdict, *named])}"
+        return right, f"hidden was {label}, which the catalogue does not hold; the answer was {', '.join([finding.verdict, *named])}"
     right = finding.verdict == "named" and named == [label]
     also = [n for n in named if n != label]
     if label in named and also:
-        return False, f"hidden was {label}, and it was named; but beside it {', '.join(also)}, which is not there"
+        return False, f"hidden was {label}, which was named, but so was {', '.join(also)}, which is not there"
     return right, f"hidden was {label}; the answer was {', '.join(named) or finding.verdict}"
 
 
 def truth_lines(result: HiddenDemo) -> list[str]:
-    """Lines that compare the answer with the sealed truth."""
+    """Return the lines that compare the answer with the sealed truth."""
     right, text = judged(result)
     lines = [f"sealed truth: {text}. {'RIGHT' if right else 'WRONG'}."]
     secret = result.truth.get("hidden")
     if secret is not None:
         values = ", ".join(f"{k} {v:g}" for k, v in secret["parameters"].items())
-        bent = ", bent away from its formula" if secret["wild"] else ""
-        lines.append(f"  it was made with {values}{bent}")
+        bent = "; its shape deviates from the formula in the catalogue" if secret["wild"] else ""
+        lines.append(f"  its true parameters: {values}{bent}")
     return lines
 
 
 def hidden_json(result: HiddenDemo) -> dict[str, Any]:
-    """JSON output of `abbe demo --hidden SEED --json`."""
+    """Return the JSON output of `abbe demo --hidden SEED --json`."""
     finding, c = result.finding, result.correction
     fields = ("label", "name", "key", "strength", "u_strength", "unit", "remedy", "remedy_text")
     right, text = judged(result)

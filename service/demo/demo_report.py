@@ -35,14 +35,13 @@ from abbe.service.verification.verify import VerificationFigures, figure_rows
 
 TRUTH = "sealed truth of the simulator"
 ALL_OBSERVABLE = (
-    "nothing of the model: these runs tell every parameter apart. Errors outside the model remain possible; the residuals are the place to "
-    "look"
+    "nothing in the model: these runs determine every parameter. Errors outside the model remain possible: look at the residuals"
 )
 TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
 
 
 def demo_json(result: DemoResult) -> dict[str, Any]:
-    """JSON output of `abbe demo --json`: sealed-truth figures, the bound of nine tables, measured figures with uncertainty."""
+    """Return the JSON output of `abbe demo --json`: sealed-truth figures, the bound of nine tables, measured figures with uncertainty."""
     before, after = result.truth_before, result.truth_after
     out: dict[str, Any] = {"format": "abbe-demo/1", "seed": result.seed, "speed": result.speed}
     out |= {key: {"before": before[key], "after": after[key]} for key in TRUTH_KEYS}
@@ -71,7 +70,7 @@ def _measured(before: VerificationFigures, after: VerificationFigures) -> list[t
 
 
 def summary_rows(result: DemoResult) -> list[SummaryRow]:
-    """Before and after, measured figures first, then the sealed truth."""
+    """Return the figures before and after: measured ones first, then the sealed truth."""
     rows = []
     c = result.correction
     for name, (v, u), (a, ua) in _measured(c.before, c.after) if c is not None else []:
@@ -111,7 +110,7 @@ def _tables(t: NineTables) -> list[TableCurve]:
 
 
 def demo_report(result: DemoResult) -> Document:
-    """Report of the demonstration: before and after, parameters, tables, residuals.
+    """Return the report of the demonstration: before and after, parameters, tables, residuals.
 
     Raises
     ------
@@ -151,8 +150,8 @@ def _before_and_after(result: DemoResult, c: Correction) -> list[Block]:
     vectors = volume_pair(_arrows(result.truth_before), _arrows(result.truth_after))
     caption = "Error vectors over the volume, rigid motion removed; both pictures share one exaggeration and one colour scale."
     diagonals = (
-        "Deviation along the body diagonals. Before: dashed; after: solid; all on one ordinate. A curve that returns shows the way out and "
-        "the way back."
+        "Deviation along the body diagonals. Before: dashed; after: solid; all on one ordinate. Where a curve has two branches, they are "
+        "the way out and the way back."
     )
     return [
         summary_table(summary_rows(result)),
@@ -171,7 +170,7 @@ def _compensation(c: Correction) -> list[Block]:
         "linearly between the points."
     )
     picture = Picture(caption, [table_plot(_tables(c.tables), lsb_um=lsb_um)], "wide")
-    return [picture, SIGNS, Section("How they got there", [Lines(c.pushed.log, numbered=True)])]
+    return [picture, SIGNS, Section("How they were written", [Lines(c.pushed.log, numbered=True)])]
 
 
 def _warnings(joint: JointSolution) -> list[str]:

@@ -45,7 +45,7 @@ DRIFT_UM_PER_M = 160.0
 """Scale error that X gains after the first check."""
 USER = "approver"
 EVERY_MIN = 2.0
-"""Minutes of the real clock between checks, which are hours of the machine at the usual speed of the demonstration."""
+"""Wall-clock minutes between checks: two hours of machine time at the usual speed of the demonstration."""
 READY_S, STOP_S, LOOK_S = 30.0, 6.0, 0.5
 MAX_LOCKED_READS = 60
 MARGIN_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
@@ -68,7 +68,7 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show
     Raises
     ------
     AbbeError, DriverError
-        With one cause and one remedy. Service and simulators are stopped in any case.
+        The demonstration failed; the error names cause and remedy. Service and simulators are stopped in any case.
     """
     async with running_simulators(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
         site = demo_site(simulator.ready)
@@ -108,7 +108,7 @@ async def store_baseline(session: Session, store: Store, site: Site, rate_hz: in
 
 
 def service_config(port: int, limits_um: dict[str, float]) -> str:
-    """Sections of the machine file for the service: page, limits, a check every few minutes, automatic proposals."""
+    """Return the sections of the machine file for the service: page, limits, a check every few minutes, automatic proposals."""
     limits = "\n".join(f"{key} = {value:g}" for key, value in limits_um.items())
     return f"""
 [web]
@@ -130,7 +130,7 @@ on_alarm = "propose"
 
 
 def free_port(wanted: int) -> int:
-    """The port ``wanted`` if it is free, else any free port."""
+    """Return the port ``wanted`` if it is free, else any free port."""
     for port in (wanted, 0):
         with socket.socket() as one:
             try:
@@ -170,7 +170,7 @@ async def served(
             stdin=asyncio.subprocess.DEVNULL,
             stdout=out_log,
             stderr=out_log,
-            start_new_session=True,  # Ctrl-C reaches this process only, which stops the service
+            start_new_session=True,  # Ctrl-C reaches only this process, which then stops the service
         )
     try:
         await _answers(process, port, log)

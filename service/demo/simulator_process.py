@@ -45,14 +45,14 @@ async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]
     Raises
     ------
     SimulatorError
-        They did not start; the message quotes the child's last line.
+        The simulators did not start; the message quotes the child's last line.
     """
     process = await asyncio.create_subprocess_exec(
         *python_command("abbe.simulators", *args, "--watch-stdin"),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C reaches this process only, which stops the machine before the simulators
+        start_new_session=True,  # Ctrl-C reaches only this process, which stops the axes before the simulators
     )
     try:
         yield SimulatorProcess(await _ready(process), process.pid)
@@ -67,7 +67,7 @@ async def _ready(process: asyncio.subprocess.Process) -> dict[str, Any]:
         async with asyncio.timeout(READY_S):
             line = await process.stdout.readline()
     except TimeoutError:
-        raise SimulatorError(f"the simulators were not ready within {READY_S:g} s", "is the machine overloaded?") from None
+        raise SimulatorError(f"the simulators were not ready within {READY_S:g} s", "this computer may be overloaded: try again") from None
     try:
         ready: dict[str, Any] = json.loads(line)
     except ValueError:

@@ -1,10 +1,10 @@
 """Locks a machine, and opens and closes all its devices together: nothing stays open when one of them fails.
 
-One process per machine: of two that command the same axes, each would drive a bar that the other believes elsewhere. The process that uses
+Only one process at a time may use a machine: of two, each would move a mounted bar that the other believes elsewhere. The process that uses
 the machine locks a file in a folder shared by all accounts of this computer, including a systemd service with private processes and a
 private ``/tmp``.
 
-Every controller status is noted with its arrival time (`notes_since`): the comparison of two clocks uses many such pairs.
+Every controller status is noted with its arrival time (`notes_since`): many such pairs relate the controller's clock to this computer's.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ENVIRONMENT = "ABBE_LOCK_FOLDER"
 INSTALLED = Path("/run/abbe")
 """Made at boot by deploy/abbe-tmpfiles.conf, for a group. If it exists, it is the only choice; an account without access gets an error."""
 WITHOUT_INSTALLATION = Path("/tmp/abbe-machines")  # noqa: S108 - the same for all accounts, whatever TMPDIR says
-"""Open to every account. A service with a private ``/tmp`` needs the other one."""
+"""Open to every account. A service with a private ``/tmp`` needs `INSTALLED`."""
 SHARED = 0o1777
 """Mode of a folder in which every account may create files and remove only its own."""
 TRIES = 100
@@ -107,8 +107,8 @@ def _shared(folder: Path) -> Path:
     if found.st_mode & SHARED != SHARED:
         if found.st_uid != os.geteuid():
             raise UnsafeToMove(
-                f"{folder} has the mode {stat.S_IMODE(found.st_mode):o}: the lock of a machine could not be made there, or be taken away",
-                f"let its owner or root do: chmod {SHARED:o} {folder}",
+                f"{folder} has the mode {stat.S_IMODE(found.st_mode):o}: other accounts could not make a lock there, or could remove it",
+                f"as its owner or root, run: chmod {SHARED:o} {folder}",
             )
         folder.chmod(SHARED)
     return folder
@@ -200,12 +200,12 @@ def noted(controller: Controller) -> Controller:
 
 
 def latest_status(controller: Controller) -> ControllerStatus | None:
-    """Last status read from a noted controller; None before the first, or for other controllers."""
+    """Return the last status read from a controller of `noted`; None before the first, or for other controllers."""
     return controller.latest_status if isinstance(controller, _Noted) else None
 
 
 def notes_since(controller: Controller, ctrl_us: int) -> list[list[float]]:
-    """Pairs [controller time in us, host time in s] since a controller time: the promptest pair of each of 500 intervals."""
+    """Return pairs [controller us, host s] since a controller time: at most 500, from each interval the one with the least delay."""
     if not isinstance(controller, _Noted):
         return []
     pairs = [(float(c), h) for c, h in controller.clock_notes if c >= ctrl_us]
@@ -258,7 +258,7 @@ class Session:
 
 async def no_console(text: str) -> None:
     """Refuse a question to a person, for unattended sessions. Raises ConfigError with the question."""
-    raise ConfigError(f"the console is unattended, but a person has to: {text}", "run this test attended, or configure a remote fixture")
+    raise ConfigError(f"no one is at the console, but a person has to act: {text}", "run this test attended, or configure a remote fixture")
 
 
 @asynccontextmanager

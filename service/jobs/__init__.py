@@ -1,1 +1,1 @@
-"""Work of the service as jobs: a check, a guided campaign, an investigation, and the recovery at start."""
+"""Work of the service as jobs: a check, a guided campaign, an investigation."""

@@ -97,7 +97,7 @@ def _name(key: str) -> str:
 
 
 def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:
-    """Return a sentence for each instrument of these figures whose certificate had ended: it cannot prove that they are within limits."""
+    """Return a sentence for each instrument of these figures whose certificate had ended: its figures cannot be judged."""
     roles = {MEASURED_WITH[name] for name in names if name in MEASURED_WITH}
     ended = ended_certificates(site_of(config), started.astimezone(UTC).date(), roles)
     return [f"the certificate of the {INSTRUMENTS[role]} ended on {day}" for role, day in ended.items()]

@@ -23,17 +23,17 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
 from abbe.service.tables.nine_tables import read_base
 
-SOLVING = "all is measured, and nothing moves while it is solved"
+SOLVING = "the measurement is complete, and nothing moves while it is solved"
 
 
 def is_full(recipe: str, names: tuple[str, ...]) -> bool:
-    """Return whether a recipe is one of these full campaigns. Only the built-in one takes a rate of the ball-bar: a file has its own."""
+    """Return whether a recipe is one of the full campaigns ``names``. Only the built-in one takes a ball-bar rate; a file sets its own."""
     name, rate_hz = split_recipe_name(recipe)
     return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
 
 
 async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str) -> JobOutcome:
-    """Measure the plan under its name, solve it and propose. ``context.control.prompts`` asks the person at the console to mount.
+    """Measure the plan as a campaign of its name, solve it and propose tables. ``context.control.prompts`` asks a person to mount.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def _check_not_ended(context: InvestigationContext) -> None:
     """Refuse to measure for a table if a certificate has ended."""
     ended = certificates(context.site, context.clock.utc().date(), needed_by(context.plan).first)
     if ended:
-        raise TableRefused("; ".join(ended), "have it calibrated, then start again; nothing was measured")
+        raise TableRefused("; ".join(ended), "have the instrument calibrated, then start again; nothing was measured")
 
 
 async def _check_table_acts(session: Session) -> None:

@@ -135,9 +135,10 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, F
 
 
 def _objections(finding: Finding, store: Store, machine: str) -> Doc:
-    """Return why a table could be the wrong answer to a finding (``against``; empty: it is not), and by how much (``rms_um``, of readings).
+    """Return what speaks against tables: ``against`` (text; empty: nothing), ``rms_um`` (unexplained readings beyond noise), ``unnamed``.
 
-    Effects of the machine's model are removed from the readings before tables are made; effects named without that proof remain in them.
+    An effect that no table corrects is an objection unless the machine's model contains it: effects of the model are subtracted from the
+    readings before tables are made. ``unnamed``: something is missing, and no effect was found for it.
     """
     gap = finding.gaps.get("identify")
     rms_um = 0.0 if gap is None else math.sqrt(max(gap.before_um**2 - gap.floor_um**2, 0.0))
@@ -146,7 +147,7 @@ def _objections(finding: Finding, store: Store, machine: str) -> Doc:
     wrong = [e for e in entering(finding) if e.remedy != "table" and e.label not in known]
     why = [f"{e.full_title} is a matter for {REMEDIES[e.remedy]}: {e.remedy_text}" for e in wrong]
     if finding.verdict == "unknown":
-        why.append("something is missing in the model that the catalogue does not know, and a table would hide it")
+        why.append("the model lacks something that the catalogue does not know, and a table would hide it")
     unnamed = finding.verdict == "unknown" and not finding.effects
     return {"against": "; ".join(why), "rms_um": rms_um, "unnamed": unnamed}
 
@@ -182,16 +183,16 @@ async def make_proposal(context: InvestigationContext, campaign: str, agree: Cal
 
 
 def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
-    """Refuse tables if the part that no table can correct is not small against their promised gain.
+    """Refuse tables if there is an objection ``against`` them and the unexplained ``rms_um`` is not small against their promised gain.
 
     Raises
     ------
     TableRefused
-        More than `BESIDE` of the promised gain in the readings is not explained by the tables' model.
+        ``rms_um`` exceeds `BESIDE` times the promised gain.
     """
     gain_um = (promised.before_mm - promised.after_mm) * 1e3
     if against and rms_um > BESIDE * gain_um:
-        raise TableRefused(f"{rms_um:.1f} µm rms of the readings are no matter for tables, which promise {gain_um:.1f} µm", against)
+        raise TableRefused(f"{rms_um:.1f} µm rms of the readings may not be correctable by tables, which promise {gain_um:.1f} µm", against)
 
 
 def promise_text(store: Store, made: StoredProposal) -> str:

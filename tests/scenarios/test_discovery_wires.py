@@ -76,7 +76,7 @@ def test_what_no_catalogue_names_is_called_unknown_and_located(tmp_path):
     assert judged(found)[0]
     assert book(tmp_path / "kept") == []
     assert found.anew.gap.after_um == found.anew.gap.before_um  # nothing is claimed, nothing is closed
-    assert "no catalogue names" in said
+    assert "the catalogue does not hold" in said
 
 
 @LONG

@@ -81,7 +81,7 @@ def test_an_approver_orders_the_table_back_and_an_operator_does_not(tmp_path: Pa
             assert f"{new:08X}" in http.get("/table", headers=who["bob"]).text
             wrong = order("ann", old, key="k0")
             assert (wrong.status_code, wrong.headers["content-type"]) == (409, "application/problem+json")
-            assert "meanwhile another table is in force" in wrong.json()["detail"]
+            assert "another table has come into force meanwhile" in wrong.json()["detail"]
             assert asyncio.run(table_in_force(sims.ready["cnc"]))[1] == new
 
             sent = order("ann")

@@ -73,5 +73,5 @@ async def test_end_of_input_is_no_confirmation(terminal):
 
 async def test_without_a_terminal_the_request_is_named(monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))
-    with pytest.raises(ConfigError, match="no one is at the console to: hang in the bar"):
+    with pytest.raises(ConfigError, match="no one is at the console, but a person has to act: hang in the bar"):
         await console_ask("hang in the bar")

@@ -162,7 +162,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
     assert (await bench.ask("user:eve", push=2)).outcome == "forbidden"
     for push, image in ((1, NEW), (2, OLD)):  # not what is in force
         answer = await bench.ask(push=push, image=image)
-        assert (answer.outcome, "meanwhile another table is in force" in answer.text) == ("conflict", True)
+        assert (answer.outcome, "another table has come into force meanwhile" in answer.text) == ("conflict", True)
     await bench.push({}, NEW, OTHER, UP_TO_ACTIVE)
     answer = await bench.ask(push=2)
     assert (answer.outcome, answer.text.split(":")[0]) == ("conflict", "which table is in force is not known")

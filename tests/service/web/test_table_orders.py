@@ -106,7 +106,7 @@ async def test_the_answer_is_the_core_s(desk: Desk, plant: Plant) -> None:
     who = plant.token("approver")
     answer = await desk.post(who)
     assert (answer.headers["location"], answer.json()["kind"], REPLAYED in answer.headers) == (f"/api/v1/jobs/{JOB.id}", "rollback", False)
-    desk.answer = ("done", "asked for before, with this key", JOB.id)
+    desk.answer = ("done", "already requested with this key", JOB.id)
     answer = await desk.post(who)
     assert (answer.status_code, answer.headers[REPLAYED]) == (202, "true")
     assert plant.store.audit.events(1)[0].outcome == "replayed 202"
