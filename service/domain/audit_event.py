@@ -16,13 +16,13 @@ class AuditEntry:
     who : str
         ``os:NAME@HOST`` at the command line, ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous`` on the network.
     action : str
-        ``abbe measure``, ``POST /login``.
+        Command or request, e.g. ``abbe measure``, ``POST /login``.
     target : str
-        Machine file, user, file, address.
+        What it acted on: machine file, user, file, address.
     outcome : str
-        ``done``, ``no``, ``refused 403``, a code of an error.
+        ``done``, ``no``, ``refused 403``, or an error code.
     id, utc, digest
-        Number, from 1 without a gap; time; SHA-256 of the content and of the digest before it. Set when the event is written.
+        Number, from 1 without a gap; time; SHA-256 of the content and of the previous event's digest. Set when the event is written.
     """
 
     id: int = 0
@@ -38,8 +38,8 @@ class AuditEntry:
 class AuditEvent(AuditEntry):
     """A complete event as it is stored.
 
-    ``doc``: options and reasons, no secrets; ``prev``: digest of the event before it; ``key``, ``mac``: name of the key, and its seal over
-    the digest.
+    ``doc``: options and reasons, no secrets; ``prev``: digest of the previous event; ``key``, ``mac``: name of the secret key, and the
+    message authentication code that it gives the digest.
     """
 
     doc: Doc = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Largest lengths of texts and size of numbers in a record; the channel refuses longer and larger ones."""
+"""Limits of texts and numbers in a record: the channel between the two processes refuses longer texts and larger numbers."""
 
 from __future__ import annotations
 

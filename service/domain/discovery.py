@@ -16,8 +16,8 @@ PROGRAM = "abbe discover"
 class SearchBase:
     """Start of a stored search.
 
-    ``model_version``: of the model whose effects were removed from the readings; ``after``: the current version when the search was opened;
-    ``continues``: id of the ended search that this one continues with more measurements.
+    ``model_version``: version of the model whose effects were removed from the readings; ``after``: version that was current when the
+    search was opened; ``continues``: id of the ended search that this one continues with more measurements.
     """
 
     model_version: int | None = None
@@ -48,9 +48,10 @@ class SearchStart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Judgement:
-    """Verdict of the runs that only judge.
+    """Verdict of the judging runs, to which nothing was fitted.
 
-    ``proved``: None if they cannot judge; ``closed``: closed share of their ``gap``; ``against``: why the names are not confirmed.
+    ``proved``: whether they confirm the named effects, None if they cannot judge; ``closed``: closed share of their ``gap``; ``against``:
+    why the effects are not confirmed.
     """
 
     rule: str
@@ -64,8 +65,8 @@ class Judgement:
 class DiscoveryStep:
     """A state that a discovery reached, who decided it, and why.
 
-    ``start``: in the first state; ``finding``: in the second; ``judged``: in the test by runs that only judge and the states after it;
-    ``not_added``: why an explained effect does not enter the model book.
+    ``start`` belongs to the first state, ``finding`` to the second, ``judged`` to TESTING and the state after it. ``not_added``: why an
+    explained effect does not enter the model book.
     """
 
     state: State

@@ -1,4 +1,4 @@
-"""The answer of a discovery (``abbe-discovery/1``, run-format.md 5) as pydantic models: what `abbe discover --json` writes."""
+"""The answer of a discovery (``abbe-discovery/1``) as pydantic models: what `abbe discover --json` writes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Adds = Literal[
 
 
 class FoundEffect(FileObject):
-    """One named effect. ``parameters``: ``strength`` and ``u_strength`` in the unit of its name, and further ones with theirs.
+    """One named effect. ``parameters``: ``strength`` and its standard uncertainty ``u_strength`` in the effect's unit, and further ones.
 
-    ``proved``: runs that were never fitted confirm it.
+    ``proved``: whether runs that were never fitted confirm the effect.
     """
 
     name: str
@@ -38,14 +38,14 @@ class FoundEffect(FileObject):
 
 
 class FoundBeside(FileObject):
-    """An unnamed structure beside named effects, ``unnamed_step:Z``."""
+    """An unnamed structure beside named effects, e.g. ``unnamed_step:Z``."""
 
     label: str
     evidence: float
 
 
 class FoundLocation(FileObject):
-    """Location of what is missing; what was not located is left out."""
+    """Where, when and on what the missing effect depends; fields that are not known are left out."""
 
     tests: list[str] = Field(default_factory=list)
     axes: list[str] = Field(default_factory=list)
@@ -57,7 +57,7 @@ class FoundLocation(FileObject):
     period_mm: float | None = None
     angular_lobes: int | None = None
     depends_on: list[str] = Field(default_factory=list)
-    shape: str = Field(default="", description="what it looks like there, for people")
+    shape: str = Field(default="", description="its shape, for people")
 
 
 class FoundTest(FileObject):
@@ -79,7 +79,7 @@ class FoundAgreement(FileObject):
 
 
 class FoundUnseen(FileObject):
-    """An effect that the campaign could not have shown, if nothing is missing: the reason, and what would show it."""
+    """With the verdict "none": an effect that the campaign could not have shown, the reason, and the measurement that would show it."""
 
     what: str
     because: str
@@ -87,7 +87,7 @@ class FoundUnseen(FileObject):
 
 
 class FoundFitted(FileObject):
-    """A value of the present simulation that a test of one axis shows: its ``scale`` in um/m, with standard uncertainty."""
+    """A parameter of the present simulation that a test of one axis measures: its ``scale`` in um/m, with standard uncertainty."""
 
     name: str
     key: str
@@ -110,10 +110,11 @@ class FoundThinning(FileObject):
 
 
 class DiscoveryFile(FileObject):
-    """What a campaign's simulation lacks, and the prediction of every sealed run, mm.
+    """Effects that a campaign's simulation lacks, and the predictions of sealed runs, mm.
 
-    ``effects`` holds what is stood by, ``suspects`` names that fit the fitted runs and that runs which only judge do not confirm: then the
-    verdict is "unknown". ``proved``: the judging runs confirm the effects; ``proof``: the rule, or why they cannot judge.
+    ``effects``: names that the answer stands for. ``suspects``: names that fit the fitted runs but that the judging runs do not confirm;
+    then the verdict is "unknown". ``proved``: whether the judging runs confirm the effects; ``proof``: by which rule, or why they cannot
+    judge.
     """
 
     format: Literal["abbe-discovery/1"]

@@ -62,7 +62,7 @@ class PackedCovariance:
 Kind = Literal["mean", "variance"]
 """Whether an effect moves the readings or makes them noisier."""
 Location = Annotated[Localization, Field(alias="where")]
-"""Location of a gap or an effect; its key in documents is ``where`` (run-format.md 5)."""
+"""Location of a gap or an effect; its key in documents is ``where``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +84,7 @@ class GapUm:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFit:
-    """One run: rms of its residuals before and after, µm (None: sealed), and the noise of its instrument."""
+    """One run: rms of its residuals without and with the finding, µm (None: sealed), and the noise of its instrument."""
 
     test: str
     role: str
@@ -105,7 +105,7 @@ class ParameterFound:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RivalEffect:
-    """Another effect that the runs cannot exclude, and the evidence (natural logarithm) by which it explains them less."""
+    """Another effect that the runs cannot exclude, and by how much its log evidence (natural logarithm) is smaller."""
 
     label: str
     title: str
@@ -116,9 +116,9 @@ class RivalEffect:
 class EffectSize:
     """An effect with its size and its catalogue entry; findings and model books share it.
 
-    ``coefficients`` and ``covariance``: linear ones, in the units of the effect's columns. ``forms``: degrees of freedom of form that it
-    needed. ``needed``: rms of the judging runs without this effect over that with it, None if no run judges. ``evidence``: gain in log
-    evidence after its price.
+    ``coefficients``, ``covariance``: of the effect's linear columns, in their units. ``forms``: names of the extra shape terms that it
+    needed. ``needed``: rms of the judging runs without this effect divided by that with it, None if no run judges. ``evidence``: gain in
+    log evidence (natural logarithm), less the price of an additional effect.
     """
 
     label: str
@@ -149,7 +149,7 @@ class EffectSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffectFound(EffectSize):
-    """An effect of a finding. ``proved``: runs that were never fitted confirm it; None before they are asked."""
+    """An effect of a finding. ``proved``: whether runs that were never fitted confirm it; None: not judged."""
 
     alternatives: tuple[RivalEffect, ...] = ()
     signature: str = ""
@@ -184,7 +184,7 @@ class RefittedModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeRival:
-    """Another change that explains nearly as much. ``less_evidence``: natural logarithm of how much less likely it is."""
+    """Another change that explains nearly as much, and by how much its log evidence (natural logarithm) is smaller."""
 
     name: str
     less_evidence: float
@@ -194,8 +194,8 @@ class ChangeRival:
 class MotionChange:
     """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
 
-    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: how many of two halves of the
-    runs chose it on their own.
+    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: in how many of the two halves
+    of the runs a separate search finds it.
     """
 
     motion: str
@@ -212,9 +212,10 @@ class MotionChange:
 class ChangedSince:
     """Changes of the machine since an earlier solution.
 
-    ``gap``, ``judged``: None if too few set-ups judge; ``judged``: log of how much more likely runs are with changes that they did not
-    choose; ``hidden_um_m``: possible undetected change of each scale and squareness; ``beside``: effects found in the same runs that may be
-    the same thing; ``proved``: runs that did not choose the changes confirm them; ``trouble``: why nothing could be compared.
+    ``gap``, ``judged``: None if too few set-ups judge. ``judged``: natural logarithm of how much likelier the changes make runs that were
+    not used to find them. ``hidden_um_m``: possible undetected change of each scale and squareness. ``beside``: effects found in the same
+    runs that may have the same cause. ``proved``: whether runs that were not used to find the changes confirm them. ``trouble``: why
+    nothing could be compared.
     """
 
     since: int
@@ -240,10 +241,10 @@ class Finding:
     proved, proof : whether runs that were never fitted confirm the names, and by which rule.
     location : location of the gap of the present model.
     rejected : labels that were tried, and the reason against each.
-    confounded_with : rivals of the names that the price rule does not exclude. beside : structures without a name beside them.
+    confounded_with : rivals of the named effects whose evidence is too close to exclude them. beside : unnamed structures beside them.
     agreement : how runs that were never fitted agree with their prediction, if nothing is missing.
     unjudged, unseen : runs that cannot be judged, and blind spots, if nothing is missing.
-    fitted : values of the present simulation that these runs show.
+    fitted : parameters of the present simulation that these runs measure.
     thinning : decimation of long runs before the search; None: they were searched as they were read.
     predictions : of sealed runs, mm.
     changed : changes since an earlier solution, if one could be compared.

@@ -13,13 +13,13 @@ JobKind = Literal["check", "campaign", "investigation", "push", "rollback"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobState:
-    """A job since the service started: a check or full campaign, a consequence of an alarm, or a rollback ordered by a person.
+    """A job since the service started: a check, a full campaign, work on an alarm, or a rollback ordered by a person.
 
     ``state``: running, asking, pausing, paused, …; once it has ended ``done: VERDICT`` of a check, ``done: kept``
     (``rolled back``, ``refused``, ``stopped``, ``failed``, ``open``) of a push, ``done: proposed`` (``ended``, ``failed``,
     ``stopped``) of a campaign or an investigation, or ``interrupted``. A rollback is a push of the previous table: ``kept`` means that
-    this table is in force again. ``asking``: a person has to do what ``ask`` says and confirm it under ``prompt``. ``who``: empty if no
-    person ordered it. ``solution``, ``proposal``: results of a campaign in the store.
+    this table is in force again. While it is ``asking``, a person has to do what ``ask`` says and confirm the number ``prompt``. ``who``:
+    empty if no person ordered it. ``solution``, ``proposal``: results of a campaign in the store.
     """
 
     id: Word
@@ -40,7 +40,7 @@ class JobState:
 
 @dataclass(frozen=True, slots=True)
 class JobOutcome:
-    """How a job ended, with a sentence, and its results in the store.
+    """How a job ended: a word, a sentence, and the job's results in the store.
 
     ``word`` of a push or rollback: ``kept``: the new table is in force and verified; ``rolled back``: the old table is in force again;
     ``refused``, ``failed``, ``stopped`` (by a person): the new table was never in force; ``open``: it may be in force, unverified. Of a

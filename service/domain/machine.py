@@ -112,7 +112,7 @@ def control_of(url: str | None) -> str:
 
 
 def address_of(url: str | None) -> str:
-    """Return the address in a URL for the machine lock: scheme, host in lower case and port (or the path of a line), without the query.
+    """Return the address in a URL for the machine lock: scheme, host in lower case and port (or the path of a serial line), no query.
 
     All units behind one address share one lock.
     """

@@ -1,7 +1,6 @@
 """Stored measurements: machines, campaigns, runs and their samples, and the process that writes a run. One record is one row.
 
-The identity of a process is unique even across restarts of process and computer: the operating system reuses pids, hence the start time;
-start times count from boot, hence the boot id.
+A process is identified by pid, start time and boot id: the operating system reuses pids, and start times count from boot.
 """
 
 from __future__ import annotations
@@ -88,9 +87,10 @@ class RunStart:
     """What is known when a run begins.
 
     ``ctrl0_us``: zero of the campaign's clock in controller time; ``clock_us``: controller time when the document was written;
-    ``path_start_us``: of the path, if known; ``standstills``: planned number of readings at standstill. A ball-bar run whose ``setup``
-    states the number of ``samples`` was read point by point (``point_by_point``): it has no path, and records like those of a laser run.
-    ``imported``: an imported run as it was, without its columns; ``entry``: its line in the campaign's file.
+    ``path_start_us``: controller time at the start of the path, if known; ``standstills``: planned number of readings at standstill. A
+    ball-bar run whose ``setup`` states the number of ``samples`` was read point by point (``point_by_point``): it has no path, and its
+    records are like those of a laser run. ``imported``: the document of an imported run, without its columns; ``entry``: its entry in the
+    campaign file.
     """
 
     setup: Doc
@@ -156,9 +156,9 @@ class RunStart:
 class RunEnd:
     """What is known when a run ends; all None or empty without an end document.
 
-    ``path_start_us``, ``path_end_us``: of the path, in controller time; ``good_us``, ``box_boot_id``: how far an interrupted path came at
-    constant feed, and the start of the box; ``clock_pairs``: controller time (µs) and arrival (host s) of statuses; ``mounted_us``: of cup
-    or laser in controller time, after the start document was written.
+    ``path_start_us``, ``path_end_us``: controller time of start and end of the path; ``good_us``: controller time until which an
+    interrupted path ran at constant feed; ``box_boot_id``: boot id of the ball-bar's box; ``clock_pairs``: controller time (µs) and arrival
+    (host s) of statuses; ``mounted_us``: controller time of mounting cup or laser after the start document was written.
     """
 
     path_start_us: int | None = None
@@ -198,7 +198,7 @@ _START_TIME_FIELD = 22 - 3
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """The process that writes a run.
+    """A process that owns stored rows, e.g. the one that writes a run.
 
     ``host``: network name of the computer; ``start``: boot id and start time, empty if the system does not show them.
     """
@@ -283,7 +283,7 @@ class CampaignRecord(DocumentRow):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:
-    """Fields of every run record: a field here that is also a column appears in the lists of page, API and command line."""
+    """Fields of a run that its full record and the summaries in lists share."""
 
     campaign: str
     test: str
@@ -319,7 +319,7 @@ class RunRecord(RunFacts):
         try:
             return parse(doc)
         except (AttributeError, KeyError, TypeError, ValueError) as err:
-            text = f"run {self.campaign}/{self.label}: its documents lack or garble {err}"
+            text = f"run {self.campaign}/{self.label}: its documents have a missing or invalid field: {err}"
             raise StoreError(text, "it was not written by Abbe, or is damaged: restore a backup") from None
 
     @property

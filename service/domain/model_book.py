@@ -39,8 +39,8 @@ class Provenance(Origin):
 class ModelBook:
     """The document of one version (``abbe-model/1``).
 
-    ``parent``: the version before it; ``machine_digest``: SHA-256 of the geometry of its effects; ``gone``: labels of effects that summed
-    to zero and left the book; ``model``: the refitted model of the last finding.
+    ``parent``: number of the previous version; ``machine_digest``: SHA-256 of the machine geometry for which the effects hold; ``gone``:
+    labels of effects that summed to zero and were removed; ``model``: the refitted model of the last finding.
     """
 
     format: Literal["abbe-model/1"] = "abbe-model/1"

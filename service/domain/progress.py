@@ -1,4 +1,4 @@
-"""Progress of long work, the path in recording and the devices: one record from the work itself to page, JSON, OPC UA and MTConnect."""
+"""Progress of long work, the path being recorded, and the state of devices: page, JSON, OPC UA and MTConnect share these records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Progress:
 
     ``done`` of ``total`` in the work's own unit (default: seconds of planned machine time); ``eta_s``: wall seconds left without waiting
     times, None without a basis for an estimate. Of a measurement: ``state`` (of `abbe.service.sequences.control`) and
-    ``why`` it waits, ``step`` of ``steps`` and ``points`` read in the test in hand.
+    ``why`` it waits, ``step`` of ``steps``, and ``points`` read in the present test.
     """
 
     stage: Word = ""
@@ -62,9 +62,9 @@ class RunningCheck(Progress):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedPath:
-    """A path that is being recorded. ``angle_deg``: about the axis of the test, at even parts of the path's length, not wrapped.
+    """A path that is being recorded. ``number`` 0: none is.
 
-    ``number`` 0: no path is being recorded.
+    ``angle_deg``: angle about the axis of the test at equal steps along the path; it grows beyond 360° instead of wrapping.
     """
 
     number: Number = 0
@@ -79,7 +79,7 @@ class RecordedPath:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceStatus:
-    """State of a device of the machine file, and when it last answered. It is not polled between checks."""
+    """State of a device of the machine file, and when it last answered. Between checks nobody polls the device."""
 
     role: Word
     url: Text

@@ -1,4 +1,4 @@
-"""States of a push, their transitions (reliability.md 3.2), and the journal entry of one transition, on disk before what it permits."""
+"""States of a push, their transitions, and the journal entry of one transition, on disk before the operation that it permits is done."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class PushState(StrEnum):
     ACTIVATING_BACK = "ACTIVATING_BACK"
     """Permits exactly one activation of the old table."""
     ROLLBACK_PENDING = "ROLLBACK_PENDING"
-    """Rollback is blocked (interlock, link, lease): it runs as soon as it can, before anything else."""
+    """The rollback is blocked (interlock, link, lease) and runs as soon as possible, before anything else."""
     ROLLED_BACK = "ROLLED_BACK"
     ABORTED = "ABORTED"
     """The new table was never in force."""
@@ -99,6 +99,6 @@ class PushTransition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushEntry(PushTransition):
-    """A transition with what became known with its state. Never changed after writing; tables are hexadecimal images."""
+    """A transition and the facts that its state brings. Never changed after writing; tables are hexadecimal images."""
 
     doc: Doc

@@ -18,7 +18,7 @@ class SolutionRecord(DocumentRow):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableRecord(DocumentRow):
-    """A compensation table as the controller would hold it. ``solution_id`` None: it was read back from the controller."""
+    """A compensation table as the controller would hold it. ``solution_id`` None: a test step, or a restored table."""
 
     machine_id: int
     solution_id: int | None

@@ -84,7 +84,7 @@ class Columns:
             The run is sealed.
         """
         if self.deviation_mm is None:
-            raise MeasurementFault("it is sealed, its readings are not there", "it can only be predicted")
+            raise MeasurementFault("the run is sealed: its readings are withheld", "it can only be predicted")
         return self.deviation_mm
 
     @property
@@ -388,7 +388,7 @@ class Run:
             )
         except (AttributeError, KeyError, TypeError, ValueError) as err:
             raise StoreError(
-                f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document has a missing or invalid field {err}",
+                f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document has a missing or invalid field: {err}",
                 "it was not written by Abbe, or is damaged: restore a backup",
             ) from None
 
@@ -456,7 +456,7 @@ class Run:
             beam = setup.span_mm * np.eye(3)["XYZ".index(setup.axis)] if setup.axis else setup.span_mm
         length = np.nan if beam is None else float(np.linalg.norm(beam))
         if beam is None or beam.shape != (3,) or not (np.isfinite(length) and length > 0.0):
-            why = f"run {self.run_id}: a laser run needs a beam: nominal_beam, or start and end apart"
+            why = f"run {self.run_id}: a laser run needs nominal_beam, or a start_mm that differs from end_mm"
             raise MeasurementFault(why, "correct the run or leave it out")
         return np.asarray(beam / length)
 

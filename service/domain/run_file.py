@@ -1,4 +1,4 @@
-"""The exchange formats as pydantic models (run-format.md 2-4). They are also the source of docs/schemas/*.schema.json."""
+"""The exchange formats as pydantic models. They are also the source of docs/schemas/*.schema.json."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ ERRORS_FORMAT = "abbe-errors/1"
 Test = Literal["ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear"]
 Role = Literal["identify", "holdout", "sealed"]
 Known = Literal["rigid6", "rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"]
-"""Effects that the present simulation of a machine may include (run-format.md 4)."""
+"""Effects that a campaign may state for the present simulation of its machine."""
 ASSUMED_MODEL: tuple[Known, ...] = ("rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt")
-"""Assumed if a campaign states nothing. An empty list is a statement: nothing beyond linear errors and squareness."""
+"""Effects that are assumed if a campaign states none. A stated empty list means: only linear errors and squareness."""
 Numbers = list[float]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]+\.json$")]
@@ -55,7 +55,7 @@ class SetupObject(FileObject):
 
 
 class ColumnsObject(FileObject):
-    """Readings, one list a column, all of one length. Further columns carry their unit in the name."""
+    """Readings, one list per column, all of the same length. Further columns carry their unit in the name."""
 
     model_config = ConfigDict(
         json_schema_extra={"additionalProperties": {"anyOf": [{"type": "array", "items": {"type": "number"}}, {"type": "null"}]}}

@@ -58,7 +58,7 @@ class Needs:
     idle: Annotated[bool, Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
     warm_min: Annotated[
         float,
-        Field(ge=0.0, le=50.0, description="so many of the last 60 minutes the spindle turned or an axis moved, as the service saw it"),
+        Field(ge=0.0, le=50.0, description="minutes of the last 60 in which the service saw the spindle turn or an axis move, at least"),
     ] = 0.0
     air: Annotated[bool, Field(description="air temperature (of the laser) inside [limits] temperature_c")] = False
     operator: Annotated[Literal["any", "present", "absent"], Field(description="by [[staffed]]; absent: the door is shut, too")] = "any"
@@ -88,8 +88,8 @@ class Schedule:
     on_alarm: Annotated[
         Literal["none", "propose"],
         Field(
-            description="propose: when a check raises an alarm, [alarm] campaign is measured, solved and searched by itself, and tables "
-            "are proposed, which wait for approval"
+            description="propose: when a check raises an alarm, the service measures the [alarm] campaign, solves and searches it, and "
+            "proposes tables, which wait for approval"
         ),
     ] = "none"
 
@@ -113,7 +113,7 @@ def one_way(schedule: Schedule) -> Schedule:
 class Window:
     """A window in time: a number of hours from each time of a cron expression, or from start to end on some days of the week.
 
-    Hours are real time, also where the clocks change in them; start and end are wall time.
+    Hours are elapsed time, also across a change of clocks; start and end are wall time.
     """
 
     name: Name

@@ -10,7 +10,7 @@ from abbe.service.domain.measured import Owner
 
 
 class AlarmKind(StrEnum):
-    """Kind of a line. The first four change the alarm itself, the others record the service's work on it."""
+    """Kind of an entry. The first four change the alarm itself, the others record the service's work on it."""
 
     RAISED = "raised"
     CONTINUED = "held"
@@ -37,7 +37,7 @@ class AlarmEntryRecord(HistoryRow):
 
 @dataclass(frozen=True, slots=True)
 class SlotRecord:
-    """One slot of a schedule and its outcome. ``reason``: a sentence on ``state``; ``finished_utc``: None while it is open."""
+    """One slot of a schedule and its outcome. ``reason``: a sentence about ``state``; ``finished_utc``: None while the slot is open."""
 
     id: int
     schedule: str
@@ -77,7 +77,10 @@ class ReplyRecord:
 
 @dataclass(frozen=True, slots=True)
 class StoreHealth:
-    """State of a database. ``file``: of SQLite, else empty; ``size_b``: with the write-ahead log; ``since_utc``: of the first machine."""
+    """State of a database.
+
+    ``file``: SQLite file, else empty; ``size_b``: bytes with the write-ahead log; ``since_utc``: when the first machine was stored.
+    """
 
     revision: str
     wanted_revision: str

@@ -39,7 +39,7 @@ class Inputs(FileObject):
 
 
 class ParameterValue(FileObject):
-    """One unknown: value and standard uncertainty in mm, rad or mm/s; how much of what is known comes from the readings."""
+    """One unknown: value and standard uncertainty in mm, rad or mm/s; share of its information that comes from the readings."""
 
     value: float
     u: float
@@ -55,7 +55,7 @@ class MeanValue(FileObject):
 
 
 class MotionValue(FileObject):
-    """One error motion over its stroke: rms standard uncertainty, mm or rad; why it has no table of its own, empty if it may."""
+    """One error motion over its stroke: rms standard uncertainty, mm or rad; reason why it gets no table of its own, or empty."""
 
     status: Status
     u: float
@@ -131,7 +131,7 @@ class ResidualTestResult(FileObject):
 
 
 class WorstPoint(FileObject):
-    """Point where the deviation is known worst: components and their uncertainties, µm; half-axis of the 95 % region of the vector."""
+    """Point with the most uncertain deviation: components and their uncertainties, µm; half-axis of the 95 % region of the vector."""
 
     at_mm: Point
     deviation_um: Point
@@ -156,7 +156,7 @@ class BudgetLineValue(FileObject):
 
 
 class Uncertainty(FileObject):
-    """Of the predicted deviation over the volume; ``compensable_share``: part of the volume where the error exceeds its uncertainty."""
+    """Uncertainty of the predicted deviation over the volume. ``compensable_share``: share of the volume where the error exceeds it."""
 
     frame: str
     worst_point: WorstPoint
@@ -196,7 +196,7 @@ class StoredPrediction(FileObject):
 
 
 class TableRow(FileObject):
-    """Errors of distances that remain with a kind of table, over the inner 80 % of every stroke, µm, with standard uncertainties.
+    """Errors of distances that remain when a kind of table is used, over the inner 80 % of every stroke, µm, with standard uncertainties.
 
     ``entries``: count of numbers in the table. ``q95_um``: 95 % are below. ``unknown_um``: rms of the part that no table can remove.
     """
@@ -240,7 +240,7 @@ class LostMotion(FileObject):
 
 
 class TableRemoval(FileObject):
-    """The table that the runs were measured with; its effect beyond smooth corrections was removed, with this lost motion by axis."""
+    """The table that the runs were measured with, and the lost motion used to remove its effect beyond smooth corrections."""
 
     crc: int | None = None
     lost_motion_mm: dict[str, LostMotion]

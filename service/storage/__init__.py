@@ -1,1 +1,1 @@
-"""The database: one Store, opened by URL, with one writer thread and schema migrations from the first table on."""
+"""The database: a `Store` opened by URL, with one writer thread and schema migrations."""

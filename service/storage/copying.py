@@ -13,9 +13,9 @@ from typing import Any
 from abbe.service.errors import StoreError
 
 PAGES = 1024
-"""Pages copied per step; between two steps others may write."""
+"""Pages copied per step; between two steps other processes may write."""
 RESTARTS = 5
-"""Restarts of a copy, which SQLite begins again after each write, before it is made in one step while writers wait."""
+"""SQLite restarts a copy after each write. After this many restarts the copy is made in one step, while writers wait."""
 LOCKED_S = 60.0
 """How long a copy waits for a process that holds the database, s."""
 FAULTS_SHOWN = 3
@@ -30,10 +30,10 @@ class _LockedError(Exception):
 
 
 def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
-    """Copy a SQLite database as of one instant with SQLite's online backup into a new file with rights 0600. Writers may continue.
+    """Copy a SQLite database, as it is at one instant, into a new file with rights 0600. Writers may continue.
 
-    On return ``target`` is on the disk; after an error it may exist in part. ``locked_s``: how long to wait for a process that holds the
-    database, s.
+    On return ``target`` is on the disk; after an error a part of it may be there. ``locked_s``: how long to wait for a process that holds
+    the database, s.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
 
 
 def _stall_detection(locked_s: float, restarts: int | None) -> Callable[[int, int, int], None]:
-    """Return a callback for SQLite's backup steps that ends a copy without progress."""
+    """Return a callback for the steps of SQLite's backup that ends a copy without progress, or after too many ``restarts`` (None: any)."""
     last = {"left": -1, "restarts": 0}
     moved_s = [time.monotonic()]
 
@@ -96,7 +96,7 @@ def prove_copy(path: Path) -> str:
                 raise StoreError(f"{path} is damaged: {'; '.join(found[:FAULTS_SHOWN])}", "take another backup")
             if orphans := copy.execute("PRAGMA foreign_key_check").fetchall():
                 raise StoreError(
-                    f"{path}: {len(orphans)} rows refer to rows that are not there (first: {orphans[0][0]})", "take another backup"
+                    f"{path}: {len(orphans)} rows refer to missing rows (the first one in table {orphans[0][0]})", "take another backup"
                 )
             row = copy.execute("SELECT version_num FROM alembic_version").fetchone()
     except sqlite3.Error as err:
@@ -112,7 +112,7 @@ def rows_of(path: Path, query: str) -> list[tuple[Any, ...]]:
     Raises
     ------
     StoreError
-        It cannot be read.
+        The file cannot be read.
     """
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as copy:
@@ -147,7 +147,7 @@ def is_locked(path: Path) -> bool:
             probe.execute("ROLLBACK")
     except sqlite3.OperationalError as err:
         return "locked" in str(err)
-    except sqlite3.DatabaseError:  # damaged, which is why it is restored
+    except sqlite3.DatabaseError:  # a damaged database may be replaced
         return False
     return False
 

@@ -38,8 +38,8 @@ T = TypeVar("T")
 class Database:
     """Engine and writer thread. Any thread may call; in coroutines use ``await database.write(...)``.
 
-    ``engine``: at the current schema. ``writer``: with exactly one thread: every write goes through it, so writes have one order and never
-    wait for each other inside the database. ``utcnow``: the clock of the time columns.
+    ``engine``: its database has the current schema. ``writer``: has exactly one thread, which does every write, so that writes have one
+    order and never wait for each other inside the database. ``utcnow``: the clock of the time columns.
     """
 
     def __init__(self, engine: Engine, writer: ThreadPoolExecutor, utcnow: Callable[[], datetime]) -> None:
@@ -59,7 +59,7 @@ class Database:
         url : str
             ``sqlite:///file``, ``sqlite://`` (memory) or ``postgresql://user@host/name``.
         utcnow : callable, optional
-            Clock with time zone, for tests.
+            Returns the present time with time zone; for tests.
 
         Raises
         ------
@@ -108,7 +108,7 @@ class Database:
         try:
             return self._writer.submit(fn, *args, **kwargs)
         except RuntimeError:
-            raise StoreError(f"database {self.url} is closed", "open it again") from None
+            raise StoreError(f"database {self.url} is closed", "open the database again") from None
 
     def commit(self, work: Callable[[Connection], T]) -> T:
         """Do ``work`` in one transaction in the writer thread, and wait for it."""
@@ -143,7 +143,7 @@ class Database:
 
         def work(connection: Connection) -> None:
             if self.is_postgresql and connection.execute(read_only).scalar_one() == "on":
-                raise StoreError(f"database {self.url} takes no writes", "use the server that does")
+                raise StoreError(f"database {self.url} is read-only", "use the primary server, which takes writes")
 
         self.commit(work)
 
@@ -152,12 +152,12 @@ R = TypeVar("R")
 
 
 class RecordMapping(Generic[R]):
-    """A frozen record and the columns that it is read from and written to.
+    """A frozen record class, and the columns that its records are read from and written to.
 
     SQLAlchemy's own mapper writes its state into the object and refuses frozen ones (decision 0037).
 
-    ``source``: the FROM clause to read, if it is more than the table. ``**other``: fields that are not the column of their name, given as
-    another expression or as the mapping of a nested record.
+    ``source``: the FROM clause to read, if it is more than the table. ``**other``: expression or nested mapping of each field that is not
+    the column of the same name.
     """
 
     def __init__(
@@ -191,7 +191,7 @@ class RecordMapping(Generic[R]):
         return self.from_values(row._mapping)  # noqa: SLF001 - SQLAlchemy's public name
 
     def from_values(self, values: Mapping[Any, Any]) -> R:
-        """The record of values by names of `columns`."""
+        """The record made from values, given by the labels of `columns`."""
         found = {
             name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
             for name, column in self._fields.items()
@@ -201,7 +201,7 @@ class RecordMapping(Generic[R]):
         return self._make(**found)
 
     def values(self, record: R, *without: str) -> dict[str, Any]:
-        """The columns of a record that its table stores, by name, except the fields ``without``."""
+        """Values of a record by column of its table, except the fields ``without``."""
         found: dict[str, Any] = {}
         for name, column in self._fields.items():
             if isinstance(column, RecordMapping):
@@ -258,7 +258,7 @@ Order = ColumnElement[Any]
 
 
 class Repository:
-    """Base of the repositories, one for each aggregate."""
+    """Base of the repositories."""
 
     def __init__(self, database: Database) -> None:
         self._db = database
@@ -271,7 +271,7 @@ class Repository:
         newest: bool = False,
         limit: int | None = None,
     ) -> list[R]:
-        """All records that match, by ``order`` (default: id); with ``newest`` in descending order."""
+        """All records that match, sorted by ``order`` (default: id), descending if ``newest``."""
         by = of.table.c.id if order is None else order
         query = of.select().where(*conditions).order_by(by.desc() if newest else by).limit(limit)
         return [of.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]

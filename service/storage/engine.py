@@ -47,7 +47,7 @@ def private_file(path: Path) -> int:
 
 
 def readable_by_others(path: Path) -> str:
-    """A warning if accounts other than its owner may use a file; empty if not, or if there is no file or no POSIX rights."""
+    """Return a warning if accounts other than the owner may use a file; empty if not, or if the file or POSIX rights are missing."""
     try:
         rights = stat.S_IMODE(path.stat().st_mode)
     except OSError:
@@ -58,7 +58,7 @@ def readable_by_others(path: Path) -> str:
 
 
 def database_readable_by_others(url: str) -> str:
-    """The same for a SQLite database; empty for a server, which guards its own files."""
+    """Return the warning of `readable_by_others` for a SQLite database; empty for a server, which guards its own files."""
     parsed = make_url(url)
     return readable_by_others(Path(parsed.database)) if parsed.drivername == "sqlite" and parsed.database else ""
 
@@ -113,9 +113,9 @@ _URL_HELP = "write e.g. sqlite:///abbe.sqlite3 or postgresql://user@host/name"
 
 
 def make_engine(url: str) -> Engine:
-    """Create the engine with this product's settings. Nothing is opened yet.
+    """Create the engine with Abbe's settings; create an empty private file for a new SQLite database. No connection is opened.
 
-    Its transactions start with BEGIN IMMEDIATE on SQLite unless the connection has the option ``READ_ONLY_OPTION``.
+    On SQLite, transactions start with BEGIN IMMEDIATE unless the connection has the option ``READ_ONLY_OPTION``.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def _to_json(value: Any) -> str:
     try:
         return json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     except ValueError as err:
-        raise StoreError(f"a document with NaN or Infinity is not stored ({err})", "give null where there is no value") from None
+        raise StoreError(f"a document with NaN or Infinity cannot be stored ({err})", "give null where there is no value") from None
 
 
 def _first_line(err: exc.SQLAlchemyError) -> str:
@@ -203,13 +203,13 @@ def _check_file(parsed: URL) -> None:
 
 
 def _make_private(path: Path) -> None:
-    """Create an empty file for its owner only, before SQLite makes one for everybody; journals inherit its rights."""
+    """Create an empty file for its owner only, before SQLite creates one that others can read; journals inherit its rights."""
     try:
         os.close(private_file(path))
     except FileExistsError:
         return  # another process was first
     except OSError as err:
-        raise StoreError(f"database {path} cannot be made: {err.strerror}", "check that the folder may be written") from None
+        raise StoreError(f"database {path} cannot be created: {err.strerror}", "check that the folder may be written") from None
 
 
 def _set_pragmas(connection: sqlite3.Connection, _record: object) -> None:
@@ -241,7 +241,7 @@ _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after
 def known_revisions() -> tuple[str, ...]:
     """Every schema revision that this program can upgrade, oldest first, from the files ``rNNNN_what.py``.
 
-    Not from Alembic, which takes a quarter of a second to import: nearly every database is up to date.
+    Alembic takes a quarter of a second to import, and nearly every database is up to date: so this does without it.
     """
     names = sorted(entry.name for entry in files(_VERSIONS).iterdir() if entry.name.startswith("r") and entry.name.endswith(".py"))
     return tuple(name[1:5] for name in names)

@@ -1,4 +1,4 @@
-"""The tables, as SQLAlchemy Core sees them. The migrations create exactly these (a test compares the two)."""
+"""The database's tables in SQLAlchemy Core. The migrations create exactly these (a test compares them)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Measurements: machines, their campaigns, the runs with their chunks of samples, and the journal of a running campaign.
 
-The capture may deliver a chunk twice: on arrival, and again from a segment after a crash. The journal is append-only, with one entry for
-everything that cannot be undone.
+The capture may deliver a chunk twice: on arrival, and again after a crash from a segment (a file of samples on disk). The journal is
+append-only, with one entry for everything that cannot be undone.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class Runs(Repository):
         return self._db.commit(lambda connection: _insert_run(connection, values | {"started_utc": self._db.now()}))
 
     def finish(self, run_id: int, status: str, reason: str, doc: Doc | None) -> None:
-        """Close a run for good.
+        """Close a run; it cannot be opened again.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class Runs(Repository):
         self._db.commit(work)
 
     def import_campaign(self, machine: tuple[str, Doc], campaign: tuple[str, Doc], imported: Sequence[ImportedRun]) -> int:
-        """Store a campaign that was measured elsewhere, entirely or after an error not at all; return its id.
+        """Store a campaign that was measured elsewhere; return its id. After an error nothing is stored.
 
         Parameters
         ----------
@@ -278,16 +278,16 @@ class Chunks(Repository):
         self._db.commit(work)
 
     def ingest(self, chunks_given: Sequence[ChunkRecord]) -> int:
-        """Add chunks of one running run, in any order: all of them, or after an error none. Returns the number of new ones.
+        """Add chunks of one running run, in any order; return the number of new ones. After an error none is added.
 
-        A chunk that is stored already is accepted if it is equal.
+        A chunk that is stored already is accepted if it has the same content.
 
         Raises
         ------
         CaptureConflict
             The database holds a different chunk of the same run, channel and number.
         StoreError
-            The run is closed or does not exist, or the database cannot take it now.
+            The run is closed or does not exist, or the database cannot be written now.
         """
 
         def work(connection: Connection) -> int:
@@ -307,7 +307,7 @@ class Chunks(Repository):
         except StoreError as error:
             if not isinstance(error.__cause__, IntegrityError):
                 raise
-            return self._db.commit(work)  # another process inserted the same chunk after our look (PostgreSQL): look again
+            return self._db.commit(work)  # another process inserted the same chunk after our SELECT (PostgreSQL): try again
 
     def of_run(self, run_id: int, channel: str | None = None) -> list[ChunkRecord]:
         """Read a run's samples (of one channel), in order of channel and seq, and check their CRC.

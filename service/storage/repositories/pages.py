@@ -92,7 +92,7 @@ class Pages(Repository):
     def page(self, kind: str, filters: Mapping[str, object], before: int | None, limit: int) -> list[Doc]:
         """Read one page of a list, one of `LISTINGS`.
 
-        ``filters``: required values by column, None for any; ``before``: only rows with a smaller id, the last one of the page before.
+        ``filters``: required values by column, None for any; ``before``: id of the last row of the page before, None for the first page.
         """
         listing = LISTINGS[kind]
         conditions = [listing.columns[name] == filters[name] for name in listing.filters if filters.get(name) is not None]

@@ -85,7 +85,7 @@ class Tables(Repository):
     def add(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:
         """Store a table; return its id.
 
-        ``solution_id`` None: the table was read back from the controller. ``crc``: CRC-32 of ``image``; ``doc``: grid and prediction.
+        ``solution_id`` None: a test step or a restored table. ``crc``: CRC-32 of ``image``; ``doc``: kind and prediction, or why it was restored.
         """
         values = {"machine_id": machine_id, "solution_id": solution_id, "image": image, "crc": crc, "doc": doc}
         return self._add(comp_tables, **values, created_utc=self._db.now())
@@ -107,7 +107,7 @@ class Verifications(Repository):
         return self._add(verifications, machine_id=machine_id, campaign_id=campaign_id, verdict=verdict, doc=doc, utc=self._db.now())
 
     def add_with_messages(self, machine_id: int, doc: Doc, messages: Sequence[tuple[str, Doc]]) -> int:
-        """Store the result of a check together with its messages: both or neither survive a power cut.
+        """Store the result of a check and its messages in one transaction; return the number of the verification.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Discoveries(Repository):
     """Searches for what a campaign's model lacks."""
 
     def add(self, campaign_id: int, digest: str, doc: Doc) -> int:
-        """Open a discovery of a campaign. ``digest``: of readings, model and program; ``doc``: what it starts from."""
+        """Open a discovery of a campaign; return its id. ``digest``: of readings, model and program; ``doc``: its start (`SearchBase`)."""
         return self._add(discoveries, campaign_id=campaign_id, digest=digest, doc=doc, created_utc=self._db.now())
 
     def get(self, discovery_id: int) -> DiscoveryRecord:
@@ -169,7 +169,7 @@ class Discoveries(Repository):
         return self._all(STEP, discovery_steps.c.discovery_id == discovery_id, order=discovery_steps.c.seq)
 
     def add_step(self, discovery_id: int, seq: int, state: str, doc: Doc, model: NewVersion | None = None) -> int | None:
-        """Write the next state of a discovery and, in the same transaction, the model version that it brings.
+        """Write the next state of a discovery and, in the same transaction, its new model version if there is one.
 
         ``seq``: number of the state, from 0; ``doc``: evidence, numbers, who decided. Returns the number of the new version, or None.
 
@@ -234,8 +234,8 @@ def _moved_on(model: NewVersion, last: int | None) -> ModelMovedOn:
     made_on = "without any" if model.after is None else f"on version {model.after}"
     have = "no model" if last is None else f"model version {last}"
     return ModelMovedOn(
-        f"machine {model.machine!r} has {have} now, and this was made {made_on}: nothing was added",
-        f"look at it (`abbe model show {model.machine}`), then run this again",
+        f"machine {model.machine!r} has {have} now, but the new version was made {made_on}: nothing was added",
+        f"look at the present model (`abbe model show {model.machine}`), then run this again",
     )
 
 
@@ -243,7 +243,7 @@ class Proposals(Repository):
     """Proposals, approvals, rejections."""
 
     def add(self, machine: str, solution_id: int, doc: Doc, digest: str) -> int:
-        """Store a proposal for a machine (by name) from a solution; return its id. ``digest``: SHA-256 of ``doc``, which holds no NaN."""
+        """Store a proposal for a machine (by name) from a solution; return its id. ``digest``: SHA-256 of ``doc``, without NaN in it."""
         return self._add(proposals, machine=machine, solution_id=solution_id, doc=doc, digest=digest, created_utc=self._db.now())
 
     def get(self, proposal_id: int) -> ProposalRecord:
@@ -272,7 +272,7 @@ class Proposals(Repository):
 
 
 MARKS = ("base_crc", "crc", "accepted_crc", "machine", "control", "by")
-"""Keys of an entry's document that `Pushes.marks` reads: tables, machine, control, and who vouched."""
+"""Keys of an entry's document that `Pushes.marks` reads: CRCs of tables, machine, control, and who vouched for a table."""
 NAME_LENGTH = 200
 
 
@@ -301,9 +301,9 @@ class Pushes(Repository):
         return self._db.commit(work)
 
     def chain(self, machine: str, control: str = "") -> str:
-        """Name of a control's journal, that of the first machine that pushed into it.
+        """Name of a control's journal: the name of the first machine that pushed into the control.
 
-        ``control``: identity of the control; empty: unknown, then it is the journal in which this machine name was last used.
+        ``control``: identity of the control; empty: unknown, so take the journal in which this machine name was last used.
         """
         doc = push_entries.c.doc
         names = (push_entries.c.machine, doc["machine"].as_string().label("name"), doc["control"].as_string().label("control"))
@@ -326,7 +326,7 @@ class Pushes(Repository):
         return self._all(PUSH_ENTRY, push_entries.c.machine == chain, push_entries.c.push == latest)
 
     def marks(self) -> list[PushEntry]:
-        """Read the entries of all journals in the order of writing; documents hold `MARKS` only, no images."""
+        """Read the entries of all journals in the order of writing, their documents reduced to `MARKS`, without images."""
         marks = [push_entries.c.doc[key].as_string().label(f"mark_{key}") for key in MARKS]
         query = PUSH_MARK.select().add_columns(*marks).order_by(push_entries.c.id)
         rows = self._db.read(lambda connection: connection.execute(query).mappings().all())
@@ -347,7 +347,7 @@ def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) 
     begun : sequence of tuple
         First entries of pushes, newest first: journal, machine name, control (empty: unknown).
     machine, control : str
-        Without a control the name decides: the journal in which it was last used.
+        Without a control the machine's name decides: it is the journal in which that name was last used.
     """
     if not control:
         return next((chain for chain, name, _ in begun if name == machine), machine)

@@ -1,7 +1,7 @@
-"""What the service itself writes: alarms, messages for the broker, slots of schedules, heartbeats, stored replies, and the audit.
+"""Records of the service itself: alarms, messages for the broker, slots of schedules, heartbeats, stored replies, and the audit.
 
-Alarms and audit are append-only. An alarm entry is stored together with its messages; each event of the audit is chained to the one before
-it within one transaction. One process only claims a slot, and another adopts it when that process no longer runs.
+Alarms and audit are append-only. An alarm entry is stored together with its messages; each audit event is chained to the one before it.
+Only one process can claim a slot; another adopts the slot when that process no longer runs.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Outbox(Repository):
     def prune(self, keep: int, at_most: int = 1000) -> int:
         """Delete sent messages, oldest first; return how many.
 
-        The newest ``keep`` stay, at least one: a database that numbers by "largest id plus one" would reuse an id. At most ``at_most`` are
-        deleted in one transaction; call again while it returns that number.
+        The newest ``keep`` stay, at least one, because a database that numbers by "largest id plus one" would reuse an id. One call deletes
+        at most ``at_most``; call again while it returns that number.
         """
         sent = select(outbox.c.id).where(outbox.c.sent_utc.is_not(None))
         newest = sent.order_by(outbox.c.id.desc()).limit(max(keep, 1))
@@ -75,17 +75,17 @@ class Outbox(Repository):
     def shed(
         self, topics: Sequence[str], most: int, down_to: int, notice: Callable[[int, str, str], tuple[str, bytes]] | None = None
     ) -> int:
-        """Drop the oldest waiting messages of some topics if more than ``most`` wait; return how many. Other topics are untouched.
+        """Drop the oldest waiting messages of some topics if more than ``most`` of them wait; return how many were dropped.
 
         Parameters
         ----------
         topics : sequence of str
             Topics whose messages may be dropped.
         down_to : int
-            Number of the newest messages that stay; at least one.
+            How many of the newest messages stay; at least one.
         notice : callable, optional
             Makes topic and payload of a message about the loss, from the number of dropped messages and the times of the oldest and the
-            newest. It is queued in the same transaction: no loss is silent.
+            newest. The message is queued in the same transaction, so that no loss is silent.
         """
         waiting = (outbox.c.sent_utc.is_(None), outbox.c.topic.in_(topics))
 
@@ -117,14 +117,14 @@ class Alarms(Repository):
     def append(
         self, machine: str, alarm: int | None, seq: int, kind: AlarmKind, doc: Doc, messages: Sequence[tuple[str, Doc]] = ()
     ) -> AlarmEntryRecord:
-        """Append an entry to an alarm, with the messages for the broker: both or neither survive a power cut.
+        """Append an entry to an alarm and queue its messages for the broker in one transaction; return the entry.
 
         Parameters
         ----------
         alarm : int or None
             None: the next alarm of this machine. 0 collects entries that belong to no alarm.
         seq : int
-            One more than the last entry that the caller has read, so that a decision on stale data is refused.
+            Number of the last entry that the caller has read, plus one: so a decision on stale data is refused.
         messages : sequence of (topic, document)
             Each document gets the number of the alarm.
 
@@ -141,7 +141,9 @@ class Alarms(Repository):
             try:
                 entry_id = insert_row(connection, alarm_entries, **ALARM_ENTRY.values(entry, "id"))
             except IntegrityError:
-                raise StoreError(f"another process changed alarm {number} of {machine} meanwhile", "look at it, then try again") from None
+                raise StoreError(
+                    f"another process changed alarm {number} of {machine} meanwhile", "look at the alarm, then try again"
+                ) from None
             for topic, message in messages:
                 queue_message(connection, topic, {"alarm": number, **message}, self._db.now())
             return replace(entry, id=entry_id)
@@ -178,10 +180,10 @@ REPLY_ABANDONED = timedelta(minutes=1)
 
 
 class Replies(Repository):
-    """Answers by idempotency key. Each key belongs to ``who`` sent it: two people may use the same text."""
+    """Answers by idempotency key. A key belongs to its sender (``who``): two people may use the same text."""
 
     def claim(self, who: str, key: str, digest: str) -> ReplyRecord | None:
-        """Claim a key for a request of this digest. None: the caller has it and must `keep` or `drop` it; otherwise the stored reply."""
+        """Claim a key for a request of this digest. None: the caller has the key and must `keep` or `drop` it; else the stored reply."""
 
         def work(connection: Connection) -> ReplyRecord | None:
             now = self._db.utcnow()
@@ -214,16 +216,16 @@ class Replies(Repository):
 CLAIMED = "claimed"
 RUNNING = "running"
 RELEASED = "released"
-"""A service ended after claiming the slot and before starting it: the next service takes it."""
+"""State of a slot whose service ended after claiming and before starting it: the next service takes it."""
 NOT_RUN = ("missed", "skipped", "interrupted")
 _OWNER = owner_of(slots)
 _NO_OWNER: dict[str, object] = {"owner_host": None, "owner_pid": None, "owner_start": None}
 
 
 class Slots(Repository):
-    """Slots of schedules. UNIQUE (schedule, slot) makes each of them one row.
+    """Slots of schedules, one row for each schedule and due time.
 
-    Arguments ``slot_utc`` are when a slot is due; text is ISO 8601 with time zone.
+    Argument ``slot_utc``: when a slot is due; text is ISO 8601 with time zone.
     """
 
     def claim(self, schedule: str, slot_utc: datetime | str) -> bool:
@@ -237,7 +239,7 @@ class Slots(Repository):
         return self._db.commit(work)
 
     def begin(self, schedule: str, slot_utc: datetime | str) -> None:
-        """Store that the machine is about to move for a claimed slot: no other process will run it. Raises StoreError if unclaimed."""
+        """Store that a claimed slot starts, so that no other process runs it. Raises StoreError if unclaimed."""
         self._mark(schedule, slot_utc, {"state": RUNNING})
 
     def release(self, schedule: str, slot_utc: datetime | str) -> None:
@@ -328,7 +330,7 @@ class Audit(Repository):
     """The audit of this database."""
 
     def append(self, make: Callable[[AuditEvent | None, str], AuditEvent]) -> AuditEvent:
-        """Append the event that ``make(last event, present UTC)`` makes. Two processes wait for each other: the chain never forks."""
+        """Append the event that ``make(last event, present UTC)`` returns. Other processes wait meanwhile, so the chain never forks."""
 
         def work(connection: Connection) -> AuditEvent:
             if self._db.is_postgresql:  # on SQLite BEGIN IMMEDIATE has shut out others already

@@ -199,8 +199,8 @@ def test_an_invalid_row_may_hold_nothing_at_all():
     ("test", "setup", "said"),
     [
         ("ballbar_helix", {"centre_mm": list(CENTRE), "radius_mm": 0}, "radius_mm must be above 0"),
-        ("laser_diagonal", {"start_mm": [1, 2, 3], "end_mm": [1, 2, 3]}, "a laser run needs a beam"),
-        ("laser_diagonal", {"nominal_beam": [0, 0, 0]}, "a laser run needs a beam"),
+        ("laser_diagonal", {"start_mm": [1, 2, 3], "end_mm": [1, 2, 3]}, "a laser run needs nominal_beam"),
+        ("laser_diagonal", {"nominal_beam": [0, 0, 0]}, "a laser run needs nominal_beam"),
     ],
 )
 def test_a_set_up_without_length_or_direction_is_named(test, setup, said):

@@ -137,7 +137,7 @@ def _edited(made: Path, statement: str) -> None:
         ("DELETE FROM audit WHERE id = 5", "is broken: record 5 was written and is missing: the audit holds 4"),
         ("DELETE FROM audit WHERE id = 2", "is broken: record 2 is missing"),
         ("UPDATE alembic_version SET version_num = '9999'", "has schema 9999, which this version of Abbe does not know"),
-        ("DELETE FROM machines", "rows refer to rows that are not there"),
+        ("DELETE FROM machines", "rows refer to missing rows"),
         ("DROP TABLE alembic_version", "is not a database of Abbe"),
     ],
 )

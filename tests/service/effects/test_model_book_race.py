@@ -69,7 +69,7 @@ def test_the_later_of_two_discoveries_is_not_put_on_top_of_what_it_has_not_seen(
     with pytest.raises(ModelMovedOn) as told:
         discover(jobs[1], second, Search(width_um=9.0), ignore_progress)
     assert told.value.code == "DIS-004"
-    assert "machine 'VMC-1' has model version 1 now, and this was made without any: nothing was added" in str(told.value)
+    assert "machine 'VMC-1' has model version 1 now, but the new version was made without any: nothing was added" in str(told.value)
     assert told.value.remedy.startswith("run the same command again: it searches anew with what the model knows now")
     one = pair[0]
     assert [(m.version, m.discovery_id) for m in one.models.all(NAME)] == [(1, first.id)]
@@ -130,7 +130,7 @@ def test_both_have_looked_before_either_writes(pair: tuple[Store, Store]) -> Non
 
 def test_a_version_is_added_to_the_current_one_and_to_no_other(pair: tuple[Store, Store]) -> None:
     one, other = pair
-    with pytest.raises(ModelMovedOn, match="machine 'VMC-1' has no model now, and this was made on version 1"):
+    with pytest.raises(ModelMovedOn, match="machine 'VMC-1' has no model now, but the new version was made on version 1"):
         one.models.add(version(1))
     assert [store.models.add(version(after)) for store, after in ((one, None), (other, 1), (one, 2))] == [1, 2, 3]
     for after in (None, 1, 2, 4):
@@ -195,7 +195,7 @@ def test_a_version_that_comes_while_a_person_goes_back_is_not_lost(pair: tuple[S
         return write(model, discovery_id)
 
     monkeypatch.setattr(one.models, "add", late)
-    with pytest.raises(ModelMovedOn, match="has model version 3 now, and this was made on version 2: nothing was added"):
+    with pytest.raises(ModelMovedOn, match="has model version 3 now, but the new version was made on version 2: nothing was added"):
         revert(one, NAME, 1)
     assert [m.doc["why"] for m in other.models.all(NAME)] == ["by a test", "by a test", "a discovery's"]
     monkeypatch.undo()

@@ -221,7 +221,7 @@ def test_an_end_document_without_the_start_of_its_path_is_refused(store: Store, 
 
 def test_a_start_document_of_other_types_gives_one_error(store: Store, campaign_id: int) -> None:
     run_id = store.runs.start(campaign_id, "r01", "ballbar_helix", "identify", start_doc() | {"rate_hz": "fast"})
-    with pytest.raises(StoreError, match="c1/r01: its documents lack or garble"):
+    with pytest.raises(StoreError, match="c1/r01: its documents have a missing or invalid field"):
         load_run(store, run_id)
 
 

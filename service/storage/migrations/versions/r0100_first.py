@@ -1,6 +1,7 @@
 """The first schema: the tables of the program as they are, until the first release.
 
-Databases from before it are not migrated (decision 0033). With the second revision this one states its tables itself; a test reminds.
+Databases from before the first release are not migrated (decision 0033). Once there is a second revision, this one has to state its own
+tables; a test reminds of it.
 """
 
 from __future__ import annotations
