@@ -1,1 +1,1 @@
-"""The status page, its JSON and the way in. It shows; it moves nothing, and what changes something is guarded and recorded."""
+"""The web interface: screens, HTTP interface and login. It moves no axis itself; every change needs a permission and is recorded."""

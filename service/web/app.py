@@ -59,8 +59,8 @@ PAGE_ROWS = 60
 class Parts:
     """Sources of the routes that need a core: jobs, live events, metrics.
 
-    ``recipes`` can be started, ``plans`` run dry; ``campaigns``: recipes that end with a proposal; ``control``: identity of the machine's
-    control, empty if unknown.
+    ``recipes`` can be started, ``plans`` rehearsed in dry runs; ``campaigns``: recipes that end with a proposal; ``control``: identity of
+    the machine's control, empty if unknown.
     """
 
     core: CoreLine

@@ -62,4 +62,4 @@ class Body:
         return self._messages.pop(0) if self._messages else await self._receive()
 
     def _too_long(self) -> Response:
-        return problem(413, f"the body is longer than the {self._longest_b} bytes that are taken here")
+        return problem(413, f"the body is longer than the {self._longest_b} bytes that this path accepts")

@@ -70,7 +70,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
         """State of a job."""
         found = _find(core, job)
         if found is None:
-            raise HTTPException(404, f"there is no job {job} since the service began")
+            raise HTTPException(404, f"there has been no job {job} since the service started")
         return found
 
     @app.post("/api/v1/jobs/{job}/prompts/{prompt}/done", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
@@ -95,7 +95,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
             visit: Visit = request.state.visit
             return answered(core, await core.steer(job, how, visit.principal.name))
 
-    add_steering("stop", "Stop at the next safe place; what is complete stays")
+    add_steering("stop", "Stop at the next safe place; complete runs are kept")
     add_steering("abort", "Stop the axes at once, and end")
     add_steering("pause", "Hold at the next safe place")
     add_steering("resume", "Go on after a pause")

@@ -39,7 +39,7 @@ def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Se
     tls : bool
         Whether a certificate is configured.
     names : sequence of str
-        Host names that other computers use, by a reverse proxy if the address is this computer's own.
+        Host names by which other computers reach the service; through a reverse proxy if ``host`` is a loopback address.
     behind_tls : bool
         Whether that proxy terminates TLS.
 
@@ -75,12 +75,13 @@ def bind(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         listening = socket.create_server((host, port), family=family, backlog=64)
-        # Connections inherit the option, which asyncio sets on no socket of protocol 0: head and body would wait 40 ms for each other.
+        # Connections inherit this option. Without it, head and body would wait 40 ms for each other: asyncio does not set it here.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening
     except OSError as trouble:
         raise ConfigError(
-            f"[web] cannot listen on {host} port {port}: {trouble.strerror}", "is another service running? choose another with --port"
+            f"[web] cannot listen on {host} port {port}: {trouble.strerror}",
+            "stop the other service, or choose another port with --port",
         ) from trouble
 
 

@@ -43,14 +43,14 @@ class _MetricsCollector(Collector):
         for verdict, number in sorted(counts.items()):
             checks.add_metric([verdict], number)
         yield checks
-        slots = CounterMetricFamily("abbe_slots_not_run", "Slots of the timetable that were not run, by why", labels=["why"])
+        slots = CounterMetricFamily("abbe_slots_not_run", "Slots of the timetable that were not run, by reason", labels=["why"])
         states = self._store.slots.counts(self._machine)
         for why in ("missed", "skipped", "interrupted"):
             slots.add_metric([why], sum(number for state, number in states.items() if state.startswith(why)))
         yield slots
         yield GaugeMetricFamily("abbe_outbox_waiting", "Messages that wait for the broker", self._store.outbox.count())
         known = verified_by(self._store, self._machine, control=self._control)
-        about = "1: a check, or the push that brought it, measured the table in force; 0: nothing has since it came"
+        about = "1: a check, or its own push, has measured the table in force; 0: nothing has measured it yet"
         yield GaugeMetricFamily("abbe_table_verified", about, float(known.state == "verified"))
         checks_now = self._store.verifications.of_machine(self._machine, 1) if known.holds else []
         last = next(iter(checks_now), None)

@@ -16,7 +16,7 @@ MEDIA_TYPE = "text/xml"
 
 
 class MtconnectAccess:
-    """The agent and its source of facts. The first request starts the agent, and its time becomes the ``instanceId``."""
+    """The agent and its source of facts. The first request starts the agent; the time of that request becomes the ``instanceId``."""
 
     def __init__(self, source: FactsSource) -> None:
         self._source = source

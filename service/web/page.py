@@ -32,7 +32,7 @@ ICON = (
 def environment() -> Environment:
     """The template environment. It escapes everything, since names and fault texts come from devices and files.
 
-    One in a process: a template costs 0.1 s to compile, and the environment keeps what it has compiled.
+    One per process: compiling a template takes 0.1 s, and the environment keeps compiled templates.
     """
     env = Environment(
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -112,9 +112,9 @@ def _point(check: Verification, key: str, unit: str, changes: Sequence[datetime]
 
 
 def figure_verdict(check: Verification, key: str) -> str:
-    """Verdict of one figure, by the same guard-banded rule as that of the check.
+    """Verdict of one figure, by the same guard-banded rule as the check's verdict.
 
-    If the check's verdict does not follow from its figures, its reason (e.g. the temperature) applies to each of them.
+    If the check's verdict has another reason than its figures (e.g. the temperature), it applies to each figure.
     """
     found = {name: _judged(check, name) for name in check.limits if check.values.get(name) is not None}
     worst = next((verdict for verdict in ("fail", "cannot tell", "pass") if verdict in found.values()), None)

@@ -45,7 +45,7 @@ async def _http(_: Request, error: Exception) -> JSONResponse:
 
 
 async def _disconnected(_: Request, error: Exception) -> JSONResponse:
-    # The client never reads it; without it, the log would show a disconnect as a defect.
+    # The client never reads this response; without a handler, the log would show a disconnect as a defect.
     assert isinstance(error, ClientDisconnect)
     return problem(400, "the request is incomplete")
 

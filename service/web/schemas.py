@@ -61,7 +61,7 @@ class SolutionList(ListPage):
 
 
 class DiscoveryList(ListPage):
-    """Searches."""
+    """Searches for missing effects."""
 
     discoveries: Sequence[DiscoverySummary]
 

@@ -42,8 +42,8 @@ class _PixelScale:
 def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo, changes: Sequence[datetime] = ()) -> str:
     """The plot as an SVG element.
 
-    ``name``, ``unit`` label the vertical axis; ``points`` may have any order and must not be empty; ``zone`` applies to the dates. Each of
-    ``changes``, when another table came into force, is a vertical line. Points of an earlier table are grey.
+    ``name``, ``unit`` label the vertical axis; ``points`` may have any order and must not be empty; ``zone`` applies to the dates;
+    ``changes``: times when another table came into force, drawn as vertical lines. Points of an earlier table are grey.
     """
     points = sorted(points, key=lambda point: point.at)
     changes = [time for time in changes if time >= points[0].at]

@@ -62,7 +62,7 @@ def shown(value: float | str | None, unit: str, system: str, decimals: int | Non
     Parameters
     ----------
     value : float, str or None
-        A number gets digits by its size. A text is an already rounded number and keeps its resolution; any other text is unchanged. None is
+        A number gets digits by its size. A text that holds a rounded number keeps its resolution; any other text is unchanged. None becomes
         a dash.
     unit : str
         Unit of ``value``: ``"µm"``, ``"mm"``, ``"mm/min"``; others are not converted.

@@ -177,6 +177,6 @@ async def test_a_changed_journal_is_no_source_of_tables(start_sims, tmp_path):
             doc = json.loads(raw.execute("SELECT doc FROM push_entries WHERE seq = 0").fetchone()[0])
             raw.execute("UPDATE push_entries SET doc = ? WHERE seq = 0", (json.dumps(doc | {"base_image": doc["image"]}),))
             raw.commit()
-        with pytest.raises(StoreError, match="not what was written"):
+        with pytest.raises(StoreError, match="was changed after it was written"):
             await rollback(session.controller, store, site)
         assert await generation(session) == gen

@@ -95,7 +95,7 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
 
 @contextmanager
 def _stored(sources: Sources, number: int) -> Iterator[None]:
-    """Decide on an existing proposal; errors of its row become an answer."""
+    """Require that the proposal exists; turn errors in its stored row into an answer."""
     sources.reader.row("proposals", number, "proposal")
     with as_stored():
         yield

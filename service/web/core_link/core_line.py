@@ -117,7 +117,7 @@ class CoreLine:
 
     @property
     def attention(self) -> list[str]:
-        """What needs a person now."""
+        """Sentences about everything that needs a person now."""
         return list(self.snapshot().attention)
 
     def next_due(self) -> list[tuple[Schedule, datetime]]:
@@ -186,7 +186,7 @@ class CoreLine:
                     return await answer
         finally:
             self._waiting.pop(request.request, None)
-        raise CoreSilent("the core of the service did not answer in time", "check whether it was done before you repeat the request")
+        raise CoreSilent("the core of the service did not answer in time", "check whether the request was carried out before you repeat it")
 
 
 def _put(queue: asyncio.Queue[Snapshot | None], snapshot: Snapshot | None) -> None:

@@ -98,7 +98,7 @@ class AuthMiddleware:
         if body is not None and (too_long := await body.refusal()) is not None:
             return too_long
         if need is not PUBLIC and need not in visit.principal.permissions:
-            return problem(403, f"a {visit.principal.role} may not do this: it needs {need.value!r}")
+            return problem(403, f"a {visit.principal.role} may not do this: the request needs the permission {need.value!r}")
         if changes or request.scope["type"] == "websocket":
             return self._foreign(request, visit, need, changes=changes)
         return None
@@ -112,7 +112,7 @@ class AuthMiddleware:
         if changes and need is not PUBLIC and not by_token:
             sent = request.headers.get(CSRF_HEADER, "")
             if not hmac.compare_digest(sent.encode(), csrf_token(visit.secret).encode()):
-                return problem(403, f"the header {CSRF_HEADER} is missing or not of this session")
+                return problem(403, f"the header {CSRF_HEADER} is missing or does not belong to this session")
         return None
 
     async def _recorded(

@@ -18,8 +18,8 @@ def is_tls(request: HTTPConnection, *, behind_tls: bool) -> bool:
 def address_of(request: HTTPConnection, *, behind_tls: bool) -> str:
     """The visitor's address.
 
-    Behind our reverse proxy, which runs on this computer, the last address in ``X-Forwarded-For``, which the proxy appended; the visitor
-    may have written the earlier ones.
+    Behind our reverse proxy, which runs on this computer, this is the last address in ``X-Forwarded-For``: the proxy appended that one, but
+    the visitor may have written the others.
     """
     address = request.client.host if request.client else ""
     if behind_tls and is_local(address):

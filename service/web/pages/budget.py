@@ -49,8 +49,9 @@ class IntervalLine:
 
 @dataclass(frozen=True, slots=True)
 class BudgetScreen:
-    """The budget in the reader's units. ``total``: combined u; ``worst``: results at the worst point; ``old``: without evaluation types and
-    degrees of freedom.
+    """The budget in the reader's units.
+
+    ``total``: combined u; ``worst``: results at the worst point; ``old``: the solution lacks evaluation types and degrees of freedom.
     """
 
     number: int

@@ -21,7 +21,7 @@ from abbe.service.queries.status import Status
 from abbe.service.secrets import mask_secrets
 from abbe.service.web.api.sources import Sources
 
-# Possible secrets are removed from texts and documents before they leave the plant: rather too much is blanked than too little.
+# Possible secrets are removed from texts and documents before these leave the plant. When in doubt, text is removed.
 
 HIDDEN = "***"
 _NAMED = r"(?:pass(?:word|phrase|wd|code)|pwd|secret|token|api[_-]?key|private[_-]?key|credential|cookie|authori[sz]ation|csrf)"
@@ -75,7 +75,10 @@ FIXED = (2026, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """State of the installation. Sizes in bytes; None if the database is on another computer; ``growth_b``: average per day."""
+    """State of the installation; sizes in bytes.
+
+    ``growth_b``: average per day, None on the first day; ``free_b``: None if the database is on another computer.
+    """
 
     version: str
     python: str

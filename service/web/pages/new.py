@@ -1,4 +1,4 @@
-"""Tests for the screens: a new one (recipe, dry run, checklist, start; only the start moves the machine), and the running one."""
+"""The screens of a measurement: a new one (recipe, dry run, checklist, start; only the start moves the machine), and the running one."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Rehearsals:
     def choices(self) -> tuple[str, ...]:
         """Names without rates: startable recipes first, then the full campaign.
 
-        Only programs can start a campaign of a recipe file; the command line has its dry run.
+        Campaigns of recipe files are left out: only programs can start them, and the command line shows their dry runs.
         """
         named = (split_recipe_name(name)[0] for name in self.recipes if not name.endswith(".toml"))
         return tuple(dict.fromkeys([*named, *((CAMPAIGN,) if self.machine is not None else ())]))

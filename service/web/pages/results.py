@@ -99,7 +99,7 @@ def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, flo
 
 
 MOST_SOLUTIONS = 20
-"""Each has half a megabyte: more would make the list slow."""
+"""A stored solution has half a megabyte: more of them would make the list slow."""
 
 
 @dataclass(frozen=True, slots=True)

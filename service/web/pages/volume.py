@@ -48,8 +48,10 @@ class NodeLine:
 
 @dataclass(frozen=True, slots=True)
 class VolumeScreen:
-    """The map in the reader's units. ``lines``: all nodes; ``source``: address of the numbers for the script, in mm and µm; ``top``: upper
-    end of the colour scale; ``not_significant``: number of such nodes; ``trouble``: why there is no map.
+    """The map in the reader's units.
+
+    ``lines``: all nodes; ``source``: address of the numbers for the script, in mm and µm; ``top``: upper end of the colour scale;
+    ``not_significant``: number of nodes whose error may be zero; ``trouble``: why there is no map.
     """
 
     number: int

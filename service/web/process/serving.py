@@ -127,7 +127,7 @@ async def _begin(wire: Wire) -> Begin | None:
         return None
     first = from_core(body)
     if not isinstance(first, Begin) or first.protocol != PROTOCOL:
-        raise ChannelBroken("the core of the service has another version of the channel")
+        raise ChannelBroken("the core of the service uses another version of the channel protocol")
     return first
 
 

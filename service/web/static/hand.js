@@ -13,8 +13,8 @@ function nameOf(button) {
   return `${button.dataset.job}/${button.dataset.prompt}`;
 }
 
-// The button stays disabled until a new prompt has been shown for a second, so that a late click on the previous prompt does not confirm it.
-// The second belongs to the prompt, since the page may replace the button meanwhile.
+// The button stays disabled until a new prompt has been shown for a second, so that a late click on the previous prompt does not confirm the
+// new one. The second counts per prompt, not per button: the page may replace the button meanwhile.
 function look() {
   const button = shown();
   if (!button) return;

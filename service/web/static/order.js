@@ -1,5 +1,5 @@
 // Orders a rollback or a push of a table after a second confirmation, and follows the job to its end. The key comes with the page, so a
-// second click or a repeated request is the same order.
+// second click or a repeated request places no second order.
 
 const form = document.getElementById("order");
 const dialog = document.getElementById("ask-order");

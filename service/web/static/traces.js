@@ -1,6 +1,6 @@
 // Strip and polar trace of a ball-bar path on two canvases. Each pixel column (strip) or part of the path (polar) keeps its least and largest
-// sample, so drawing does not depend on the rate and shows every peak. Samples arrive in µm; from `take` on all values are in the reader's
-// unit, so that its scales are round numbers.
+// sample, so the effort of drawing does not depend on the rate, and every peak shows. Samples arrive in µm; `take` converts them to the
+// reader's unit, so that the scales are round numbers in it.
 
 const STRIP_S = 20;
 const PARTS = 1440;

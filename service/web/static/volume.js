@@ -219,7 +219,7 @@ async function begin() {
   const answer = await asked;
   if (!answer?.ok) return fallBack(note.dataset.lost);
   const map = prepared(await answer.json(), unit);
-  scene.hidden = false; // not before: until then its choices are empty
+  scene.hidden = false; // only now: its selection lists were empty before
   note.hidden = true;
   start(map, paint);
 }

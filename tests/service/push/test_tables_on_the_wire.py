@@ -83,7 +83,7 @@ def test_limits_refuse_and_say_which_key_to_look_at(limits, what):
     check_test_step(tables(), None, PushLimits())
     with pytest.raises(TableRefused, match=what) as caught:
         check_test_step(tables(), None, limits)
-    assert "Nothing was written" in caught.value.remedy
+    assert "nothing was written" in caught.value.remedy
 
 
 def test_change_is_measured_against_the_active_table():

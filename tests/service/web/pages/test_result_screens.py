@@ -156,7 +156,7 @@ def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> No
     page = got(running, f"/compare?run={a}&run={b}")
     assert "Polar plot" in page
     assert "B − A" in page
-    assert re.search(r"Largest difference [−\d.]+ ± [\d.]+ µm; beyond its U at \d+% of the places", page)
+    assert re.search(r"Largest difference [−\d.]+ ± [\d.]+ µm; beyond its U at \d+% of the positions", page)
     assert re.search(r"<th scope=\"row\">helix rms</th>.*? ± .*? ± .*? ± ", page)
     assert re.search(r"was measured elsewhere than", page)
     laser = runs_of(running, "laser_linear")[0]
