@@ -57,7 +57,7 @@ def stated(value: float | None, u: float | None) -> str:
 
 
 def summary_table(rows: Sequence[SummaryRow]) -> TextTable:
-    """Table of figures before and after; what the correction reached is bold."""
+    """Table of figures before and after the correction, with the columns about its result in bold."""
     head = ("Figure", "Before", "After", "Unit", "Smaller by", "Source")
     cells = [(r.name, stated(r.before, r.u_before), stated(r.after, r.u_after), r.unit, _times(r), r.source) for r in rows]
     return TextTable(head, cells, bold=("After", "Smaller by"))

@@ -62,7 +62,7 @@ def _drawn(order: int, test: TestPlan) -> DrawnTest:
 
 
 def _read_places(test: TestPlan) -> list[Point]:
-    """Positions of all readings, in order: recorded paths and places of single readings."""
+    """Positions of all readings, in order: those of recorded paths and of single readings."""
     out: list[Point] = []
     here: Point | None = None
     for step in test.steps:

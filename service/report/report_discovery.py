@@ -204,7 +204,7 @@ def gap_table(finding: Finding) -> TextTable:
 
 
 def _what(finding: Finding) -> str:
-    """Name what was added to the model between the gaps before and after; empty if nothing was."""
+    """Name the addition to the model that leads from the gap before to the gap after; empty if there is none."""
     return {"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict]
 
 

@@ -248,9 +248,9 @@ def _remedy(site: Site, push: PushedTable) -> str:
 
 
 async def accept_strange(controller: TableController, store: Store, site: Site, by: str) -> str | None:
-    """Accept the table in force if this database did not push it into this control; return what was done.
+    """Accept the table in force if this database did not push it into this control; return a sentence about it, else None.
 
-    An unverified table of a push of this database is not accepted here: that takes `abbe accept-table`.
+    An unverified table that this database pushed is not accepted here: `abbe accept-table` can do that.
     """
     now = await identify_table(controller, *await asyncio.to_thread(_journals, store, site))
     if not now.strange and now.elsewhere is None:

@@ -37,7 +37,7 @@ class SlicePlane:
 
 @dataclass(frozen=True, slots=True)
 class SliceTexts:
-    """Texts of the picture in the reader's language, and display units of places and errors."""
+    """Texts of the picture in the reader's language, and display units of positions and errors."""
 
     heading: str
     nominal: str

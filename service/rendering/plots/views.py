@@ -58,7 +58,7 @@ class DrawnTest:
 def three_views(stroke_mm: F2, tests: Sequence[DrawnTest], *, key: str = "views", unit: Unit = MM) -> str:
     """Paths of all tests (in the order of measuring) in three views with one scale, strokes as frames, set-ups with their numbers.
 
-    ``stroke_mm``: first and last position of X, Y, Z, shape (3, 2). ``unit``: display unit of places.
+    ``stroke_mm``: first and last position of X, Y, Z, shape (3, 2). ``unit``: display unit of positions.
     """
     summary = "; ".join(f"{t.number}: {t.text}" for t in tests)
     svg = Svg(WIDTH, HEIGHT, key, f"Paths of {len(tests)} tests in three views", summary)

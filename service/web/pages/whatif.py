@@ -1,4 +1,4 @@
-"""What-if for the screen: errors that would remain if some were corrected."""
+"""The what-if screen: errors that would remain if some error motions were corrected."""
 
 from __future__ import annotations
 
