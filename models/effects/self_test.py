@@ -92,7 +92,7 @@ def _faults(effect: Effect, signal: Signal, paths: tuple[Path, ...], key: str, v
     if len(columns) != len(paths) or any(len(s) != 2 or s[0] != p.n or s[1] != shape[0][1] for s, p in zip(shape, paths, strict=False)):
         return [f"one array of shape (readings, coefficients) per run expected, with equally many coefficients; got shapes {shape}"]
     if not all(np.isfinite(c).all() for c in columns):
-        return ["a column holds NaN or infinity"]
+        return ["a value is not finite"]
     out = [
         f"blind names {p.test}, but the columns of that test are not zero"
         for p, c in zip(paths, columns, strict=True)
