@@ -1,8 +1,8 @@
-"""Centroid ballscrew table, version 1 (.tab; CNC7 v6.00 on): encoder counts, one direction (cncsnw.com, "Laser Compensation").
+"""Centroid ballscrew table, version 1 (.tab; CNC7 v6.00 and later): encoder counts, one direction (cncsnw.com, "Laser Compensation").
 
-First line: number of values, and the travel from the first to the last in counts with its sign; then one whole number per line, the first
-at the reference. The page's own example (24 values over -1448819 counts) is 40 mm per point at 40000 counts per inch. Versions 2
-and 3 (two directions, a longer heading) are not supported, because their description was not available.
+The first line holds the number of values and the signed travel from the first to the last, in counts. One whole number per line follows,
+the first at the reference. In the example of that page, 24 values over -1448819 counts are 40 mm apart at 40000 counts per inch. Versions 2
+and 3 (two directions, a longer heading) are not supported, because no description of them was available.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ WHAT = "Centroid ballscrew table"
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """One file per axis; the reference must be one end of the table.
+    """Write one file per axis; the reference must be one end of the table.
 
     Raises
     ------
@@ -35,7 +35,10 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         ends = (table.position_mm[0], table.position_mm[-1])
         reference = ends[0] if settings.reference_mm is None else settings.reference_mm[AXES.index(table.axis)]
         if min(abs(reference - e) for e in ends) > 1e-6:
-            raise FormatRefused(f"{WHAT}, table {table.name}: the reference {reference:g} is neither end of the table", NOTHING)
+            raise FormatRefused(
+                f"{WHAT}, table {table.name}: the reference {reference:g} mm is at neither end of the table",
+                f"choose another grid; {NOTHING}",
+            )
         way = 1 if abs(reference - ends[0]) <= 1e-6 else -1
         travel = way * round(float(np.ptp(table.position_mm)) * settings.counts_per_mm)
         counts = integers(SIGN.to_file(table.forward_mm, table.position_mm), 1.0 / settings.counts_per_mm)[::way]
@@ -59,14 +62,14 @@ def _read_one(file: TextFile, settings: FormatSettings) -> AxisTable:
     axis = file.name.rpartition(".")[0][-1:].upper()
     lines = list(file.lines())
     if axis not in AXES or not lines:
-        raise file.wrong(1, "the name does not end in its axis, or the file is empty", "name it cnc-x.tab, cnc-y.tab or cnc-z.tab")
+        raise file.wrong(1, "the file's name does not end in its axis, or the file is empty", "name it cnc-x.tab, cnc-y.tab or cnc-z.tab")
     head = lines[0][1].split()
     if len(head) != 2 or not head[0].isdigit():
         raise file.wrong(1, f"{lines[0][1]!r} is not a heading of version 1 (number of values, travel in counts)")
     count, travel = int(head[0]), file.number(1, head[1], "the travel")
     values = np.array([file.number(line, text.strip(), "the correction") for line, text in lines[1:]])
     if values.size != count or count < 2 or travel == 0.0:
-        raise file.wrong(len(lines), f"{values.size} values, {count} stated")
+        raise file.wrong(len(lines), f"{values.size} values; the first line states {count:g} values and a travel of {travel:g} counts")
     start = 0.0 if settings.reference_mm is None else settings.reference_mm[AXES.index(axis)]
     position = start + np.linspace(0.0, travel / settings.counts_per_mm, count)
     way = 1 if travel > 0 else -1

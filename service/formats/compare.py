@@ -86,7 +86,7 @@ def check_same(found: Compensation, expected: Compensation, tolerance_mm: float)
     size = (
         f"the correction of {worst.axis} differs by {worst.size_mm * 1e3:.2f} µm at {place} moving in {'+' if worst.direction > 0 else '−'}"
     )
-    raise TableContradicts(f"{_mistake(found, expected) or 'these are other tables than expected'} ({size})", REMEDY)
+    raise TableContradicts(f"{_mistake(found, expected) or 'the tables are not the expected ones'} ({size})", REMEDY)
 
 
 def _moving(comp: Compensation, p: F2, way: int) -> F2:
@@ -94,7 +94,7 @@ def _moving(comp: Compensation, p: F2, way: int) -> F2:
 
 
 def _mistake(found: Compensation, expected: Compensation) -> str:
-    """The known mistake that turns the expected tables into the found ones; empty if none does."""
+    """Return the known mistake that turns the expected tables into the found ones; empty if none does."""
     p = places_mm(found, expected)
     have, want = (np.stack([_moving(c, p, way) for way in (1, -1)]) for c in (found, expected))
     size = np.linalg.norm(want)

@@ -1,7 +1,8 @@
-"""Capabilities of controls from their documents (controllers.md 1, 5), and the best use of a control for an identified machine.
+"""Capabilities of controls by their manuals, and the best use of a control for an identified machine.
 
-`choices` gives the residual errors with each kind of table, judged over the whole volume in both directions of motion, with the best-fit
-rigid motion removed and the numbers rounded as in the control. A limited number of tables is filled greedily by the largest reduction.
+`choices` gives the residual errors with each kind of table over the whole volume in both directions of motion, with the best-fit rigid
+motion removed and the numbers rounded as in the control. If the control limits the number of tables, those with the largest reduction are
+taken first.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Latti
 
 @dataclass(frozen=True, slots=True)
 class ControlModel:
-    """One control.
+    """What the tables of one control can hold.
 
     Attributes
     ----------
     own, cross : str
         Format of own-axis tables; format of cross and product tables; empty for none.
     own_points, cross_points : int
-        Points of a table.
+        Largest number of points of a table.
     both_directions : bool
         Own-axis tables have two columns. Otherwise the control's backlash parameter holds the lost motion.
     tables : int, optional
         Largest number of tables of the ``cross`` format, of which a product takes two; None: unlimited.
     lattice, nodes : str, int
-        Format of a 3-D grid; nodes per axis.
+        Format of a 3-D grid, and its nodes per axis.
     motions : str
         Format of error motions for the control's own kinematic chain.
     lookup : str
-        Argument of all tables but the own-axis ones.
+        Position at which the control looks up all tables but the own-axis ones.
     unit_mm : float
-        Unit of the numbers in the tables.
+        Resolution of the numbers in the tables.
     """
 
     key: str
@@ -111,7 +112,7 @@ CONTROLS: dict[str, ControlModel] = {
 
 
 def control_of(key: str) -> ControlModel:
-    """The control of a key.
+    """Return the control with this key.
 
     Raises
     ------
@@ -145,7 +146,7 @@ class FormatChoice:
 
 
 class FormatJudge:
-    """The identified error field at the nodes at which tables are judged."""
+    """Evaluates tables by the error they leave at the nodes of a volume grid."""
 
     def __init__(self, known: Identified, control: ControlModel, nodes: int = JUDGE_NODES) -> None:
         self.points_mm: F2 = volume_grid(known.machine.stroke_mm, nodes)
@@ -153,7 +154,7 @@ class FormatJudge:
         self._control = control
 
     def left_mm(self, comp: Compensation) -> F1:
-        """Length of the residual error at every node, moving in + and in −, mm, shape (2 n,)."""
+        """Return the length of the residual error at every node, first moving in +, then in −, mm, shape (2 n,)."""
         stored = rounded(comp, self._control.unit_mm)
         parts = []
         for way, field in self._moving.items():
@@ -169,7 +170,7 @@ class FormatJudge:
 
 
 def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple[FormatChoice, ...]:
-    """Every kind of tables that the control can hold, from none to all; one is marked as the best."""
+    """Evaluate every kind of tables that the control can hold, from none to all, and mark the best."""
     judge = FormatJudge(known, control)
     found = [judge.choice("no table", Compensation())]
     if control.own:
@@ -188,7 +189,7 @@ def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple
 
 
 def best_of(found: tuple[FormatChoice, ...]) -> FormatChoice:
-    """The choice marked as the best."""
+    """Return the choice marked as the best."""
     return next(c for c in found if c.best)
 
 
@@ -206,7 +207,7 @@ def _grids(known: Identified, points: int, reference_mm: F1) -> tuple[F1, F1, F1
 
 
 def _own(known: Identified, control: ControlModel, tables: tuple[AxisTable, ...]) -> Compensation:
-    """Own-axis tables with lost motion in their two columns or in the control's backlash parameter."""
+    """Put the lost motion into the two columns of the own-axis tables or into the control's backlash parameter."""
     if control.both_directions:
         return Compensation(tables)
     plain = tuple(replace(t, backward_mm=t.forward_mm) for t in tables)
@@ -214,7 +215,7 @@ def _own(known: Identified, control: ControlModel, tables: tuple[AxisTable, ...]
 
 
 def _crossed(control: ControlModel, build: _Builder, judge: FormatJudge) -> list[FormatChoice]:
-    """Own-axis tables with as many cross tables and products as the control can hold."""
+    """Evaluate own-axis tables with as many cross tables and products as the control can hold."""
     kinds: list[tuple[str, tuple[ProductTable, ...]]] = [("one-axis and cross tables", ())]
     kinds += [("one-axis, cross and product tables", build.offered)] if control.products else []
     out = []
@@ -231,7 +232,7 @@ PAIRS: tuple[Pair, ...] = tuple((a, o) for a in AXES for o in AXES if a != o)
 
 
 class _Builder:
-    """Builds sets of tables that correct every error once. All parts are linear, so each is computed once."""
+    """Builds sets of tables that correct no error twice. Tables are linear in the error, so each part is computed only once."""
 
     def __init__(self, known: Identified, control: ControlModel, reference_mm: F1) -> None:
         self.known, self._control = known, control
@@ -241,7 +242,7 @@ class _Builder:
         self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
 
     def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
-        """Own-axis and cross tables, each on its own grid, for the error that the products leave."""
+        """Combine the products with own-axis and cross tables, each on its own grid, for the error that the products leave."""
         fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
         own = _own(self.known, self._control, tuple(t for t in fine if t.own))
         cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)
@@ -252,7 +253,7 @@ class _Builder:
         return x, y, z
 
     def greedy(self, judge: FormatJudge, offered: tuple[ProductTable, ...], room: int) -> tuple[tuple[ProductTable, ...], tuple[Pair, ...]]:
-        """Add the part with the largest reduction per table until ``room`` tables are used or nothing helps."""
+        """Add the product or cross table with the largest reduction per table until ``room`` tables are used or none helps."""
         products: tuple[ProductTable, ...] = ()
         pairs: tuple[Pair, ...] = ()
         left = float(np.mean(judge.left_mm(self.together(products, pairs)) ** 2))
@@ -272,12 +273,12 @@ class _Builder:
 
 
 def _added_by(product: ProductTable, points_mm: F2) -> F2:
-    """Correction by one product, to be subtracted from the other tables."""
+    """Return the correction by one product, which the other tables need not make."""
     return correction_at(Compensation(products=(product,)), points_mm)
 
 
 def rounded(comp: Compensation, unit_mm: float) -> Compensation:
-    """Corrections rounded to the control's unit; angles are a thousand times finer."""
+    """Round all corrections to the control's resolution, and angles to a thousandth of it (rad)."""
 
     def to(v: F1, unit: float = unit_mm) -> F1:
         return np.asarray(np.round(v / unit) * unit)

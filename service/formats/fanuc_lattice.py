@@ -1,7 +1,7 @@
-"""Fanuc three-dimensional error compensation: a sheet of the nodes (A-79351E p. 3: rectangular grid, trilinear; controllers.md 5.2).
+"""Fanuc three-dimensional error compensation: a sheet of the nodes of a rectangular grid with trilinear interpolation (A-79351E p. 3).
 
-No public manual describes the control's file, parameter numbers or limits. This module writes a sheet for manual entry, in whole detection
-units, X fastest. The interpolation is as documented.
+No public manual describes the control's file, parameter numbers or limits. So this module writes a sheet for manual entry, in whole
+detection units, with X changing fastest.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        There is no 3-D grid or another kind of table, the spacing is unequal, a correction is too large or not zero at the reference.
+        There is no 3-D grid, there are other kinds of tables, the spacing is unequal, or a correction is too large.
     """
     check_kinds(comp, LIMITS, WHAT)
     if comp.lattice is None:
-        raise FormatRefused(f"{WHAT}: there is no grid", NOTHING)
+        raise FormatRefused(f"{WHAT}: there is no 3-D grid", NOTHING)
     positions, values = comp.lattice.position_mm, comp.lattice.correction_mm
     for p in positions:
         check_positions(p, LIMITS, WHAT)

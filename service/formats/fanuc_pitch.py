@@ -1,10 +1,10 @@
-"""Fanuc stored pitch error compensation (controllers.md 5.2): whole numbers from point to point, between ``%`` lines.
+"""Fanuc stored pitch error compensation: whole numbers from point to point, between ``%`` lines.
 
-Point n holds what is added between coordinate (n - ref - 1) and (n - ref) intervals from the reference position, so the sum is zero at the
-reference by construction (B-63980EN p. 100). Rounding: every SUM is rounded and the numbers are differences of the rounded sums, so the
-remainder is carried on and no point is ever off by more than half a unit. Both directions: 3605#0 = 1, the second set of points from 3626,
-3627 = the value at the reference when coming from the other side. Acts after power off, power on and reference return.
-Data identification of the pitch lines (Q1 here, as in the specification) and the sign differ between sources: verify the 10 µm step first.
+Point n holds the units added between (n - ref - 1) and (n - ref) intervals from the reference position, so their sum is zero at the
+reference (B-63980EN p. 100). The SUMS are rounded and the points hold the differences of rounded sums, so no sum is off by more than half a
+unit. For two directions, parameter 3605 bit 0 is 1, 3626 is the first point of the second set, and 3627 the value at the reference when
+approached from the other side. The table acts after power off, power on and reference return. Sources differ about the sign and the data
+identification of the pitch lines (Q1 here): verify the 10 µm step first (docs/reference/formats.md).
 """
 
 from __future__ import annotations
@@ -47,11 +47,14 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        The table is of another kind, the reference is not a point of it, a difference exceeds ``largest_step``, or the points are used up.
+        The table is of another kind, has no point at the reference, or has a difference over ``largest_step``; or the control has too few
+        points.
     """
     check_kinds(comp, LIMITS, WHAT)
     if settings.reference_mm is None:
-        raise FormatRefused(f"{WHAT}: counts from the reference position, and none is given", f"give the reference; {NOTHING}")
+        raise FormatRefused(
+            f"{WHAT}: positions count from the reference position, which is not given", f"give the reference position; {NOTHING}"
+        )
     limits = LIMITS if settings.points is None else FormatLimits(points=settings.points + 1, equidistant=True)
     unit = settings.unit_mm * settings.magnification
     parameters: dict[int, list[str]] = {}
@@ -79,7 +82,9 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         for number, value in texts.items():
             parameters.setdefault(number, []).append(f"A{axis}P{value}")
     if free - 1 > LAST_POINT:
-        raise FormatRefused(f"{WHAT}: points up to {free - 1}, the control has 0 to {LAST_POINT}", f"use a coarser grid; {NOTHING}")
+        raise FormatRefused(
+            f"{WHAT}: the tables need points up to {free - 1}, the control has 0 to {LAST_POINT}", f"use a coarser grid; {NOTHING}"
+        )
     lines = ["%", *(f"N{n:05d}Q1{''.join(v)}" for n, v in sorted(parameters.items())), *points, "%"]
     return (TextFile(NAME, "\n".join(lines) + "\n"),)
 
@@ -97,8 +102,8 @@ def _points(difference: np.ndarray[tuple[int, ...], np.dtype[np.int64]], first: 
     if np.abs(difference).max() > largest:
         k = int(np.abs(difference).argmax())
         raise FormatRefused(
-            f"{WHAT}, table {name}: {difference[k]} from point to point, the control holds ±{largest}",
-            f"more points or a larger magnification; {NOTHING}",
+            f"{WHAT}, table {name}: the correction changes by {difference[k]} units from point to point, the control holds ±{largest}",
+            f"use more points or a larger magnification; {NOTHING}",
         )
     return [f"N{BASE + first + k}Q1P{v}" for k, v in enumerate(difference)]
 
@@ -152,7 +157,10 @@ def _axis_table(file: TextFile, data: _Data, axis: int, settings: FormatSettings
 
     first, last, reference = int(value(FIRST)), int(value(LAST)), int(value(REFERENCE))
     if not (first <= last and first - 1 <= reference <= last and value(INTERVAL) > 0):
-        raise file.wrong(data.parameter[(FIRST, axis)][1], f"points {first} to {last} with {reference} at the reference cannot be")
+        raise file.wrong(
+            data.parameter[(FIRST, axis)][1],
+            f"points {first} to {last}, point {reference} at the reference and interval {value(INTERVAL):g} mm contradict each other",
+        )
     start = 0.0 if settings.reference_mm is None else settings.reference_mm[axis - 1]
     position = start + value(INTERVAL) * (np.arange(first - 1, last + 1, dtype=np.float64) - reference)
     unit = settings.unit_mm * value(MAGNIFICATION)
@@ -166,7 +174,7 @@ def _axis_table(file: TextFile, data: _Data, axis: int, settings: FormatSettings
 
 
 def _sums(file: TextFile, data: _Data, first: int, last: int, reference: int, at_reference: float) -> F1:
-    """Sums of the points, in units, equal to ``at_reference`` at the reference position; one more than there are points."""
+    """Return the sums of the points, one more than there are points, in units; ``at_reference`` is the sum at the reference position."""
     for n in range(first, last + 1):
         if n not in data.point:
             raise file.wrong(1, f"point {n} is missing: the control keeps its old value")

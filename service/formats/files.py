@@ -1,6 +1,4 @@
-"""Files of an export: text files and their numbers, written unambiguously for controls and read with file and line of every mistake; and
-the settings of an export for one machine.
-"""
+"""Text files of an export, their numbers as controls read them, errors that name file and line, and the settings of an export."""
 
 from __future__ import annotations
 
@@ -30,16 +28,16 @@ class TextFile:
         return enumerate(self.text.splitlines(), start=1)
 
     def wrong(self, line: int, what: str, remedy: str = "correct the file; nothing was loaded") -> TableFileError:
-        """An error about one line of this file."""
+        """Return an error about one line of this file, for the caller to raise."""
         return TableFileError(f"{self.name}:{line}: {what}", remedy)
 
     def number(self, line: int, word: str, what: str) -> float:
-        """A finite number in plain notation.
+        """Convert ``word`` to a finite number; ``what`` names it in the message.
 
         Raises
         ------
         TableFileError
-            The text is no such number; the message has file and line.
+            The word is not a finite number; the message has file and line.
         """
         if NUMBER.fullmatch(word) is None or not math.isfinite(float(word)):
             raise self.wrong(line, f"{what} is {word!r}, expected a number")
@@ -47,24 +45,24 @@ class TextFile:
 
 
 def short(value: float, decimals: int) -> str:
-    """Shortest text of the rounded value with at least one decimal, no exponent, no minus zero: ``0.01``, ``-200.0``."""
+    """Return the shortest text of the rounded value with at least one decimal, no exponent, no minus zero: ``0.01``, ``-200.0``."""
     text = f"{round(value, decimals) + 0.0:.{decimals}f}"
     head, _, tail = text.partition(".")
     return f"{head}.{tail.rstrip('0') or '0'}" if float(text) != 0.0 else "0.0"
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Text with a fixed number of decimals, no minus zero: ``0.010``."""
+    """Return the value as text with a fixed number of decimals, no minus zero: ``0.010``."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 
 def whole(value: float, decimals: int) -> str:
-    """Like `short`, but whole numbers without a point: ``100``, ``12.5``."""
+    """Return the text of `short`, but whole numbers without a point: ``100``, ``12.5``."""
     return short(value, decimals).removesuffix(".0")
 
 
 def integers(values: F1, unit: float) -> list[int]:
-    """Values in whole units, rounded to the nearest."""
+    """Return the values in whole units, rounded to the nearest."""
     return [int(v) for v in np.rint(np.asarray(values) / unit)]
 
 
@@ -83,26 +81,28 @@ def increasing(file: TextFile, position: list[float], lines: list[int]) -> None:
 
 @dataclass(frozen=True)
 class FormatSettings:
-    """Attributes.
+    """Settings of an export for one machine.
 
+    Attributes
+    ----------
     reference_mm : (x, y, z), optional
         Position at which the tables must be zero (reference point, home); None: not checked.
     decimals : int
-        Decimals of millimetres. Angles have three more.
+        Decimals of corrections in mm. Angles in rad have three more.
     points : int, optional
         Largest number of points of a table on this machine (Siemens MD38000, MD18342; Fanuc option); None: limit of the format.
     machine : Machine, optional
         Nominal geometry for a control with a kinematic model (ISG).
     axis_names : (str, str, str)
         Siemens machine axes of X, Y, Z.
-    unit_mm, magnification, largest_step : Fanuc
-        Detection unit; parameter 3623; largest number of a point (127, on old series 7).
+    unit_mm, magnification, largest_step : float, int, int
+        Fanuc: detection unit; parameter 3623; largest number that a point can hold (127; 7 on old series).
     first_point : int
         Fanuc: number of the first point that may be used.
     counts_per_mm : float
         Centroid: encoder counts per millimetre.
     power_of_two : bool
-        Heidenhain TNC 4xx: spacing is a power of two times 0.1 µm.
+        The control is a Heidenhain TNC 4xx: the spacing must be a power of two times 0.1 µm.
     """
 
     reference_mm: tuple[float, float, float] | None = None

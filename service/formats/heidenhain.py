@@ -1,8 +1,9 @@
-"""Heidenhain .COM value tables and the .CMA that assigns them (controllers.md 5.3; MANUALplus 620 pp. 716-718, TNC 407 pp. 153-156).
+"""Heidenhain .COM value tables and the .CMA that assigns them (MANUALplus 620 pp. 716-718, TNC 407 pp. 153-156).
 
-One .COM per axis that something depends on: column X, Y or Z holds what that axis gets as a function of the table's axis, so straightness
-and sag are native. BACKLASH holds the own axis' values measured in −. The heading differs per control: export a table from the target
-control and compare. The sign of the values differs between manuals: verify the 10 µm step first.
+There is one .COM file per input axis. Its column X, Y or Z holds the correction of that axis as a function of the input axis, so it also
+takes straightness and sag. Column BACKLASH holds the correction of the input axis itself while it moves in −. The heading differs per
+control: export a table from the target control and compare. The sign of the values differs between manuals: verify the 10 µm step first
+(docs/reference/formats.md).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"
 UNIT_MM = 1e-4
 STEEPEST = 64
-"""TNC 4xx: neighbouring values may differ by the spacing divided by this."""
+"""TNC 4xx: neighbouring values may differ by at most the spacing divided by this."""
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
@@ -46,7 +47,10 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
             if table.directional and not table.own:
                 raise FormatRefused(f"{WHAT}, table {table.name}: only the own axis has a BACKLASH column", f"give the mean; {NOTHING}")
             if not np.array_equal(table.position_mm, mine[0].position_mm):
-                raise FormatRefused(f"{WHAT}: tables over {axis} have different points, one file has one column of them", NOTHING)
+                raise FormatRefused(
+                    f"{WHAT}: the tables over {axis} have different points, but share one column of positions",
+                    f"use the same points; {NOTHING}",
+                )
         _check_positions(mine, settings)
         names[axis] = f"{axis}.COM"
         files.append(TextFile(names[axis], _com(axis, mine, settings)))
@@ -67,11 +71,14 @@ def _check_positions(tables: list[AxisTable], settings: FormatSettings) -> None:
     if np.ptp(units) > 1e-3 or abs(power - round(power)) > 1e-6:
         raise FormatRefused(
             f"{WHAT}: spacing over {tables[0].axis} is {units[0] * UNIT_MM:g} mm, this control wants a power of two times 0.1 µm",
-            f"take 6.5536 mm (2^16) or its multiples; {NOTHING}",
+            f"take 6.5536 mm (2^16 times 0.1 µm), or double or half of it; {NOTHING}",
         )
     steepest = max(float(np.abs(np.diff(v)).max()) for t in tables for v in (t.forward_mm, t.backward_mm))
     if steepest > units[0] * UNIT_MM / STEEPEST:
-        raise FormatRefused(f"{WHAT}: values over {tables[0].axis} change by {steepest * 1e3:.1f} µm from point to point", NOTHING)
+        raise FormatRefused(
+            f"{WHAT}: values over {tables[0].axis} change by {steepest * 1e3:.1f} µm from point to point, more than spacing / {STEEPEST}",
+            NOTHING,
+        )
 
 
 def _com(axis: str, tables: list[AxisTable], settings: FormatSettings) -> str:
@@ -104,13 +111,13 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     for axis, name in sorted(names.items()):
         if name not in by_name:
             assert cma is not None
-            raise cma.wrong(3, f"the table {name} is not there")
+            raise cma.wrong(3, f"the file {name} of the active line is missing")
         tables += _read_com(by_name[name], axis)
     return Compensation(tuple(tables))
 
 
 def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Column names, and rows with line numbers, of a table between BEGIN and [END]."""
+    """Return column names and rows with line numbers of a table between BEGIN and [END]."""
     lines = list(file.lines())
     if not lines or not lines[0][1].startswith("BEGIN "):
         raise file.wrong(1, "the first line is not BEGIN")

@@ -31,7 +31,7 @@ SPACING_DECIMALS = 4
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """``coefficients`` of ``terms`` (mm, rad), and lost motion B of each axis, mm.
+    """The identified errors of a machine: coefficients of error-motion terms (mm, rad), and the lost motion B of each axis, mm.
 
     The deviation while moving in direction s is design @ coefficients − s B/2.
     """
@@ -42,16 +42,16 @@ class Identified:
     lost_motion_mm: Mapping[str, float] = field(default_factory=dict)
 
     def deviation_mm(self, axes_mm: F2) -> F2:
-        """Deviation as mean of both directions, mm, shape (n, 3)."""
+        """Return the mean deviation of both directions, mm, shape (n, 3)."""
         return np.asarray(design(self.machine, self.terms, axes_mm) @ self.coefficients)
 
     def moving_mm(self, axes_mm: F2, direction: int) -> F2:
-        """Deviation while all axes move in + (1) or in − (−1), mm, shape (n, 3)."""
+        """Return the deviation while all axes move in + (1) or in − (−1), mm, shape (n, 3)."""
         lost = np.array([self.lost_motion_mm.get(a, 0.0) for a in AXES])
         return self.deviation_mm(axes_mm) - 0.5 * direction * lost
 
     def motion(self, name: str, position_mm: F1) -> F1:
-        """One of the 18 error motions (without squareness) over positions of its axis, mm or rad."""
+        """Return one of the 18 error motions (without squareness) at positions of its axis, mm or rad."""
         axis = PLACES[name][0]
         mine = [i for i, t in enumerate(self.terms) if t.motion == name]
         points = np.tile(self.machine.centre_mm, (position_mm.size, 1))
@@ -61,7 +61,7 @@ class Identified:
 
 
 def grid_mm(machine: Machine, axis: int, points: int, reference_mm: F1) -> F1:
-    """Equidistant points that cover the stroke and include the reference, as incremental formats need, mm."""
+    """Return equidistant points that cover the stroke and include the reference, as incremental formats need, mm."""
     low, high = machine.stroke_mm[axis]
     reference = float(np.clip(reference_mm[axis], low, high))
     pitch = np.ceil((high - low) / max(1, points - 2) * 10**SPACING_DECIMALS - 1e-6) / 10**SPACING_DECIMALS
@@ -72,7 +72,7 @@ def grid_mm(machine: Machine, axis: int, points: int, reference_mm: F1) -> F1:
 
 
 def line_fit(grid: F1, stroke_mm: F1) -> tuple[F1, F2]:
-    """Sampling positions inside the stroke, and the operator from values there to the best piecewise linear function on a grid.
+    """Return sampling positions inside the stroke, and the matrix from values there to the best piecewise linear function on a grid.
 
     A grid may reach beyond the stroke by part of a cell; a weak penalty on bends extrapolates the function there.
     """
@@ -91,7 +91,7 @@ def line_fit(grid: F1, stroke_mm: F1) -> tuple[F1, F2]:
 
 
 def products_of(known: Identified, grids: Grids, reference_mm: F1) -> tuple[ProductTable, ...]:
-    """All products of rule G as corrections: minus angle over its own axis, times the travel of another axis from the reference."""
+    """Return all products of rule G as corrections: minus an angle over its axis, times the travel of another axis from the reference."""
     masks, unit = lever_masks(known.machine.chain), np.eye(3)
     out = []
     for j, k, c in product(range(3), range(3), range(3)):
@@ -106,7 +106,7 @@ def products_of(known: Identified, grids: Grids, reference_mm: F1) -> tuple[Prod
 
 
 def _sampled(known: Identified, name: str, grid: F1) -> F1:
-    """A motion as the best piecewise linear function on a grid."""
+    """Fit a motion by the best piecewise linear function on a grid."""
     at, operator = line_fit(grid, known.machine.stroke_mm[PLACES[name][0]])
     return np.asarray(operator @ known.motion(name, at))
 
@@ -118,10 +118,10 @@ Values = tuple[F2, F2, F2]
 def table_values(
     known: Identified, field: Callable[[F2], F2], sets: tuple[Grids, ...], reference_mm: F1, *, smooth: bool = False
 ) -> tuple[Values, ...]:
-    """The best nine one-axis tables for minus a field, on several sets of grids, zero at the reference. Linear in the field.
+    """Return the nine one-axis tables that best correct a field, for each set of grids; zero at the reference and linear in the field.
 
-    ``field``: positions (n, 3) to values (n, 3), mm. ``smooth``: the field consists of the terms, so its main effects are polynomials and
-    as many positions as coefficients suffice.
+    ``field``: positions (n, 3) to deviations (n, 3), mm. ``smooth``: the field consists of the terms of ``known``, so its main effects are
+    polynomials, for which as many positions as coefficients suffice.
     """
     stroke = known.machine.stroke_mm
     fits = [[line_fit(grids[a], stroke[a]) for grids in sets] for a in range(3)]
@@ -146,15 +146,15 @@ def table_values(
 
 
 def _chebyshev(stroke_mm: F1, n: int) -> F1:
-    """Chebyshev nodes on a stroke for a polynomial with n coefficients."""
+    """Return the Chebyshev nodes on a stroke for a polynomial with n coefficients."""
     return np.asarray(stroke_mm.mean() - 0.5 * np.ptp(stroke_mm) * np.cos((np.arange(n) + 0.5) * np.pi / n))
 
 
 def axis_tables(known: Identified, grids: Grids, values: Values) -> tuple[AxisTable, ...]:
-    """Nine tables from values; own-axis tables have both directions.
+    """Build nine tables from values; own-axis tables have both directions.
 
-    Forward columns are zero at the reference, which is approached in +. An axis with lost motion B stands B further while moving in −, so
-    its backward column is the forward one minus B.
+    Forward columns are zero at the reference, which is approached in +. While an axis with lost motion B moves in −, it stands B further
+    in +, so its backward column is the forward one minus B.
     """
     out = []
     for a, axis in enumerate(AXES):
@@ -166,7 +166,7 @@ def axis_tables(known: Identified, grids: Grids, values: Values) -> tuple[AxisTa
 
 
 def lattice_of(known: Identified, grids: Grids, reference_mm: F1) -> Lattice:
-    """The best 3-D grid, zero at the reference. Every term is fitted along its own axis, the only one along which it bends (rule G)."""
+    """Return the best 3-D grid, zero at the reference. Each term is fitted along its own axis; along the others it is linear (rule G)."""
     counts = tuple(g.size for g in grids)
     total: F2 = np.zeros((int(np.prod(counts)), 3))
     for a in range(3):
@@ -183,7 +183,7 @@ def lattice_of(known: Identified, grids: Grids, reference_mm: F1) -> Lattice:
 
 
 def motions_of(known: Identified, grids: Grids) -> Motions:
-    """All identified error motions. They hold for the measured tool even if single motions are not observable."""
+    """Return all identified error motions. Together they hold for the measured tool, even if single motions are not observable."""
     curves = {}
     for name, (axis, _) in PLACES.items():
         if any(t.motion == name for t in known.terms):

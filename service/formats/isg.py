@@ -1,8 +1,9 @@
-"""Beckhoff/ISG volumetric CSV (controllers.md 5.4): ISO 230-1 error motions per axis. The neutral exchange format.
+"""Beckhoff/ISG volumetric CSV: ISO 230-1 error motions per axis. The neutral exchange format.
 
-Blank-separated columns under a heading; ``//`` comment; ``#`` begins a new heading. Arguments mm, errors mm and rad. The kernel computes
-the correction by its own chain. Its parameter ``negate`` inverts single axes: verify the 10 µm step first. Squareness (C0Y, B0Z, A0Z) is
-one row without argument and counts travel from the start of the stroke here; another zero is a constant shift of the whole map.
+Blank-separated columns stand under a heading; ``//`` begins a comment, and ``#`` a block with a new heading. Positions are in mm, errors in
+mm and rad. The kernel computes the correction by its own kinematic chain. Its parameter ``negate`` inverts single axes: verify the 10 µm
+step first (docs/reference/formats.md). Squareness (C0Y, B0Z, A0Z) is one row without a position. Its effect here is zero at the start of
+the stroke; another zero would only shift the whole map.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from abbe.service.formats.model import AxisCurve, Compensation, Motions
 from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_positions, check_size, check_table
 
 LIMITS = FormatLimits(points=2000, directional=False, cross=True, motions=True, zero_at_reference=False)
-SIGN = SignRule(1, False, "by manual", False, "the error itself; the kernel can turn it over (parameter negate)")
+SIGN = SignRule(1, False, "by manual", False, "the error itself; the kernel can invert it (parameter negate)")
 WHAT = "ISG volumetric CSV"
 NAME = "volcomp.csv"
 ANGLE_DECIMALS = 3
@@ -33,7 +34,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """
     check_kinds(comp, LIMITS, WHAT)
     if comp.motions is not None and comp.tables:
-        raise FormatRefused(f"{WHAT}: error motions and tables at once", f"give one of them; {NOTHING}")
+        raise FormatRefused(f"{WHAT} cannot hold both error motions and tables", f"give one of them; {NOTHING}")
     curves = _curves(comp, settings)
     lines = ["// error motions, actual - nominal; arguments mm, errors mm and rad"]
     square = {} if comp.motions is None else {n: v for n, v in comp.motions.squareness_rad.items() if v}
@@ -48,7 +49,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def _curves(comp: Compensation, settings: FormatSettings) -> dict[str, AxisCurve]:
-    """Error motions by name, in ISO order."""
+    """Return the curves to write by name, in ISO order."""
     if comp.motions is not None:
         found = {n: AxisCurve(c.axis, c.position_mm, SIGN.to_file(-c.value, c.position_mm)) for n, c in comp.motions.curves.items()}
     else:
@@ -64,7 +65,9 @@ def _block(axis: str, mine: dict[str, AxisCurve], settings: FormatSettings) -> l
     check_positions(position, LIMITS, f"{WHAT}, {axis}")
     for name, curve in mine.items():
         if not np.array_equal(curve.position_mm, position):
-            raise FormatRefused(f"{WHAT}: motions of {axis} have different points, one block has one column of them", NOTHING)
+            raise FormatRefused(
+                f"{WHAT}: the motions of {axis} have different points, but share one column of positions", f"use the same points; {NOTHING}"
+            )
         check_size(position, curve.value, LIMITS, f"{WHAT}, {name}")
     decimals = [settings.decimals + (ANGLE_DECIMALS if PLACES[n][1] > 2 else 0) for n in mine]
     lines = [" ".join([axis, *mine])]
@@ -74,18 +77,18 @@ def _block(axis: str, mine: dict[str, AxisCurve], settings: FormatSettings) -> l
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """Read the error motions of a file; ``settings.machine`` is the chain configured in the kernel.
+    """Read the error motions of a file; ``settings.machine`` has the kinematic chain that is configured in the kernel.
 
     Raises
     ------
     TableFileError
-        A heading has an unknown name or two arguments (2-D tables are not supported), a row has another length, or positions do not
-        increase.
+        A heading has an unknown name or two position columns (2-D tables are not supported), a row has another length, or positions do
+        not increase.
     FormatRefused
-        No machine was given; the correction needs its chain.
+        No machine was given.
     """
     if settings.machine is None:
-        raise FormatRefused(f"{WHAT}: the control works with its machine's chain, and none is given", "give the machine")
+        raise FormatRefused(f"{WHAT}: the correction depends on the machine's kinematic chain, and no machine is given", "give the machine")
     file = files[0]
     curves: dict[str, AxisCurve] = {}
     square: dict[str, float] = {}
@@ -100,7 +103,7 @@ Row = tuple[int, list[str]]
 
 
 def _blocks(file: TextFile) -> list[tuple[Row, list[Row]]]:
-    """Blocks of a heading with its rows."""
+    """Split the file into headings with their rows."""
     blocks: list[tuple[Row, list[Row]]] = []
     fresh = True
     for line, text in file.lines():
@@ -120,7 +123,8 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
     arguments = [n for n in names if n in AXES]
     strange = [n for n in names if n not in AXES and n not in PLACES and n not in SQUARENESS]
     if strange or len(arguments) > 1 or len(set(names)) != len(names):
-        raise file.wrong(line, f"heading {' '.join(names)}: {strange[0] if strange else 'more than one argument'} cannot be read")
+        problem = f"{strange[0]} is unknown" if strange else "two position columns or a repeated name"
+        raise file.wrong(line, f"heading {' '.join(names)}: {problem}")
     again = [n for n in names if n in curves or n in square]
     if again or not rows:
         raise file.wrong(line, f"{again[0]} appears in two blocks" if again else "there are no rows under this heading")
@@ -130,7 +134,7 @@ def _take(file: TextFile, head: Row, rows: list[Row], curves: dict[str, AxisCurv
     table = np.array([[file.number(n, w, c) for w, c in zip(cells, names, strict=True)] for n, cells in rows])
     if not arguments:
         if len(rows) != 1 or not set(names) <= set(SQUARENESS):
-            raise file.wrong(rows[0][0], "a table without an argument has one row, of C0Y, B0Z, A0Z")
+            raise file.wrong(rows[0][0], "a block without a position column must have one row, with only C0Y, B0Z or A0Z")
         square.update({n: -float(v) for n, v in zip(names, SIGN.from_file(table[0], np.zeros(len(names))), strict=True)})
         return
     axis = arguments[0]

@@ -1,9 +1,9 @@
-"""LinuxCNC COMP_FILE, type 0 and 1 (controllers.md 1.4): bare triplets "nominal forward reverse", one file per joint.
+"""LinuxCNC COMP_FILE, type 0 and 1: bare triplets "nominal forward reverse", one file per joint.
 
 The control reads with sscanf and stops WITHOUT AN ERROR at the first line that is not three numbers: a comment, a heading or a blank line
-in front yields an empty table. Lines whose nominal does not increase are skipped. So the writer writes triplets only, and the reader
-refuses what the control would silently skip. BACKLASH of the ini file has no effect on a joint with a table, so the two columns hold the
-lost motion.
+at the start yields an empty table. It skips lines whose nominal does not increase. So the writer writes triplets only, and the reader
+refuses every line that the control would silently skip. BACKLASH of the ini file has no effect on a joint with a table, so the two columns
+hold the lost motion.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SIGNS = {
     1: SignRule(-1, False, "verified by execution", True, "what is added to the motor's command: −e"),
     0: SignRule(1, True, "verified by execution", True, "the position that was reached: nominal + e"),
 }
-"""By the type of the file."""
+"""Sign rule by COMP_FILE_TYPE."""
 POSITION_DECIMALS = 6
 
 
@@ -68,7 +68,7 @@ def _read_one(file: TextFile, kind: int) -> AxisTable:
         rows.append([file.number(line, w, n) for w, n in zip(cells, ("the position", "forward", "reverse"), strict=True)])
         lines.append(line)
     if not rows:
-        raise file.wrong(1, "the file is empty: no compensation at all")
+        raise file.wrong(1, "the file is empty: LinuxCNC would not compensate at all")
     if len(rows) > LIMITS.points:
         raise file.wrong(lines[LIMITS.points], f"LinuxCNC takes {LIMITS.points} points and leaves out the rest")
     increasing(file, [r[0] for r in rows], lines)

@@ -1,8 +1,9 @@
-"""Volumetric compensation as a network of stock LinuxCNC HAL components (controllers.md 1.5): lincurve, mult2, sum2.
+"""Volumetric compensation as a network of stock LinuxCNC HAL components: lincurve, mult2, sum2.
 
-A lincurve holds 2 to 16 points, ends held; tables can be changed live with ``halcmd setp``. One curve per table, two and a mult2 per
-product. The sums end in signals ``drive-x`` .. (what a servo gets); feedback stays before the sum. No directions: lost motion belongs in
-COMP_FILE. The file is loaded instead of the lines that tie motor-pos-cmd to motor-pos-fb, after motion-controller's addf.
+A table is one lincurve, a product two of them and a mult2. A lincurve has 2 to 16 points and holds its end values beyond them;
+``halcmd setp`` changes it live. The sums end in the signals ``drive-x`` and so on, the commands of the servos; motor-pos-fb gets the
+command before the sum. The network does not know the direction of motion, so lost motion belongs in COMP_FILE. The file replaces the lines
+that connect motor-pos-cmd to motor-pos-fb, and is loaded after ``addf motion-controller``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ WHAT = "LinuxCNC HAL network"
 NAME = "abbe.hal"
 JOINTS = {"X": 0, "Y": 1, "Z": 2}
 ANGLE_DECIMALS = 3
-"""Additional decimals of an angle, which is multiplied by up to a metre."""
+"""Additional decimals of an angle, which acts at a lever of up to a metre."""
 _TABLE = re.compile(r"t-([xyz])([xyz])")
 _PART = re.compile(r"(a|l)-([xyz])([xyz])([xyz])")
 
@@ -44,7 +45,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        There are a grid, error motions, a direction-dependent table, or more than 16 points.
+        There is a grid, an error motion, a direction-dependent table, or a table with more than 16 points.
     """
     check_kinds(comp, LIMITS, WHAT)
     curves: list[tuple[str, str, AxisCurve, int]] = []
@@ -91,7 +92,7 @@ def _hal(comp: Compensation, curves: list[tuple[str, str, AxisCurve, int]]) -> l
 
 
 def _summed(axis: str, parts: list[str]) -> list[str]:
-    """Motor command plus all parts of one axis, two at a time."""
+    """Return the lines that add all corrections of one axis to its motor command, one sum2 each."""
     a, joint = axis.lower(), JOINTS[axis]
     source = f"net abbe-cmd-{a} joint.{joint}.motor-pos-cmd => joint.{joint}.motor-pos-fb s-{a}0.in0"
     lines = [source]
@@ -136,7 +137,7 @@ def _take(net: _Network, file: TextFile, line: int, text: str) -> None:
     if cells[:2] == ["loadrt", "lincurve"] and len(cells) == 4:
         names, sizes = cells[2].removeprefix("names=").split(","), cells[3].removeprefix("personality=").split(",")
         if len(names) != len(sizes) or not all(s.isdigit() and 2 <= int(s) <= LIMITS.points for s in sizes):
-            raise file.wrong(line, f"names and personality do not belong together, or a curve has not 2 to {LIMITS.points} points")
+            raise file.wrong(line, f"names and personality differ in length, or a curve does not have 2 to {LIMITS.points} points")
         net.points |= {n: int(s) for n, s in zip(names, sizes, strict=True)}
     elif cells[:1] == ["addf"] and len(cells) == 3:
         net.running.add(cells[1])
@@ -145,7 +146,7 @@ def _take(net: _Network, file: TextFile, line: int, text: str) -> None:
     elif cells[:1] == ["net"] and len(cells) > 3:
         net.wired |= {w.partition(".")[0] for w in cells[3:] if w.endswith((".in", ".in0", ".in1", ".out"))} | {cells[2].partition(".")[0]}
     elif cells[:1] != ["loadrt"]:
-        raise file.wrong(line, f"{text.strip()!r} is not a line of such a network")
+        raise file.wrong(line, f"{text.strip()!r} is not a line of a network written by Abbe")
 
 
 def _curve(net: _Network, file: TextFile, name: str) -> AxisCurve:
@@ -160,7 +161,7 @@ def _curve(net: _Network, file: TextFile, name: str) -> AxisCurve:
             if which == "x":
                 lines.append(net.values[key][1])
     if name not in net.running or name not in net.wired:
-        raise file.wrong(1, f"{name} is not run (addf) or not wired (net): it would do nothing")
+        raise file.wrong(1, f"curve {name} is not run (addf) or not wired (net): it would do nothing")
     increasing(file, found["x"], lines)
     match = _TABLE.fullmatch(name) or _PART.fullmatch(name)
     if match is None:

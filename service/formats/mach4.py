@@ -1,6 +1,7 @@
-"""Mach4 screw map as a sheet for manual entry in its Machine Calibration plugin (controllers.md 5.6), which reads no file.
+"""Mach4 screw map as a sheet for manual entry in its Machine Calibration plugin, which reads no file.
 
-Start (most negative), length, equidistant points, error = expected − actual at each; separate values for + and − since build 4780.
+The sheet has the start (most negative end), the length, and error = expected − actual at equidistant points. Mach4 takes separate values
+for + and − since build 4780.
 """
 
 from __future__ import annotations

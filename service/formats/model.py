@@ -84,7 +84,7 @@ class ProductTable:
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Corrections (nx, ny, nz, 3), mm, at the nodes of a 3-D grid; trilinear between them."""
+    """Corrections at the nodes of a 3-D grid, mm, shape (nx, ny, nz, 3); trilinear between nodes."""
 
     position_mm: tuple[F1, F1, F1]
     correction_mm: F4
@@ -99,7 +99,7 @@ class Motions:
     squareness_rad: Mapping[str, float]
 
     def correction_at(self, axes_mm: F2) -> F2:
-        """Minus the deviation of rule G, shape (n, 3); squareness counts travel from the start of the stroke."""
+        """Return minus the deviation by rule G, mm, shape (n, 3); squareness counts travel from the start of the stroke."""
         values = np.zeros((axes_mm.shape[0], 3, 6))
         for name, curve in self.curves.items():
             axis, component = PLACES[name]
@@ -111,9 +111,9 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """The sum of all tables.
+    """All tables of a machine; the control adds up their corrections.
 
-    ``lost_motion_mm``: the control's backlash parameter per axis: it adds nothing while the axis moves in +, and −B in −.
+    ``lost_motion_mm``: the control's backlash parameter B per axis; it adds nothing while the axis moves in +, and −B while it moves in −.
     """
 
     tables: tuple[AxisTable, ...] = ()
@@ -144,7 +144,7 @@ class Compensation:
 
 
 def correction_at(comp: Compensation, axes_mm: F2, direction: F2 | None = None, *, lookup: Lookup = "command") -> F2:
-    """Correction that a control adds to commanded positions; the reference for every format.
+    """Return the correction that a control adds to commanded positions; every format must reproduce it.
 
     Parameters
     ----------

@@ -131,7 +131,7 @@ FORMATS: dict[str, Format] = {
 
 
 def format_of(key: str) -> Format:
-    """The format of a key.
+    """Return the format with this key.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Rules of every format, checked before anything is written: limits of the control, and the sign (controllers.md 5.7).
+"""Rules of every format, checked before a file is written: limits of the control, and the sign.
 
 Sign: e = actual − nominal. A number in a file is ``per_error`` times e, plus the nominal position if the control expects the reached
 position. Each format states its `SignRule`; no other code depends on these signs.
@@ -24,7 +24,11 @@ SPACING_TOLERANCE_MM = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class FormatLimits:
-    """Limits of a format. ``points``: per table; ``directional``: two directions are supported; ``size_mm``: largest absolute number."""
+    """Limits of a format.
+
+    ``points``: largest number per table; ``directional``: a table may differ between the directions of motion; ``size_mm``: largest
+    absolute correction; ``own`` to ``motions``: whether the format holds this kind of table.
+    """
 
     points: int
     equidistant: bool = False
@@ -53,7 +57,7 @@ def check_kinds(comp: Compensation, limits: FormatLimits, what: str) -> None:
     pairs = [t.name for t in comp.tables] + [p.name for p in comp.products]
     twice = next((n for n in pairs if pairs.count(n) > 1), None)
     if twice is not None:
-        raise FormatRefused(f"{what}: two tables {twice}", f"add them up; {NOTHING}")
+        raise FormatRefused(f"{what}: there are two tables {twice}", f"add them up; {NOTHING}")
     kinds = (
         (limits.products, bool(comp.products), "products of two tables"),
         (limits.lattice, comp.lattice is not None, "a 3-D grid"),
@@ -73,20 +77,22 @@ def check_table(table: AxisTable, limits: FormatLimits, what: str, reference_mm:
     Raises
     ------
     FormatRefused
-        The message names limit, place and excess.
+        The message names the limit, and where the table exceeds it.
     """
     name = f"{what}, table {table.name}"
     check_positions(table.position_mm, limits, name)
     for values in (table.forward_mm, table.backward_mm):
         check_size(table.position_mm, values, limits, name)
     if table.directional and not limits.directional:
-        raise FormatRefused(f"{name}: the format knows no direction, and the two directions differ", f"give the mean of both; {NOTHING}")
+        raise FormatRefused(
+            f"{name}: the two directions of motion differ, and the format holds only one column", f"give the mean of both; {NOTHING}"
+        )
     if reference_mm is not None and limits.zero_at_reference:
         here = float(np.interp(reference_mm[AXES.index(table.axis)], table.position_mm, table.forward_mm))
         if abs(here) > 0.5 * unit_mm + 1e-9:
             at = reference_mm[AXES.index(table.axis)]
             raise FormatRefused(
-                f"{name}: {here * 1e3:+.3f} µm at the reference ({table.axis} {at:g}), must be zero there", f"shift the table; {NOTHING}"
+                f"{name}: {here * 1e3:+.3f} µm at the reference ({table.axis} {at:g}), where it must be zero", f"shift the table; {NOTHING}"
             )
 
 
@@ -96,7 +102,7 @@ def check_positions(position_mm: F1, limits: FormatLimits, name: str) -> None:
     Raises
     ------
     FormatRefused
-        One of them is wrong.
+        The number is outside the limit, positions do not increase, or the spacing is unequal.
     """
     n = position_mm.size
     if not 2 <= n <= limits.points:
@@ -119,7 +125,7 @@ def check_size(position_mm: F1, values: F1, limits: FormatLimits, name: str) -> 
         The message names place and size.
     """
     if not np.isfinite(values).all():
-        raise FormatRefused(f"{name}: holds values that are not numbers", f"check the solution; {NOTHING}")
+        raise FormatRefused(f"{name}: the table holds values that are not numbers", f"check the solution; {NOTHING}")
     k = int(np.argmax(np.abs(values)))
     if abs(values[k]) > limits.size_mm:
         raise FormatRefused(
@@ -146,11 +152,11 @@ class SignRule:
     text: str
 
     def to_file(self, correction: F1, position_mm: F1) -> F1:
-        """Numbers of a file for corrections at positions of its axis."""
+        """Convert corrections at positions of an axis to numbers of a file, mm."""
         value = -self.per_error * np.asarray(correction, dtype=np.float64)
         return value + position_mm if self.adds_position else value
 
     def from_file(self, number: F1, position_mm: F1) -> F1:
-        """Corrections from numbers of a file."""
+        """Convert numbers of a file to corrections, mm."""
         value = np.asarray(number, dtype=np.float64)
         return -self.per_error * (value - position_mm if self.adds_position else value) + 0.0

@@ -27,19 +27,21 @@ class Assignments:
     line: dict[tuple[str, tuple[str, ...]], int] = field(default_factory=dict)
 
     def number(self, name: str, *index: str) -> float:
-        """One number; raises `TableFileError` if it is missing or invalid."""
+        """Return one number; raise `TableFileError` if it is missing or invalid."""
         key = (name, index)
         if key not in self.value:
-            raise self.file.wrong(1, f"${name}[{','.join(index)}] is missing: the control would keep what it had")
+            raise self.file.wrong(1, f"${name}[{','.join(index)}] is missing: the control keeps its old value")
         return self.file.number(self.line[key], self.value[key], f"${name}[{','.join(index)}]")
 
     def values(self, name: str, *index: str, places: int = 1) -> F1:
-        """All numbered points 0, 1, ... of a table; index ``place`` of the variable is the point's number.
+        """Return all numbered points 0, 1, ... of a table.
+
+        ``index`` holds the variable's other indices; the point's number is the index at ``places`` (from 0).
 
         Raises
         ------
         TableFileError
-            A point between the first and the last is missing.
+            A point is missing.
         """
         found: dict[int, float] = {}
         for (variable, indices), text in self.value.items():
@@ -85,7 +87,7 @@ def parse(file: TextFile, name: str) -> Assignments:
 
 
 def grid(found: Assignments, count: int, step: float, first: float, last: float, end_key: tuple[str, str]) -> F1:
-    """Positions of equidistant points, checked against the stated end; ``end_key``: variable and index of the end, for the message.
+    """Return equidistant positions, checked against the stated end; ``end_key``: variable and index of the end, for the message.
 
     Raises
     ------
@@ -94,14 +96,12 @@ def grid(found: Assignments, count: int, step: float, first: float, last: float,
     """
     line = found.line.get((end_key[0], tuple(end_key[1].split(","))), 1)
     if not step > 0 or abs(first + (count - 1) * step - last) > 1e-6 * max(1.0, abs(last), count):
-        raise found.file.wrong(
-            line, f"{count} points from {first:g} in steps of {step:g} mm do not end at {last:g}: positions are not those"
-        )
+        raise found.file.wrong(line, f"{count} points from {first:g} in steps of {step:g} mm do not end at {last:g} mm, as the file states")
     return np.asarray(first + step * np.arange(count, dtype=np.float64))
 
 
 def step_of(position_mm: F1, name: str) -> float:
-    """Step that reproduces a grid with the written decimals.
+    """Return the step that reproduces a grid with the decimals of the file.
 
     Raises
     ------
@@ -111,6 +111,7 @@ def step_of(position_mm: F1, name: str) -> float:
     step = round(float(np.ptp(position_mm)) / (position_mm.size - 1), POSITION_DECIMALS)
     if abs(position_mm[0] + step * (position_mm.size - 1) - position_mm[-1]) > 1e-6:
         raise FormatRefused(
-            f"{name}: the step {np.ptp(position_mm) / (position_mm.size - 1)!r} mm is not a whole number of nanometres", NOTHING
+            f"{name}: the step {np.ptp(position_mm) / (position_mm.size - 1)!r} mm is not a whole number of nanometres",
+            f"choose another grid; {NOTHING}",
         )
     return step

@@ -1,8 +1,8 @@
-"""Siemens sag and angularity compensation, $AN_CEC (controllers.md 5.1): any axis from any axis, pairs for the two directions, products.
+"""Siemens sag and angularity compensation, $AN_CEC: any axis from any axis, pairs for the two directions, products.
 
 Directions: two tables with $AN_CEC_DIRECTION 1 and -1. Products: $AN_CEC_MULT_BY_TABLE[t] = n multiplies table t by table n (index n - 1).
-The manual's grid example (6FC5397-1BP40-3BA1 p. 259) counts the product alone, and so does this module; the factor table must not act by
-itself: its evaluation is switched off ($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first.
+As in the manual's grid example (6FC5397-1BP40-3BA1 p. 259), only the product acts; the factor table by itself is switched off
+($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first (docs/reference/formats.md).
 Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the command.
 """
 
@@ -28,7 +28,9 @@ ANGLE_DECIMALS = 3
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """One $AN_CEC table: curve (numbers as in the file), output, direction, table of its factor (0: none), whether it is only a factor."""
+    """One $AN_CEC table. ``curve``: numbers as in the file; ``times``: number of the table that multiplies it, from 1 (0: none);
+    ``factor``: it only multiplies another table.
+    """
 
     curve: AxisCurve
     output: str
@@ -89,8 +91,8 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     Raises
     ------
     TableFileError
-        A line is of another kind, a point is missing, the end does not fit step and count, an axis is not AX1 to AX3, or the table of a
-        factor is missing.
+        A line is of another kind, a point is missing, the end does not fit step and count, an axis is not AX1 to AX3, or a factor table
+        is missing.
     """
     found = parse(files[0], "NC_CEC")
     numbers = sorted({int(i[0]) for v, i in found.value if v == "AN_CEC" and i[0].isdigit()})
@@ -104,7 +106,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
             other = tables.get(table.times - 1)
             if other is None:
                 line = found.line[("AN_CEC_MULT_BY_TABLE", (str(t),))]
-                raise found.file.wrong(line, f"table {t} is multiplied by table number {table.times}, which is not there")
+                raise found.file.wrong(line, f"table {t} is multiplied by table number {table.times}, which is missing")
             angle = AxisCurve(table.curve.axis, table.curve.position_mm, SIGN.from_file(table.curve.value, table.curve.position_mm))
             products.append(ProductTable(table.output, angle, other.curve))
         elif not table.factor:
@@ -114,7 +116,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def _both(axis: str, output: str, parts: list[tuple[int, AxisCurve]]) -> AxisTable:
-    """Sum of all tables of one pair of axes on one grid, for both directions."""
+    """Add up all tables of one pair of axes on one grid, for both directions."""
     position = parts[0][1].position_mm
     there, back = np.zeros(position.size), np.zeros(position.size)
     for way, curve in parts:

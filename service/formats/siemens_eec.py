@@ -1,7 +1,8 @@
-"""Siemens encoder (leadscrew) error compensation, $AA_ENC_COMP (controllers.md 5.1): one equidistant table per axis, no directions.
+"""Siemens encoder (leadscrew) error compensation, $AA_ENC_COMP: one equidistant table per axis, for both directions of motion.
 
-Load with MD32700 = 0, then set it to 1 and reference the axis; inactive until then. The control neither limits nor monitors the size.
-The table must be zero at the reference point. Lost motion that does not depend on place goes into MD32450 (backlash), by hand.
+Load with MD32700 = 0, then set it to 1 and reference the axis; the table is inactive until then. The control neither limits nor monitors
+the size of a correction. The table must be zero at the reference point. A lost motion that is constant along the axis goes into MD32450
+(backlash), by hand.
 """
 
 from __future__ import annotations

@@ -66,12 +66,12 @@ TOO_MANY = np.arange(300.0)
 REFUSED = [
     ("linuxcnc-1", _table(TOO_MANY, np.zeros(300)), TOLD, "300 points, the control holds 2 to 256"),
     ("linuxcnc-hal", _table(np.arange(17.0), np.zeros(17)), TOLD, "2 to 16"),
-    ("linuxcnc-hal", GOOD, TOLD, "knows no direction"),
-    ("siemens-eec", GOOD, TOLD, "knows no direction"),
+    ("linuxcnc-hal", GOOD, TOLD, "holds only one column"),
+    ("siemens-eec", GOOD, TOLD, "holds only one column"),
     ("siemens-eec", _table(np.array([0.0, 1.0, 3.0]), np.zeros(3)), TOLD, "equal distances"),
     ("siemens-eec", _table(P, V), replace(TOLD, points=2), "holds 2 to 2"),
     ("siemens-eec", _table(P, V + 0.001), TOLD, r"\+1\.000 µm at the reference"),
-    ("linuxcnc-1", _table(P, V + 0.001), TOLD, "must be zero there"),
+    ("linuxcnc-1", _table(P, V + 0.001), TOLD, "where it must be zero"),
     ("linuxcnc-1", _table(P[::-1], V), TOLD, "do not increase"),
     ("linuxcnc-1", _table(P, np.array([0.0, np.nan, 0.0])), TOLD, "not numbers"),
     ("linuxcnc-1", _table(P, 1000.0 * V), TOLD, "the largest allowed is 1 mm"),
@@ -104,7 +104,7 @@ MISTAKES = [
     (_times(25.4), "mm were taken for inches"),
     (Compensation((replace(GOOD.tables[0], forward_mm=V - 0.003, backward_mm=V),)), "directions are exchanged"),
     (Compensation((replace(GOOD.tables[0], axis="Y", output="Y"),)), "tables of X and Y are exchanged"),
-    (_times(1.3), "other tables than expected"),
+    (_times(1.3), "not the expected ones"),
 ]
 
 
