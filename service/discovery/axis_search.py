@@ -26,7 +26,7 @@ CHANCE = 1e-3
 
 @dataclass(frozen=True)
 class _Scatter:
-    """Scatter of repeated visits with each run's mean free: ``sd_mm``, and the variance inflation ``long`` of sums of neighbours."""
+    """Scatter of repeated visits about each run's mean: ``sd_mm``, and the variance inflation ``long`` of sums of correlated neighbours."""
 
     sd_mm: float
     long: float
@@ -35,7 +35,7 @@ class _Scatter:
 def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
     """Search a test of one axis for a drift of its repeats, and the rest for effects of the catalogue.
 
-    A named effect must exceed the scatter of the repeats, whose noise needs no model; otherwise the result of `axis_drift` stands.
+    An effect must exceed the scatter of the repeats, which needs no noise model; otherwise the result of `axis_drift` stands.
     """
     drift = axis_drift(case)
     drifts = drift_at(case) if drift is not None and drift.verdict == "named" else {}
@@ -61,7 +61,7 @@ def _without(case: Case, drifts: dict[str, F1]) -> Case:
 
 
 def _combined(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, F1], table: tuple[Significance, ...]) -> Discovery:
-    """Drift and the other named effects as one finding; "before" is the present simulation of the measured readings."""
+    """Join the drift and the other named effects to one finding; its residuals "before" are those of the readings with the drift."""
     problem = whiten(case, baseline_of(case))
     before = predictions(problem, solve(problem, ()))
     fitted_setups = {r.path.setup for r in problem.runs}
@@ -108,9 +108,9 @@ def _stacked(case: Case) -> tuple[F1, F1, F1]:
 
 
 def _exceeds_scatter(case: Case, found: Discovery, scatter: _Scatter) -> bool:
-    """Whether the finding moves the places by more than their repeats allow, and every named effect exceeds its own U.
+    """Check whether the finding shifts positions by more than their repeats allow, and every named effect exceeds its own U.
 
-    Named effects count by what they change, a lack of fit by what remains.
+    The shift is the change by the named effects; without any, the remaining residual.
     """
     if any(abs(e.strength) <= 2.0 * e.u_strength for e in found.effects):
         return False
@@ -127,7 +127,7 @@ def _exceeds_scatter(case: Case, found: Discovery, scatter: _Scatter) -> bool:
 
 
 def _scale(case: Case) -> tuple[Fitted, ...]:
-    """Scale of the axis, um/m, which the present simulation fits and no search looks for.
+    """Fit the scale of the axis, um/m. The search does not look for it, because the present model contains it.
 
     Least squares, together with a zero of every run and a lost motion that varies along the axis.
     """

@@ -38,8 +38,8 @@ LOST_MOTION = "backlash"
 class ReferenceSolution:
     """The solution that a campaign is compared with, and the comparison, which takes a second or two.
 
-    ``compare`` takes the campaign, or one joined with it, and the effects that a search just found in it. A failed comparison returns the
-    reason in ``trouble``.
+    ``compare`` takes the campaign, alone or joined with a later one, and the effects that a search just found in it. If it fails, its
+    result has the reason in ``trouble``.
     """
 
     number: int
@@ -50,7 +50,7 @@ class ReferenceSolution:
 class _Before:
     """A solution, the CRC of the table that acted while it was measured, and the effects subtracted from its readings.
 
-    ``taken``: labels from the model book's ``version``; ``version`` None: no book was used.
+    ``taken``: labels of these effects; ``version``: their version of the model book, None without one.
     """
 
     number: int
@@ -61,9 +61,9 @@ class _Before:
 
 
 def reference_solution(store: Store, campaign: Campaign) -> ReferenceSolution | None:
-    """The last comparable solution of the same machine from an earlier stored campaign; None without one.
+    """Return the last comparable solution of the same machine from an earlier stored campaign; None if there is none.
 
-    It must have the same geometry and hold its covariance. The tables that acted during both measurements must be known or equal.
+    It must be for the same geometry and contain its covariance. The compensation tables of both measurements must be known or equal.
     """
     for record in _earlier(store, campaign):
         try:
@@ -120,12 +120,12 @@ def _acting(tables: Sequence[RunTable]) -> int | None:
     """
     found = {one.acting_crc for one in tables}
     if len(found) > 1:
-        raise TableMismatch("these runs were not all measured with one table")
+        raise TableMismatch("the runs were measured with different compensation tables")
     return next(iter(found), None)
 
 
 def _tables_between(store: Store, campaign: Campaign, before: _Before) -> RemovedTable | None:
-    """Correction that turns the readings into those of the machine with the earlier table; None if both tables are the same.
+    """Return the change that turns the readings into those of the machine with the earlier table; None if both tables are the same.
 
     Raises
     ------
@@ -137,12 +137,12 @@ def _tables_between(store: Store, campaign: Campaign, before: _Before) -> Remove
 
 
 def _applied(store: Store, crc: int | None) -> AppliedTables:
-    """Moves that a table causes in axes that follow it."""
+    """Return how the table with this CRC displaces the axes; `NOTHING` without a table."""
     if crc is None:
         return NOTHING
     image = images_of(store)(crc)
     if image is None:
-        raise TableMismatch(f"table {crc:08X} is not known")
+        raise TableMismatch(f"the compensation table {crc:08X} is not known")
     if int.from_bytes(image[KIND_AT], "big") == NO_CORRECTION:
         return NOTHING
     table = tables_from_image(image)
@@ -159,7 +159,7 @@ def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[
 
 
 def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[EffectFound]) -> ChangedSince:
-    """Compare without the effects that the solution's readings lack too, and without the campaign's own thermal and instrument effects."""
+    """Compare after subtracting the effects that the solution subtracted too, and the campaign's own thermal and instrument effects."""
     left = remove_table(campaign, campaign_table(store, campaign).table)
     if before.version is not None:
         book = version(store, campaign.site.name, before.version).book.effects
@@ -174,7 +174,7 @@ def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence
 
 
 def _record(since: int, changed: Changed, beside: tuple[str, ...]) -> ChangedSince:
-    """The changes as stored with a finding: µm/m and µrad for linear parts, µm or µrad for shapes."""
+    """Convert the changes to what is stored with a finding: µm/m and µrad for linear parts, µm or µrad for shapes."""
     gap = None
     if changed.before_mm is not None and changed.after_mm is not None:
         gap = GapUm(before_um=changed.before_mm * 1e3, after_um=changed.after_mm * 1e3, floor_um=changed.floor_mm * 1e3)

@@ -8,26 +8,26 @@ from abbe.service.domain.finding import ChangedSince, GapUm, MotionChange
 from abbe.service.rendering.numbers import COVERAGE, plain, with_uncertainty
 
 LEFT = 1.5
-"""Ratio of the remaining gap to the noise from which the remainder counts as more than noise: the solution itself is uncertain."""
+"""A remaining gap above this multiple of the noise counts as more than noise; not 1, because the solution itself is uncertain."""
 HALVES = 2
 UNITS = {"um/m": "µm/m", "urad": "µrad", "um": "µm"}
 
 
 def changed_text(changed: ChangedSince | None) -> str:
-    """One sentence with the changes, their U (k = 2) and whether they are proved; empty without a comparison."""
+    """Return one sentence with the changes, their U (k = 2) and whether they are proved; empty without a comparison."""
     if changed is None:
         return ""
     since = f"since solution {changed.since}"
     if changed.trouble:
-        return f"what has changed {since} could not be determined: {changed.trouble}"
+        return f"the changes {since} could not be determined: {changed.trouble}"
     if not changed.changes:
-        return f"nothing has changed {since} that these runs can tell"
+        return f"these runs show no change {since}"
     names = ", ".join(_size(c) for c in changed.changes)
     return f"changed {since}: {names}{'' if changed.proved else ' (not proved)'}"
 
 
 def changed_lines(changed: ChangedSince | None) -> list[str]:
-    """`changed_text`, then the proof, the alternatives and what these runs could not show; empty without a comparison."""
+    """Return `changed_text`, then alternatives, proof and what these runs could not show; empty without a comparison."""
     if changed is None:
         return []
     out = [changed_text(changed)]
@@ -38,17 +38,17 @@ def changed_lines(changed: ChangedSince | None) -> list[str]:
         if c.rivals:
             out.append(f"  {name}: these runs cannot tell it from {', '.join(_rival(r.name) for r in c.rivals)}")
         if not _sure(c):
-            out.append(f"  {name}: zero is within its uncertainty, so it may be another scale or squareness that has changed")
+            out.append(f"  {name}: zero is within its uncertainty, so another scale or squareness may have changed instead")
     if changed.changes and changed.beside:
-        out.append(f"  {', '.join(changed.beside)} was found in the same runs: a change may be the same thing, seen by other motions")
+        out.append(f"  {', '.join(changed.beside)} was found in the same runs and may be what looks like a change here")
     return out + (_proof(changed) if changed.changes else []) + _hidden(changed)
 
 
 def proved(changed: ChangedSince) -> bool:
-    """Whether runs that did not choose the changes confirm them.
+    """Check whether runs that did not choose the changes confirm them.
 
     Each half of the set-ups must be more likely with the changes that the other half chose. A visible gap must close. Both halves must have
-    chosen every change, which must have no close rival and exceed its own U. No other finding in these runs may have the same cause.
+    chosen every change, and each change must exceed its own U and have no close rival. No other finding in these runs may be the cause.
     """
     sure = all(c.halves == HALVES and not c.rivals and _sure(c) for c in changed.changes)
     if not changed.changes or not sure or changed.beside or changed.judged is None or changed.judged < NEAR:
@@ -67,31 +67,34 @@ def _sure(change: MotionChange) -> bool:
 def _proof(changed: ChangedSince) -> list[str]:
     gap, judged = changed.gap, changed.judged
     if gap is None or judged is None:
-        return ["  there are too few set-ups for one half of them to judge what the other chooses: judged by evidence alone"]
+        return ["  there are too few set-ups to choose the changes in one half and test them on the other: judged by evidence alone"]
     before, after, floor = plain(gap.before_um), plain(gap.after_um), plain(gap.floor_um)
     if _shows(gap):
         share = gap.closed or 0.0
         goes, part = ("shrinks", f" ({share:.0%} closed)") if share > 0.0 else ("goes", "")
-        out = [f"  on runs that did not choose it the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"]
+        out = [f"  on runs that did not choose the change the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"]
     else:
-        out = [f"  set-ups take up nearly all of it: the gap is {before} µm rms without and {after} with it where {floor} µm is noise"]
+        out = [
+            f"  the fitted set-ups absorb nearly all of the change: "
+            f"the gap is {before} µm rms without and {after} with it where {floor} µm is noise"
+        ]
     if judged < NEAR:
-        out.append("  runs that did not choose it are not more likely with it")
+        out.append("  runs that did not choose the change are not more likely with it")
     unconfirmed = [_name(c.motion, c.part) for c in changed.changes if c.halves < HALVES]
     if unconfirmed:
         out.append(f"  not chosen by each half of the runs alone: {', '.join(unconfirmed)}")
     if gap.after_um > LEFT * gap.floor_um:
-        out.append("  what is left is more than noise: what the solution did not know, or a change that has no name here")
+        out.append("  more than noise is left: an error that the solution did not contain, or another kind of change")
     return out
 
 
 def _hidden(changed: ChangedSince) -> list[str]:
-    """Changes that these runs could have missed."""
+    """Return the changes that these runs could have missed."""
     hidden = changed.hidden_um_m
     named = {c.motion for c in changed.changes if c.part == "linear"}
     each = [f"{NAMES[n]} {plain(v, 2)} {'µm/m' if n[0] == 'E' else 'µrad'}" for n, v in hidden.items()]
     unseen = [name for n, name in NAMES.items() if n not in hidden and n not in named]
-    out = [f"  what may have changed all the same, at most (k = 2): {', '.join(each)}"] if each else []
+    out = [f"  these runs could have missed changes of at most (k = 2): {', '.join(each)}"] if each else []
     return out + ([f"  not seen by these runs: {', '.join(unseen)}"] if unseen else [])
 
 

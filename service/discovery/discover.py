@@ -1,4 +1,4 @@
-"""The discovery workflow: fit, suspect, propose, test, explain or leave unexplained. It is persistent and resumes where it was stopped.
+"""The discovery workflow: fit, suspect, propose, test, explain or leave unexplained. It is stored and resumes where it was stopped.
 
 The search itself is one pure computation that takes seconds (`abbe.models.discovery.discover`). The journal stores the finding with the
 first state that follows from it, so that nothing is computed twice, and the new model version with the last state.
@@ -125,7 +125,7 @@ def prepare(
     case = case_of(campaign.doc, campaign.site.machine, runs)
     expected_version = None if base is None else base.version
     if base is not None and base.book.machine_digest != machine_digest(case.machine):
-        flags.append(f"model version {base.version} of {base.machine} is of another geometry and was not used")
+        flags.append(f"model version {base.version} of {base.machine} is for another geometry and was not used")
         base = None
     known = [] if base is None else [e for e in base.book.effects if applies(e, campaign.name)]
     known_mm = readings_of(known, effects, case)
@@ -148,7 +148,7 @@ def _checked(campaign: Campaign) -> list[str]:
     flags = check_files(campaign.site.doc, used)
     flags += copy_issues([*used, *(r for r in campaign.runs if r.role == "holdout")])
     refuse(flags)
-    # Wrong units, signs and axes are refused. A run that only does not fit the others is not a flag here: the search looks for the reason.
+    # Wrong units, signs and axes are refused. A run that merely disagrees with the others is not flagged: the search looks for the reason.
     refuse(check_readings(campaign.site.machine, [run_data(r, blocks=ALL_READINGS) for r in used]))
     return [f.line for f in flags]
 
@@ -175,7 +175,7 @@ class DiscoveryJournal:
         self.steps.append(step)
 
     def _persist(self, seq: int, step: DiscoveryStep, model: ModelBook | None) -> None:
-        """Subclasses write the state; this one does nothing."""
+        """Write the state to the store; a journal in memory has none."""
 
     @property
     def id(self) -> int | None:
@@ -229,5 +229,5 @@ def _enters(step: DiscoveryStep, finding: Finding) -> bool:
 
 
 def _version(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> ModelBook:
-    """The model version of a proved finding, with those effects only that shift readings."""
+    """Return the model book extended by the effects of a proved finding that shift readings."""
     return extended_book(job.base, replace(finding, effects=entering(finding)), job.source, journal.id, job.effects)

@@ -1,7 +1,7 @@
 """Continue a discovery on the connected machine: measure the proposal, join it with the old campaign, search again.
 
-All state is stored. The document of a continuing campaign names the campaign that it continues and its plan. The joined campaign follows
-from the two, and its discovery is found by the readings. The same command therefore resumes wherever it was stopped.
+All state is stored. The document of a continuing campaign names its plan and the campaign that it continues. Both together give the joined
+campaign, whose readings identify its discovery. So the same command resumes wherever it was stopped.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Addition:
 
 
 def addition_count(store: Store, name: str) -> int:
-    """Number of additions in the chain that a campaign continues, itself included; their run labels are in use."""
+    """Count the additions in the chain of campaigns that ends with this one; their run labels are taken."""
     before = {c.name: (c.doc.get("continues") or {}).get("campaign") for c in store.campaigns.all()}
     chain = [name]
     while (old := before.get(chain[-1])) is not None and old not in chain:
@@ -58,7 +58,7 @@ def addition_count(store: Store, name: str) -> int:
 
 
 def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s: float = 0.0) -> Addition:
-    """State of a plan that continues a campaign; a campaign that was begun for the same plan is resumed.
+    """Return what is done and what remains of a plan that continues a campaign; a campaign begun for the same plan is resumed.
 
     A set-up counts only if all its tests were completed in one mounting. After an interrupted test the equipment in the machine is unknown:
     the operator is first asked to remove it, then mounts it again under the name of a new set-up.
@@ -84,7 +84,7 @@ def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s:
 
 
 def _remaining(tests: tuple[TestPlan, ...], states: dict[str, str]) -> tuple[TestPlan, ...]:
-    """Tests that remain, in whole set-ups: an incomplete set-up starts again from its mounting.
+    """Return the remaining tests in whole set-ups: an incomplete set-up starts again from its mounting.
 
     Another process cannot resume a set-up, because the bar may have moved or been removed.
     """
@@ -103,7 +103,7 @@ def _remaining(tests: tuple[TestPlan, ...], states: dict[str, str]) -> tuple[Tes
 
 
 def _attempt(test: TestPlan, number: int) -> TestPlan:
-    """The test in the n-th mounting of its set-up, with its own label and set-up name."""
+    """Return the test for the n-th mounting of its set-up, with its own label and set-up name."""
     if number == 1:
         return test
     return replace(test, label=f"{test.label}-{number}", setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})
@@ -129,7 +129,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
     status, comp = await session.controller.status(), await session.controller.comp_status()
     old = campaign.doc
     if "ctrl0_us" not in old or old.get("boot_id") != comp.boot_id or old["ctrl0_us"] > status.ctrl_us:
-        raise CampaignRefused(f"campaign {campaign.name} has not the clock that the machine has now", NO_CLOCK)
+        raise CampaignRefused(f"campaign {campaign.name} was measured before the controller restarted, or elsewhere", NO_CLOCK)
     now = comp.bank_crc[comp.active_bank]
     tables = {run.table.crc for run in campaign.runs} - {None, now}
     if tables:
@@ -138,7 +138,9 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
     if what.after_s > 0.0 and wait_s > 0.0:
         return wait_s
     if status.moving:  # the operator must not reach into a moving machine
-        raise UnsafeToMove("the machine is moving: it may run the path of a run that was broken off", "wait until it stands, then go on")
+        raise UnsafeToMove(
+            "the machine is moving, perhaps on the path of an interrupted run", "wait until it stands still, then give the command again"
+        )
     await check_devices(session, what.remaining, air=site.watching.air_c is not None)
     if what.begun is None:
         begun = await start_campaign(session, store, site, what.plan.name, {"continues": what.link})
@@ -154,9 +156,9 @@ def _last_s(campaign: Campaign) -> float:
 
 
 def next_search(store: Store, job: DiscoveryJob, journal: StoredJournal, name: str) -> tuple[DiscoveryJob, StoredJournal]:
-    """The search of a campaign joined with the added campaign ``name``, and its journal; ``journal``: of the ended previous search.
+    """Prepare the search of a campaign joined with the added campaign ``name``; ``journal`` is that of the ended previous search.
 
-    It contains the readings of the previous search. It therefore starts from the same model version, and its finding replaces the
+    The new search contains the readings of the previous one. So it starts from the same model version, and its finding replaces the
     previous one.
     """
     campaign = joined(job.campaign, from_store(store, name))
@@ -168,7 +170,7 @@ def next_search(store: Store, job: DiscoveryJob, journal: StoredJournal, name: s
 
 
 def joined(old: Campaign, new: Campaign) -> Campaign:
-    """The runs of both campaigns on the old campaign's clock, under the new campaign's name."""
+    """Join the runs of both campaigns on the old campaign's clock, under the new campaign's name."""
     later_s = (new.doc["ctrl0_us"] - old.doc["ctrl0_us"]) * 1e-6
     runs = [*old.runs, *(_later(run, later_s) for run in new.runs)]
     doc = old.doc | {"campaign": new.name}

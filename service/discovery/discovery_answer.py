@@ -1,4 +1,4 @@
-"""A finding as the answer of run-format.md 5 (``abbe-discovery/1``)."""
+"""A finding as JSON in the format ``abbe-discovery/1`` (docs/schemas/discovery.schema.json)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FORMAT = "abbe-discovery/1"
 
 
 def answer_doc(finding: Finding) -> dict[str, Any]:
-    """JSON of a finding: gaps in µm, predictions of every sealed run in mm."""
+    """Return a finding as JSON: gaps in µm, predictions of every sealed run in mm."""
     holdout, fitted, test = finding.gaps.get("holdout"), finding.gaps.get("identify"), finding.next_test
     doc: dict[str, Any] = {
         "format": FORMAT,
@@ -62,5 +62,5 @@ def _next_test(test: NextTest) -> dict[str, Any]:
 
 
 def location_doc(location: Localization) -> dict[str, Any]:
-    """The known fields of a location, without the table of significance tests."""
+    """Return the known fields of a location, without the table of significance tests."""
     return {k: v for k, v in asdict(location).items() if k != "table" and v not in (None, (), [], "")}

@@ -23,20 +23,20 @@ FOLLOWS: dict[State | None, frozenset[State]] = {
 }
 ENDS = frozenset({"EXPLAINED", "UNEXPLAINED"})
 VISIBLE = 1.05
-"""Smallest gap of the judging runs over their noise floor before the fit; below it the effect does not show and they cannot judge."""
+"""Smallest ratio of gap to noise floor, before the fit, at which holdout runs can judge; below it the effect does not show in them."""
 CLOSED = 0.5
-"""Share of the gap (`GapUm.closed`) that must close on the judging runs. A wrong effect closes it on the fitted runs only."""
+"""Share of the gap (`GapUm.closed`) that must close on the holdout runs. A wrong effect closes it on the fitted runs only."""
 LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise."""
 WORSE = 1.05
 """Largest ratio of the gap after to the gap before in any role: a diverged solution is not a finding."""
 NEAR = 3.0
 """Lead in evidence (natural logarithm) over every rival that an effect needs for the model book: twenty times as likely."""
-NOT_CONFIRMED = "runs that judge do not agree better with the effect than without it"
+NOT_CONFIRMED = "the holdout runs do not agree better with the effect than without it"
 
 
 def after_fit(finding: Finding) -> Iterator[DiscoveryStep]:
-    """The states from FITTED to the end; the first of them carries the finding."""
+    """Yield the steps after FITTED, to the end; the first one carries the finding."""
     if finding.verdict == "none":
         yield DiscoveryStep(state="EXPLAINED", why=nothing_missing(finding), finding=finding)
         return
@@ -45,14 +45,14 @@ def after_fit(finding: Finding) -> Iterator[DiscoveryStep]:
     if not _names(finding):
         yield DiscoveryStep(state="UNEXPLAINED", why="nothing in the catalogue explains the gap")
         return
-    yield DiscoveryStep(state="PROPOSED", why="best evidence after its price, rivals refitted")
+    yield DiscoveryStep(state="PROPOSED", why="has the best evidence, with all rivals refitted")
     judged = judge(finding)
     yield DiscoveryStep(state="TESTING", why=judged.rule, judged=judged)
     yield ending(finding, judged)
 
 
 def ending(finding: Finding, judged: Judgement) -> DiscoveryStep:
-    """The last state: whether the judged effects explain the gap."""
+    """Return the last step: whether the judged effects explain the gap."""
     if judged.proved is False:
         return DiscoveryStep(state="UNEXPLAINED", why=judged.against, judged=judged)
     if finding.verdict == "unknown":
@@ -64,14 +64,14 @@ def ending(finding: Finding, judged: Judgement) -> DiscoveryStep:
 
 
 def not_entered(finding: Finding, judged: Judgement) -> str | None:
-    """Reason to keep a finding out of the model book. None: it is proved and has no close rival, so its `entering` effects are added."""
+    """Return the reason to keep a finding out of the model book; None if its `entering` effects are added: proved, without close rivals."""
     if judged.proved is not True:
-        return f"it is not proved, {judged.rule}"
+        return f"it is not proved: {judged.rule}"
     if finding.beside:
-        return f"what closes the gap is in part a structure without a name ({finding.beside[0].label.replace('_', ' ')})"
+        return f"part of the gap is closed by a structure that the catalogue does not name ({finding.beside[0].label.replace('_', ' ')})"
     for e in entering(finding):
         if e.needed is not None and e.needed <= 1.0:
-            return f"the runs that judge do not need {e.label}"
+            return f"the holdout runs do not need {e.label}"
         near = next((rival for rival in e.alternatives if rival.less_evidence < NEAR), None)
         if near is not None:
             return f"these runs hardly tell {e.label} from {near.label}"
@@ -79,7 +79,7 @@ def not_entered(finding: Finding, judged: Judgement) -> str | None:
 
 
 def with_proof(finding: Finding) -> Finding:
-    """The finding with the result of the judging runs. Effects that they refute become suspects, and the verdict "unknown"."""
+    """Add the result of the holdout runs to a finding. Effects that they refute become suspects, and the verdict "unknown"."""
     if not finding.effects:
         return finding
     judged = judge(finding)
@@ -105,21 +105,21 @@ def _names(finding: Finding) -> tuple[EffectFound, ...]:
 
 
 def entering(finding: Finding) -> tuple[EffectFound, ...]:
-    """Effects that can be proved, because they shift readings; effects that only add scatter close no gap, here or in a later campaign."""
+    """Return the effects that can be proved because they shift readings; effects that only add scatter close no gap."""
     return tuple(e for e in finding.effects if e.kind == "mean")
 
 
 def judge(finding: Finding) -> Judgement:
-    """How much of the gap closes on the runs that only judge, and whether that proves the finding.
+    """Judge by the holdout runs how much of the gap closes, and whether that proves the finding.
 
-    If they cannot judge, effects that leave the fitted runs a gap above `LEFT` times the noise are rejected too.
+    If they cannot judge, effects are rejected if they leave a gap above `LEFT` times the noise in the fitted runs.
     """
     moving = any(e.kind == "mean" for e in _names(finding))
     found = _judged(finding, moving=moving)
     fitted = finding.gaps.get("identify")
     if found.proved is None and moving and fitted is not None and fitted.after_um > LEFT * fitted.floor_um:
         times = fitted.after_um / fitted.floor_um
-        against = f"{found.rule}, and with it the fitted runs are still off by {times:.2g} times the noise"
+        against = f"{found.rule}, and even with the effect the fitted runs deviate by {times:.2g} times the noise"
         return replace(found, proved=False, against=against)
     return replace(found, against=NOT_CONFIRMED) if found.proved is False else found
 
@@ -130,12 +130,12 @@ def _judged(finding: Finding, *, moving: bool) -> Judgement:
         return Judgement(rule=f"the {worse[0]} runs agree worse with the effect than without it", proved=False)
     gap = finding.gaps.get("holdout")
     if gap is None:
-        return Judgement(rule="no run of this campaign only judges", proved=None)
+        return Judgement(rule="no holdout run of this campaign can judge", proved=None)
     share = gap.closed
     if gap.before_um <= VISIBLE * gap.floor_um or share is None:
-        return Judgement(rule="the gap does not show in the runs that judge", proved=None, closed=share, gap=gap)
+        return Judgement(rule="the gap does not show in the holdout runs", proved=None, closed=share, gap=gap)
     if not moving:
-        rule = "what makes readings noisier closes no gap: judged by evidence alone"
+        rule = "an effect that only adds scatter closes no gap: judged by evidence alone"
         return Judgement(rule=rule, proved=None, closed=share, gap=gap)
-    rule = f"at least {CLOSED:.0%} of the gap closes on the runs that judge"
+    rule = f"at least {CLOSED:.0%} of the gap closes on the holdout runs"
     return Judgement(rule=rule, proved=share >= CLOSED, closed=share, gap=gap)

@@ -43,24 +43,24 @@ class StoredJournal(DiscoveryJournal):
             self.version = self._store.discoveries.add_step(self._id, seq, step.state, document(step), new)
         except ModelMovedOn as moved:
             # The search ignored the effects of the newer version: adding to them could count one twice or keep a repaired one.
-            again = "run the same command again: it searches anew with what the model knows now"
-            raise ModelMovedOn(f"discovery {self._id}: {moved.detail}", f"{again}; what was found stays in discovery {self._id}") from None
+            again = "run the same command again: it searches anew with the present model"
+            raise ModelMovedOn(f"discovery {self._id}: {moved.detail}", f"{again}; the finding stays in discovery {self._id}") from None
 
 
 def journal_of(store: Store, job: DiscoveryJob, before: StoredJournal | None = None) -> StoredJournal:
-    """The journal of a job: that of an equal search that is still valid, else a new one. A campaign folder is imported first.
+    """Return the journal of an equal search if it is still valid, else a new one; a campaign folder is imported first.
 
-    A search is valid while the current model version is the one that it started from, or one that it or a continuation of it added.
+    A search is valid while the current model version is the one that it started from, or one that it or its continuation added.
 
     Parameters
     ----------
     before : StoredJournal, optional
-        The ended discovery that this one continues after another measurement; a stored continuation of it is valid.
+        The ended discovery that this one continues after another measurement; its stored continuation is always valid.
 
     Raises
     ------
     CampaignRefused
-        The store has another campaign of this name.
+        The store has a different campaign of this name.
     """
     ensure_stored(store, job.campaign)
     campaign = store.campaigns.find(job.campaign.name)
@@ -79,17 +79,17 @@ def journal_of(store: Store, job: DiscoveryJob, before: StoredJournal | None = N
 
 
 def base_of(one: DiscoveryRecord) -> SearchBase:
-    """The model versions that a stored search started from, and the discovery that it continues."""
+    """Return the model versions that a stored search started from, and the discovery that it continues."""
     return record(SearchBase, one.doc, f"discovery {one.id}")
 
 
 def stored_steps(store: Store, discovery_id: int) -> list[DiscoveryStep]:
-    """The states of a stored search, first to last.
+    """Return the states of a stored search, first to last.
 
     Raises
     ------
     Unusable
-        Another version of the program stored one of them in another form.
+        Another version of the program stored a state in another form.
     """
     return [record(DiscoveryStep, s.doc, f"state {s.state} of discovery {discovery_id}") for s in store.discoveries.steps(discovery_id)]
 
@@ -107,7 +107,7 @@ def _is_valid(store: Store, old: DiscoveryRecord, machine: str, now: int | None)
 
 
 def _chain(store: Store, discovery_id: int | None) -> list[int]:
-    """A discovery and those that it continues, back to the first one."""
+    """Return a discovery and those that it continues, back to the first one."""
     out: list[int] = []
     while discovery_id is not None:
         out.append(discovery_id)

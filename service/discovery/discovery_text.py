@@ -39,23 +39,23 @@ ROLES = {
 
 
 def unit(text: str) -> str:
-    """A unit of run-format.md 5 in its usual spelling."""
+    """Return a unit of the discovery format in its usual spelling: ``um/m`` as ``µm/m``."""
     return UNITS.get(text, text)
 
 
 def size(effect: EffectSize) -> tuple[str, str, str]:
-    """Strength, U (k = 2) and unit of an effect."""
+    """Return strength, U (k = 2) and unit of an effect as text."""
     value, expanded = with_uncertainty(effect.strength, effect.u_strength)
     return value, expanded, unit(effect.unit)
 
 
 def size_text(effect: EffectSize) -> str:
-    """Strength, U and unit in one string: ``6.1 ± 0.2 µm``."""
+    """Return strength, U (k = 2) and unit in one string: ``6.1 ± 0.2 µm``."""
     return _plus_minus(effect.strength, effect.u_strength, unit(effect.unit))
 
 
 def verdict_of(finding: Finding) -> tuple[str, str, str]:
-    """Sign, word and sentence of a finding."""
+    """Return sign (ok, open or bad), headline and text of a finding."""
     sign, word, text = _verdict_of(finding)
     fitted = "; ".join(f"{f.name} of {f.key} {_plus_minus(f.value, f.u, unit(f.unit))}" for f in finding.fitted)
     return sign, word, f"{text} In the present model, as fitted: {fitted}." if fitted else text
@@ -83,7 +83,7 @@ def _nothing_missing_verdict(finding: Finding, gap: str) -> tuple[str, str, str]
     if location.tests and location.table and location == Localization(tests=location.tests, table=location.table):
         return "ok", "No common drift", _repeatability_text(finding)
     if disagreeing(finding):
-        sign, word = "open", "Nothing is missing in the fitted runs, but the others do not agree"
+        sign, word = "open", "Nothing is missing in the fitted runs, but other runs disagree"
     else:
         sign, word = "ok", "Nothing is missing"
     return sign, word, f"{_capital(nothing_missing(finding))}: {gap}."
@@ -94,30 +94,30 @@ def _capital(text: str) -> str:
 
 
 def _remainder_text(finding: Finding) -> str:
-    """A note that more than noise remains; empty if not, or if the finding is scatter, which no model removes."""
+    """Return a note if more than noise remains; empty if the finding is only scatter, which no model removes."""
     gap = finding.gaps.get("identify")
     more = gap is not None and entering(finding) and gap.after_um > LEFT * gap.floor_um
     return " More than noise is left: something else is missing, too." if more else ""
 
 
 def _proof_text(judged: Judgement) -> str:
-    """How far the gap closed on the judging runs."""
+    """Tell how far the gap closed on the holdout runs."""
     assert judged.gap is not None  # a proof needs a gap
     before, after, _ = _gap_values(judged.gap)
     return f"also on runs that were never fitted, from {before} to {after} µm rms ({judged.closed:.0%} closed)"
 
 
 def _suspect_text(finding: Finding) -> str:
-    """Effects that the judging runs do not confirm; empty without any."""
+    """List the effects that the holdout runs do not confirm; empty without any."""
     names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.suspects)
     return f" Suspected: {names}; but {finding.proof}." if names else ""
 
 
 def _repeatability_text(finding: Finding) -> str:
-    """A positioning test whose repeats share no drift: their scatter is the repeatability of axis and sensor."""
+    """Describe a positioning test without a common drift of its repeats: their scatter is the repeatability of axis and sensor."""
     test, gap = finding.location.table[0], finding.gaps["identify"]
-    p = f"noise with the same memory gives as much in {test.p:.1%} of tests"
-    scatter = f"They scatter by {plain(gap.before_um)} µm: that is repeatability, which no model takes out"
+    p = f"noise with the same correlation gives as much in {test.p:.1%} of tests"
+    scatter = f"The repeats scatter by {plain(gap.before_um)} µm: that is repeatability, which no model can remove"
     return f"In these repeats a {test.value}; {p}. {scatter}."
 
 
@@ -131,7 +131,7 @@ def _gap_text(finding: Finding) -> str:
         return "no run could be judged"
     before, after, floor = _gap_values(gap)
     if finding.effects and not entering(finding):
-        return f"readings scatter more than the noise of {floor} µm; {before} µm rms in all, and no model takes scatter out"
+        return f"readings scatter by {before} µm rms, more than the noise of {floor} µm, and no model can remove scatter"
     if not finding.effects:
         return f"the gap between measured and simulated is {before} µm rms where {floor} µm is noise"
     share = "" if gap.closed is None else f" ({gap.closed:.0%} closed)"
@@ -139,7 +139,7 @@ def _gap_text(finding: Finding) -> str:
 
 
 def lines_of(finding: Finding) -> list[str]:
-    """The verdict for the terminal, one fact per line."""
+    """Return the verdict for the terminal, one fact per line."""
     _, word, text = verdict_of(finding)
     out = [f"{word}. {text}"]
     for e in finding.effects:
@@ -150,13 +150,13 @@ def lines_of(finding: Finding) -> list[str]:
 
 
 def book_lines(finding: Finding) -> list[str]:
-    """Why the named effects stay out of the model book; empty if they enter it."""
+    """Tell why the named effects stay out of the model book; empty if they enter it."""
     why = not_entered(finding, judge(finding)) if finding.effects else None
     return [] if why is None else [f"not added to the model book: {why}"]
 
 
 def effect_lines(effect: EffectFound) -> list[str]:
-    """One named effect: size, remedy, place, rivals."""
+    """Describe one named effect: size, remedy, location, rivals."""
     lines = [f"{effect.full_title}: {size_text(effect)}"]
     lines += [f"  {name}: {parameter_text(p)}" for name, p in effect.parameters.items()]
     lines.append(f"  what to do: {effect.remedy_text} ({REMEDIES[effect.remedy]})")
@@ -168,18 +168,18 @@ def effect_lines(effect: EffectFound) -> list[str]:
 
 
 def parameter_text(parameter: ParameterFound) -> str:
-    """A non-linear parameter with its U (k = 2) and unit."""
+    """Return a non-linear parameter with its U (k = 2) and unit as text."""
     return _plus_minus(parameter.value, parameter.u, unit(parameter.unit)).rstrip()
 
 
 def _plus_minus(value: float, u: float | None, what: str) -> str:
-    """Value and U (k = 2), if known; a threshold that was picked from a grid has no U."""
+    """Return value and U (k = 2) as text; without U if it is unknown, as for a threshold picked from a grid."""
     text, expanded = with_uncertainty(value, u)
     return f"{text} {what}" if expanded == NOT_AVAILABLE else f"{text} ± {expanded} {what}"
 
 
 def rival_lines(effect: EffectFound) -> list[str]:
-    """Each alternative with its odds; without any, the reason."""
+    """List the alternatives with their odds; without any, say why."""
     if not effect.alternatives:
         moves = effect.kind == "mean"
         return ["nothing else in the catalogue fits these runs as well" if moves else "no rival was tried: scatter has no shape to compare"]
@@ -187,31 +187,31 @@ def rival_lines(effect: EffectFound) -> list[str]:
 
 
 def _times(less: float) -> str:
-    """Odds of a rival. Above `CLEAR` it is formally ruled out, although a slightly bent form of it could still explain the readings."""
+    """Return the odds of a rival. Above `CLEAR` it is formally ruled out, but a slightly different form could explain the readings."""
     if less < 0.7:
         return "just as likely"
     if less < CLEAR:
         return f"{plain(math.exp(less), 2)} times less likely"
-    return f"10^{less / math.log(10.0):.0f} times less likely, but slightly bent it would look the same"
+    return f"10^{less / math.log(10.0):.0f} times less likely, but in a slightly different form it would look the same"
 
 
 def next_of(finding: Finding) -> list[str]:
-    """What to measure next: a test that separates the suspects, else general advice; empty if nothing is missing."""
+    """Tell what to measure next: a test that separates the suspects, else general advice."""
     if finding.next_test is not None:
         return _next_lines(finding.next_test)
     if finding.verdict == "unknown":
         there = "; ".join(location_lines(finding.location))
-        what = f"repeat it where it lives ({there})" if there else "repeat the whole campaign: it could not be located"
-        return [f"measure next: {what}, and repeat it later: what recurs belongs to the machine, what does not belonged to that session"]
+        what = f"repeat the measurement where the gap appears ({there})" if there else "repeat the whole campaign: the gap was not located"
+        return [f"measure next: {what}, and again later: a gap that recurs belongs to the machine, one that does not to that session"]
     if finding.verdict == "none":
-        again = "measure next: repeat the runs that were never fitted and do not agree, some of them with the role identify"
+        again = "measure next: repeat the runs that were never fitted and disagree, some of them with the role identify"
         return ([again] if disagreeing(finding) else []) + unseen_lines(finding)
-    return [f"no test on offer tells it from {', '.join(finding.confounded_with)}"] if finding.confounded_with else []
+    return [f"no available test tells it from {', '.join(finding.confounded_with)}"] if finding.confounded_with else []
 
 
 def _next_lines(test: NextTest) -> list[str]:
-    """The next test with its purpose, duration and expected separation."""
-    what = " and ".join(ADDS.get(a, a) for a in test.adds) or "nothing on offer"
+    """Describe the next test: purpose, duration and expected separation."""
+    what = " and ".join(ADDS.get(a, a) for a in test.adds) or "no test is available"
     sigma = test.expected_separation_sigma
     well = "" if sigma is None else f", should tell them apart by {plain(sigma, 2)} sigma"
     between = f" to tell {' from '.join(test.separates)}" if test.separates else ""
@@ -219,13 +219,13 @@ def _next_lines(test: NextTest) -> list[str]:
 
 
 def unseen_lines(finding: Finding) -> list[str]:
-    """Effects that these runs could not show, and the measurement that would."""
+    """List the effects that these runs could not show, and the measurement that would."""
     return [f"could not be seen: {u.what}, because {u.because}; what would show it: {ADDS.get(u.adds, u.adds)}" for u in finding.unseen]
 
 
 def location_lines(location: Localization) -> list[str]:
-    """The location of an effect, one line per known property."""
-    axes = () if len(location.axes) == len(AXES) else location.axes  # all three axes say nothing
+    """Describe the location of an effect, one line per known property."""
+    axes = () if len(location.axes) == len(AXES) else location.axes  # all three axes locate nothing
     out = [
         f"{label} {', '.join(found[:MANY])}" + (f" and {len(found) - MANY} more" if len(found) > MANY else "")
         for label, some in (("seen in", location.tests), ("axis", axes), ("run", location.runs), ("depends on", location.depends_on))

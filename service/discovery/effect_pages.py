@@ -13,7 +13,7 @@ HEADINGS = ("name", "what it is", "sits at", "usual size", "taken out by")
 
 
 def effect_row(effect: Effect) -> tuple[str, ...]:
-    """Cells of `HEADINGS`."""
+    """Return the cells of one effect under `HEADINGS`."""
     return (effect.name, effect.title, _keys(effect), _usual(effect), REMEDIES[effect.remedy])
 
 
@@ -28,7 +28,7 @@ def _usual(effect: Effect) -> str:
 
 
 def effect_lines(effect: Effect) -> list[tuple[str, str]]:
-    """The description of one effect: pairs of heading and text."""
+    """Describe one effect by pairs of heading and text."""
     lines = [
         ("what it is", effect.title),
         ("name", effect.name),
@@ -42,7 +42,7 @@ def effect_lines(effect: Effect) -> list[tuple[str, str]]:
     for p in effect.shape:
         lines.append((f"parameter {p.name}", f"{plain(p.low)} to {plain(p.high)} {unit(p.unit)}, usually {plain(p.typical)} ({p.source})"))
     if effect.forms:
-        lines.append(("may be bent by", ", ".join(f.name for f in effect.forms)))
+        lines.append(("other forms", ", ".join(f.name for f in effect.forms)))
     lines += [("taken out by", REMEDIES[effect.remedy]), ("what to do", effect.remedy_text)]
     for rival, adds in effect.separated_by.items():
         lines.append((f"distinguished from {rival} by", "; or ".join(ADDS.get(a, a) for a in adds)))
@@ -50,7 +50,7 @@ def effect_lines(effect: Effect) -> list[tuple[str, str]]:
 
 
 def effect_doc(effect: Effect) -> dict[str, Any]:
-    """One effect as JSON."""
+    """Return one effect as JSON."""
     return {
         "name": effect.name,
         "title": effect.title,

@@ -61,7 +61,7 @@ def next_plan(
     max_feed_mm_min: float,
     about: Localization | None = None,
 ) -> NextPlan:
-    """Recipes for the additions that a discovery proposes (``next_test.adds``).
+    """Plan the additions that a discovery proposes (``next_test.adds``).
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def next_plan(
 def _tests(
     add: str, machine: Machine, runs: list[Run], name: str, max_feed_mm_min: float, about: Localization | None
 ) -> tuple[TestPlan, ...] | str:
-    """The tests of one addition, or the text for the person who has to do it."""
+    """Return the tests of one addition, or the text for the person who has to do it."""
     make = MAKERS.get(add)
     if make is None:
         return add
@@ -109,7 +109,7 @@ def _tests(
 def _within(
     add: str, machine: Machine, recipes: list[Recipe], max_feed_mm_min: float, place: tuple[float, float, float] | None
 ) -> tuple[TestPlan, ...] | str:
-    """The tests of recipes inside the strokes; a second radius without room is halved once."""
+    """Return the tests of recipes if they fit the strokes, else the reason as text; a second radius without room is halved once."""
     tries = [recipes]
     if add == "second_radius":
         tries.append([_shrunk(r, 0.5, place) if isinstance(r, Helix) else r for r in recipes])
@@ -136,7 +136,7 @@ def _repeats_first(runs: list[Run], about: Localization) -> list[Run]:
 
 
 def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None) -> Helix:
-    """A helix with a shorter bar about the same centre, or about one nearer to ``place``, so that the sphere still passes through it."""
+    """Return a helix with a shorter bar; with a ``place``, its centre moves so that the sphere passes through the place."""
     if place is None:
         return replace(helix, radius_mm=scale * helix.radius_mm)
     at, centre = np.asarray(place, dtype=np.float64), np.asarray(helix.centre_mm, dtype=np.float64)
@@ -147,7 +147,7 @@ def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None
 
 
 def _through(place: tuple[float, float, float] | None, like: Helix, name: str) -> list[Recipe]:
-    """A denser helix on another sphere through ``place``; without one, the usual second radius."""
+    """Return a denser helix on another sphere through ``place``; without a place, the usual second radius."""
     if place is None:
         return _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm)
     near = _shrunk(like, SHORTER, place)
@@ -167,7 +167,7 @@ def _repeats(like: Helix, name: str) -> list[Recipe]:
 
 
 def _first_helix(machine: Machine, runs: list[Run]) -> Helix | None:
-    """The first helix of the campaign as a recipe, None if it cannot be repeated; without any helix, the one that verifies tables."""
+    """Return the first helix as a recipe, None if it cannot be repeated; without any helix, the one that verifies tables."""
     for run in runs:
         if run.test == "ballbar_helix":
             return _recipe_of(machine, run)
@@ -175,7 +175,7 @@ def _first_helix(machine: Machine, runs: list[Run]) -> Helix | None:
 
 
 def _recipe_of(machine: Machine, run: Run) -> Helix | None:
-    """A stored helix as a recipe; None if its set-up is incomplete or this machine cannot repeat it."""
+    """Turn a stored helix into a recipe; None if its set-up is incomplete or this machine cannot repeat it."""
     setup, bar = run.setup.document, run.bar
     if any(setup.get(key) is None for key in KNOWN) or bar.turns is None or bar.u_length_mm is None or bar.turns < MIN_TURNS:
         return None
@@ -212,6 +212,6 @@ MAKERS: dict[str, Maker] = {
     "laser_diagonals": _diagonals,
     "single_axis_laser": _lines,
 }
-"""Additions that the sequencer can run. A person does circles in the planes, other tools, angular optics and references."""
+"""Additions that the sequencer can run. Circles in the planes, other tools, angular optics and reference lengths need a person."""
 LASER = ("laser_diagonals", "single_axis_laser")
 """Additions that need no measured helix."""

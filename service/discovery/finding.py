@@ -1,4 +1,4 @@
-"""The result of a search as the record that is stored, reported and drawn."""
+"""Convert the result of a search to the finding that is stored, reported and drawn."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from abbe.service.domain.finding import (
 def finding_of(
     found: Discovery, case: Case, effects: tuple[Effect, ...], known_mm: Mapping[str, F1], thinning: FoundThinning | None = None
 ) -> Finding:
-    """The record of a discovery, including the result of the judging runs.
+    """Build the finding of a discovery, including the result of the holdout runs.
 
     ``known_mm``: contribution of the model book's effects, mm by run label, which was subtracted before the search and is added to the
     predictions again. ``thinning``: the decimation of long runs; None without any.
@@ -69,7 +69,7 @@ def finding_of(
 
 
 def effect_found(named: NamedEffect, effect: Effect, by_name: Mapping[str, Effect]) -> EffectFound:
-    """One named effect with the texts of its catalogue entry."""
+    """Combine a named effect with the texts of its catalogue entry."""
     units = {p.name: p.unit for p in effect.shape}
     return EffectFound(
         label=named.label,
@@ -121,12 +121,12 @@ def _run(found: Discovery, run: CaseRun) -> RunFit:
 
 
 def noise_mm_of(noise_mm: Mapping[str, float], kind: str) -> float:
-    """Noise of one reading of an instrument, mm; that of the noisiest instrument if none of its runs was fitted."""
+    """Return the noise of one reading of an instrument, mm; that of the noisiest instrument if none of its runs was fitted."""
     return noise_mm.get(kind, max(noise_mm.values()))
 
 
 def rms(residual_mm: F1) -> float:
-    """Root mean square of the residuals, mm, without flagged readings (NaN)."""
+    """Return the root mean square of the residuals, mm, without flagged readings (NaN)."""
     kept = residual_mm[np.isfinite(residual_mm)]
     return float(np.sqrt(np.mean(kept**2))) if kept.size else 0.0
 

@@ -1,4 +1,4 @@
-"""Which scale or squareness of a machine has changed most since it was solved last: what a drift is called by people."""
+"""Text about a drift: which scale or squareness of a machine has changed most since its last solution."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ COVERAGE = 2.0
 
 
 def drift_text(store: Store, made: StoredProposal) -> str:
-    """The linear error that changed most since the solution before, with U; without one before the largest there is. Empty: none is known.
+    """Tell which linear error changed most since the previous solution, with U; without a previous one, which is largest.
 
-    Only solutions that were measured with the same table in force are compared. What both share (the laser's wavelength) counts twice in U.
+    Empty if no linear error is known. Only solutions measured with the same compensation table are compared. Uncertainty that both share
+    (the laser's wavelength) counts twice in U.
     """
     new = store.solutions.get(made.proposed.solution_id)
     known = {k: v for k, v in stored_solution(new.doc, new.id).mean_over_volume.items() if k in NAMES}
@@ -43,7 +44,7 @@ def drift_text(store: Store, made: StoredProposal) -> str:
 
 
 def largest_sure(changes: dict[str, tuple[float, float]]) -> str | None:
-    """Name of the largest change that exceeds its U (k = 2), given (change, standard uncertainty) by name; None if none does."""
+    """Return the name of the largest change that exceeds its U (k = 2), from (change, standard uncertainty) by name; None if none does."""
     sure = {name: abs(change) for name, (change, u) in changes.items() if abs(change) > COVERAGE * u}
     return max(sure, key=lambda name: sure[name], default=None)
 
@@ -53,14 +54,14 @@ def _size(value: float, u: float) -> str:
 
 
 def _before(store: Store, new: SolutionRecord) -> SolutionRecord | None:
-    """The last solution of the same machine, geometry included, that is comparable."""
+    """Return the last solution of the same machine with the same geometry and compensation table."""
     inputs = stored_solution(new.doc, new.id).inputs
     same = [c.id for c in store.campaigns.all() if c.machine_id == store.campaigns.find(new.campaign_id).machine_id]
     earlier = [s for number in same for s in store.solutions.all(number) if s.id < new.id and s.kind == new.kind]
     for one in sorted(earlier, key=lambda s: s.id, reverse=True):
         try:
             old = stored_solution(one.doc, one.id)
-        except Unusable:  # stored by a version that kept less
+        except Unusable:  # an older version stored fewer fields
             continue
         if old.mean_over_volume and old.inputs.machine == inputs.machine and old.inputs.tables == inputs.tables:
             return one

@@ -12,12 +12,12 @@ SHOWN = 4
 
 
 def disagreeing(finding: Finding) -> list[Agreement]:
-    """Runs outside the fit that deviate by more than noise and prediction allow, worst first (`abbe.models.discovery.agreement`)."""
+    """Return the runs outside the fit that deviate by more than noise and prediction allow, worst first."""
     return [a for a in finding.agreement if a.p < ALARM]
 
 
 def nothing_missing(finding: Finding) -> str:
-    """The verdict when nothing is missing in the fitted runs, with the other runs that disagree or could not be judged."""
+    """Return the verdict if nothing is missing in the fitted runs, with the other runs that disagree or could not be judged."""
     off, open_ = disagreeing(finding), _unjudged(finding)
     if not off and not open_:
         return "the present model explains all runs to their noise"
@@ -25,14 +25,14 @@ def nothing_missing(finding: Finding) -> str:
     if off:
         runs = _few([f"{a.run} {a.times:.2g} times" for a in off])
         text += (
-            f"; of the runs that were never fitted {runs} what noise and the prediction's own uncertainty allow "
-            f"(chance gives as much in {off[0].p:.1g} of such campaigns)"
+            f"; runs that were never fitted deviate by more than noise and the prediction's own uncertainty allow: {runs} as much "
+            f"(chance gives as much in a share of {off[0].p:.1g} of such campaigns)"
         )
     return text + open_
 
 
 def _unjudged(finding: Finding) -> str:
-    """Runs outside the fit that could not be judged, grouped by reason; empty without any."""
+    """List the runs outside the fit that could not be judged, grouped by reason; empty without any."""
     by_reason: dict[str, list[str]] = {}
     for u in finding.unjudged:
         by_reason.setdefault(u.why, []).append(u.run)
@@ -40,5 +40,5 @@ def _unjudged(finding: Finding) -> str:
 
 
 def _few(runs: list[str]) -> str:
-    """The first `SHOWN` runs and the number of the others."""
+    """List the first `SHOWN` runs and the number of the others."""
     return ", ".join(runs[:SHOWN]) + (f" and {len(runs) - SHOWN} more" if len(runs) > SHOWN else "")

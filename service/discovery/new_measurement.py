@@ -19,7 +19,7 @@ from abbe.service.domain.model_book import ModelVersion
 
 @dataclass(frozen=True)
 class NewMeasurement:
-    """The gap on all new runs together and by run, before and after the finding entered the model."""
+    """The gap on all new runs together and by run, without ("before") and with ("after") the finding in the model."""
 
     gap: GapUm
     runs: dict[str, GapUm]
@@ -38,7 +38,7 @@ def validate_on(
         Measured later while the controller's clock kept running. Only its own set-up values are fitted: the zero of every laser run, and
         the cup position of a new set-up.
     model : ModelVersion, optional
-        The book version with the finding. None: nothing was found, and before and after are equal.
+        Version of the model book with the finding. None: nothing was found, and before and after are equal.
 
     Raises
     ------

@@ -19,7 +19,7 @@ from abbe.service.domain.finding import Finding, GapUm, PackedReadings, RunFit, 
 FORMAT = "abbe-simulation/1"
 ROLES: tuple[Role, ...] = ("identify", "holdout")
 AGREE = 1.1
-"""Gap over noise up to which both agree. Fitting and noise estimation alone give up to 1.05."""
+"""Ratio of gap to noise up to which measured and simulated agree. Fitting and noise estimation alone give up to 1.05."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def simulate(job: DiscoveryJob) -> Simulation:
 
 
 def simulated_finding(job: DiscoveryJob, simulation: Simulation) -> Finding:
-    """The gap of every run and role as a finding without a search: before and after are equal."""
+    """Return the gap of every run and role as a finding without a search: before and after are equal."""
     gaps: dict[str, GapUm] = {}
     for role in ROLES:
         some = [r for r in job.case.of(role) if r.path.label in simulation.residual_mm]
@@ -76,7 +76,7 @@ def _run(run: CaseRun, simulation: Simulation) -> RunFit:
 
 
 def simulation_doc(job: DiscoveryJob, simulation: Simulation) -> dict[str, Any]:
-    """The simulation as JSON: the gap per run and role, and every prediction, mm."""
+    """Return the simulation as JSON: the gap per run and role, µm, and every prediction, mm."""
     found = simulated_finding(job, simulation)
     head = {"format": FORMAT, "campaign": job.campaign.name, "machine": job.campaign.site.name, "present_model": sorted(job.case.includes)}
     known = {"model_version": None if job.base is None else job.base.version, "known_effects": list(job.known)}
@@ -89,7 +89,7 @@ def simulation_doc(job: DiscoveryJob, simulation: Simulation) -> dict[str, Any]:
 
 
 def verdict_line(found: Finding) -> tuple[str, str, str]:
-    """Sign, headline and text: the gap of the present model. `abbe discover` tests whether it exceeds chance."""
+    """Return sign, headline and text about the gap of the present model. `abbe discover` tests whether it exceeds chance."""
     worst = max((g.before_um / g.floor_um for g in found.gaps.values() if g.floor_um > 0.0), default=1.0)
     text = "; ".join(f"{role} runs {g.before_um:.2f} µm rms where {g.floor_um:.2f} µm is noise" for role, g in found.gaps.items())
     text = f"{text[:1].upper()}{text[1:]}."

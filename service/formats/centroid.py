@@ -69,7 +69,7 @@ def _read_one(file: TextFile, settings: FormatSettings) -> AxisTable:
     count, travel = int(head[0]), file.number(1, head[1], "the travel")
     values = np.array([file.number(line, text.strip(), "the correction") for line, text in lines[1:]])
     if values.size != count or count < 2 or travel == 0.0:
-        raise file.wrong(len(lines), f"{values.size} values; the first line states {count:g} values and a travel of {travel:g} counts")
+        raise file.wrong(len(lines), f"{values.size} values, {count} stated with a travel of {travel:g} counts")
     start = 0.0 if settings.reference_mm is None else settings.reference_mm[AXES.index(axis)]
     position = start + np.linspace(0.0, travel / settings.counts_per_mm, count)
     way = 1 if travel > 0 else -1

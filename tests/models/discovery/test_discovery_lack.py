@@ -58,8 +58,8 @@ def test_a_name_that_leaves_most_of_the_gap_and_that_nothing_proves_is_only_a_su
     answer = answer_doc(finding)
     assert (answer["verdict"], answer["effects"], answer["proved"]) == ("unknown", [], False)
     assert [e["name"] for e in answer["suspects"]] == ["cyclic_error"]
-    assert "the fitted runs are still off by" in answer["proof"]
-    assert "the fitted runs are still off by" in verdict_of(finding)[2]
+    assert "even with the effect the fitted runs deviate by" in answer["proof"]
+    assert "even with the effect the fitted runs deviate by" in verdict_of(finding)[2]
 
 
 def test_a_smooth_axis_with_the_same_repeats_misses_nothing() -> None:

@@ -141,7 +141,7 @@ def test_without_a_change_what_could_hide_is_told(store: Store, tmp_path: Path) 
     found = compared(store, "july")
     assert found is not None
     assert found.changes == ()
-    assert changed_text(found) == "nothing has changed since solution 1 that these runs can tell"
+    assert changed_text(found) == "these runs show no change since solution 1"
     assert "scale of Z" in changed_lines(found)[1]
 
 
@@ -278,7 +278,7 @@ def test_what_cannot_be_compared_is_a_line_and_costs_no_finding(store: Store, tm
     found = compared(store, "july")
     assert found is not None
     assert changed_lines(found) == [changed_text(found)]
-    assert changed_text(found).startswith("what has changed since solution 1 could not be determined: ")
+    assert changed_text(found).startswith("the changes since solution 1 could not be determined: ")
 
 
 GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
@@ -289,9 +289,9 @@ GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
     [
         ({}, {}, True, "100% closed"),
         ({}, {"halves": 1}, False, "not chosen by each half of the runs alone: scale of X"),
-        ({"gap": GAP | {"after_um": 8.0}}, {}, False, "what is left is more than noise"),
-        ({"gap": GAP | {"before_um": 1.02}}, {}, True, "set-ups take up nearly all of it"),
-        ({"gap": GAP | {"before_um": 1.02}, "judged": -1.0}, {}, False, "runs that did not choose it are not more likely with it"),
+        ({"gap": GAP | {"after_um": 8.0}}, {}, False, "more than noise is left"),
+        ({"gap": GAP | {"before_um": 1.02}}, {}, True, "the fitted set-ups absorb nearly all of the change"),
+        ({"gap": GAP | {"before_um": 1.02}, "judged": -1.0}, {}, False, "runs that did not choose the change are not more likely with it"),
         ({"gap": None, "judged": None}, {"halves": 0}, False, "too few set-ups"),
         ({}, {"rivals": [{"name": "C0Y", "less_evidence": 1.0}]}, False, "cannot tell it from squareness of X and Y"),
         ({}, {"u": 7.0}, False, "zero is within its uncertainty"),

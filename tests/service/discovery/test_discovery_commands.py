@@ -104,7 +104,7 @@ def test_every_verdict_has_words_a_page_and_exit_code_0(
     assert "stored" not in out
     if verdict == "unknown":
         assert "about X 310, Y 240, Z 100 mm, within 30" in out
-        assert "measure next: repeat it where it lives (seen in ballbar circle; axis X; about X 310" in out
+        assert "measure next: repeat the measurement where the gap appears (seen in ballbar circle; axis X; about X 310" in out
     page = (tmp_path / "a.html").read_text()
     assert sign in page
     assert "No further measurement is needed" not in page

@@ -141,7 +141,7 @@ def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: 
 def test_the_answer_says_what_is_proved_and_by_which_rule(folder: Path) -> None:
     answer = answer_doc(discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress))
     assert (answer["verdict"], answer["proved"]) == ("named", True)
-    assert answer["proof"] == "at least 50% of the gap closes on the runs that judge"
+    assert answer["proof"] == "at least 50% of the gap closes on the holdout runs"
     assert [e["proved"] for e in answer["effects"]] == [True]
     assert answer_doc(discover(job_of(folder), DiscoveryJournal(), Search("none"), ignore_progress))["proved"] is False
 
@@ -165,11 +165,14 @@ def test_each_effect_has_to_be_needed_and_nothing_nameless_may_share_in_what_clo
     found = discover(job_of(folder), DiscoveryJournal(), Search(), ignore_progress)
     assert not_entered(found, judge(found)) is None
     second = replace(found.effects[0], label="cyclic_error:Y", alternatives=())
-    for needed, why in ((1.3, None), (1.0, "the runs that judge do not need cyclic_error:Y"), (None, None)):
+    for needed, why in ((1.3, None), (1.0, "the holdout runs do not need cyclic_error:Y"), (None, None)):
         both = replace(found, effects=(*found.effects, replace(second, needed=needed)))
         assert not_entered(both, judge(both)) == why
     nameless = replace(found, beside=(Unnamed(label="unnamed_step:Z", evidence=144.0),))
-    assert not_entered(nameless, judge(nameless)) == "what closes the gap is in part a structure without a name (unnamed step:Z)"
+    assert (
+        not_entered(nameless, judge(nameless))
+        == "part of the gap is closed by a structure that the catalogue does not name (unnamed step:Z)"
+    )
 
 
 def test_scatter_is_told_without_a_gap_that_it_cannot_close(folder: Path) -> None:
@@ -178,7 +181,7 @@ def test_scatter_is_told_without_a_gap_that_it_cannot_close(folder: Path) -> Non
     alone = replace(finding, effects=scatter, next_test=None, confounded_with=())
     told = "\n".join(lines_of(alone))
     assert "closed" not in verdict_of(alone)[2]
-    assert "no model takes scatter out" in told
+    assert "no model can remove scatter" in told
     assert "what else it could be: no rival was tried" in told
     assert {row[4] for row in gap_table(alone).rows} == {"n/a"}
     assert "fits these runs as well" in rival_lines(replace(finding.effects[0], alternatives=()))[0]
@@ -202,7 +205,7 @@ def changed(search: Search, **changes: Any) -> Any:
             (Agreement("r03", 1.82, 3e-7),),
             (),
             "open",
-            "the fitted runs to their noise; of the runs that were never fitted r03 1.8 times what noise",
+            "the fitted runs to their noise; runs that were never fitted deviate by more than noise and the prediction's own uncertainty allow: r03 1.8 times",
         ),
         ((Agreement("r03", 1.12, 0.03),), (), "ok", "explains all runs to their noise"),
         ((), (Unjudged("r03", "nobody knows"),), "ok", "explains the fitted runs to their noise; not judged, for nobody knows: r03"),
@@ -254,7 +257,7 @@ def test_kin_that_explains_nearly_all_but_costs_more_is_listed_with_its_odds(fol
     finding = discover(job_of(folder), DiscoveryJournal(), Search(ahead=25.0), ignore_progress)
     assert finding.confounded_with == ()
     (line,) = rival_lines(finding.effects[0])
-    assert line.endswith("(10^11 times less likely, but slightly bent it would look the same)")
+    assert line.endswith("(10^11 times less likely, but in a slightly different form it would look the same)")
     assert any(line in told for told in lines_of(finding))
     card = shown(found_report(job_of(folder), DiscoveryJournal(), finding, "now"))["sections"][0]["blocks"][0]
     assert {"name": "What else it could be", "value": line} in card["items"]
@@ -266,7 +269,7 @@ def test_runs_whose_readings_are_all_flagged_judge_nothing(folder: Path) -> None
     gaps = {"identify": Gap(3e-3, 3e-4, 3e-4), "holdout": Gap(float("nan"), float("nan"), 3e-4)}
     finding = discover(job_of(folder), DiscoveryJournal(), gapped(Search(), **gaps), ignore_progress)
     assert list(finding.gaps) == ["identify"]
-    assert judge(finding).rule == "no run of this campaign only judges"
+    assert judge(finding).rule == "no holdout run of this campaign can judge"
     for run in folder.glob("r03.json"):
         doc = json.loads(run.read_text())
         doc["columns"]["valid"] = [0] * len(doc["columns"]["t_s"])
@@ -284,7 +287,7 @@ def test_an_instrument_that_no_fitted_run_has_is_judged_by_the_noise_of_the_othe
 @pytest.mark.parametrize(
     ("roles", "ahead", "why"),
     [
-        (("identify", "identify", "sealed"), 4.2, "it is not proved, no run of this campaign only judges"),
+        (("identify", "identify", "sealed"), 4.2, "it is not proved: no holdout run of this campaign can judge"),
         (("identify", "identify", "holdout"), 2.9, "these runs hardly tell backlash:X from lateral_play:EYX"),
         (("identify", "identify", "holdout"), 3.1, None),
     ],

@@ -70,7 +70,7 @@ def test_the_later_of_two_discoveries_is_not_put_on_top_of_what_it_has_not_seen(
         discover(jobs[1], second, Search(width_um=9.0), ignore_progress)
     assert told.value.code == "DIS-004"
     assert "machine 'VMC-1' has model version 1 now, but the new version was made without any: nothing was added" in str(told.value)
-    assert told.value.remedy.startswith("run the same command again: it searches anew with what the model knows now")
+    assert told.value.remedy.startswith("run the same command again: it searches anew with the present model")
     one = pair[0]
     assert [(m.version, m.discovery_id) for m in one.models.all(NAME)] == [(1, first.id)]
     assert states_of(one, second) == ALL[:-1]  # the end and the version: both or none
