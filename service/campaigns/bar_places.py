@@ -66,7 +66,7 @@ class BarPlaces:
         Raises
         ------
         MeasurementFault
-            The bar did not read at every position.
+            A position has no valid reading.
         """
         first, self.mounted = not self.mounted, True
         recipe = HelixPoints(
@@ -79,11 +79,11 @@ class BarPlaces:
         self.run_ids += ids
         columns = (await asyncio.to_thread(load_run, self.store, ids[0])).columns
         if not columns.valid.all():
-            raise MeasurementFault("the ball-bar did not read at every place", "check the bar, then begin again")
+            raise MeasurementFault("the ball-bar gave no valid reading at some positions", "check the bar, then begin again")
         return PlaceReadings(columns.q_mm, columns.readings_mm)
 
     def directions(self, readings: PlaceReadings) -> F2:
-        """Unit vectors from the cup to the tool, shape (n, 3)."""
+        """Return unit vectors from the cup to the tool, shape (n, 3)."""
         out = readings.places_mm - np.array(self.centre_mm)
         return np.asarray(out / np.linalg.norm(out, axis=1)[:, None], dtype=np.float64)
 

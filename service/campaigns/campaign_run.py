@@ -44,7 +44,7 @@ async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
 
 
 class BarBreaks:
-    """Handles the loss of the box during a test. Without ``ballbar`` in the conditions of ``suspending`` it ends the measurement."""
+    """Handles the loss of the box during a test; without ``ballbar`` in the conditions of ``suspending``, a loss ends the measurement."""
 
     def __init__(self, session: Session, control: Control, suspending: Suspending) -> None:
         self._bar, self._control, self._suspending = session.ballbar, control, suspending
@@ -181,7 +181,7 @@ async def read_path(session: Session, store: Store, campaign: int, test: str, mo
 
 
 def halfway(item: Item) -> str:
-    """Question to a person before an interrupted path resumes."""
+    """Return the question to a person before an interrupted path resumes."""
     return f"Set-up {item.setup} was left mounted, {item.test.label} half read. Is it still untouched?"
 
 
@@ -190,7 +190,7 @@ class Resumed:
     """State from which an interrupted campaign resumes. ``done``: complete runs by test; ``start``: tests that do not begin as planned.
 
     ``campaign``: number and clock zero; ``mounted_us``: time of each mounting; ``messages``: findings, one sentence each; ``expected``:
-    controller run and table at the beginning of the campaign.
+    boot id and table of the controller at the beginning of the campaign.
     """
 
     campaign: tuple[int, int]
@@ -255,7 +255,7 @@ class CampaignRun:
             return run_id
 
     async def _ready(self) -> None:
-        """Check controller run, table and interlocks before a run, and clear a feed hold that a killed process left.
+        """Check boot id, table and interlocks of the controller before a run, and clear a feed hold that a killed process left.
 
         Raises
         ------
@@ -272,7 +272,7 @@ class CampaignRun:
     async def _next(
         self, item: Item, runner: Runner, why: RunInterrupted | SetupDisturbed | Interlock, so_far: ReadProgress | None
     ) -> Item:
-        """Wait until the test can resume, and return it from its last checkpoint.
+        """Wait until the test can resume, and return its rest from the last checkpoint.
 
         Raises
         ------

@@ -48,7 +48,7 @@ U_DELAY_S = 2e-3
 
 @dataclass(frozen=True, slots=True)
 class ListenRequest:
-    """One reading of the recipe: position and direction."""
+    """One reading of the recipe: position, direction, distance along the beam from the first reading, and settling time."""
 
     target_mm: Point
     direction: int
@@ -65,7 +65,7 @@ class Heard:
 
 
 def planned_readings(test: TestPlan) -> list[ListenRequest]:
-    """Return the readings of a laser test in order. Raises MeasurementFault for a test without single laser readings."""
+    """Return the readings of a laser test in order. Raises MeasurementFault for a test without laser readings at standstills."""
     here, out = None, list[ListenRequest]()
     beam = np.array(next((s.beam for s in test.steps if isinstance(s, MountLaser)), test.setup.get("nominal_beam", (0.0, 0.0, 0.0))))
     for step in test.steps:
@@ -76,7 +76,7 @@ def planned_readings(test: TestPlan) -> list[ListenRequest]:
             out.append(ListenRequest(here, step.direction, float(beam @ np.subtract(here, first)), step.settle_s))
     if len(out) < 2:
         raise MeasurementFault(
-            f"test {test.label} has no single laser readings", "listening takes laser tests; measure the others by themselves"
+            f"test {test.label} has no laser readings at standstills", "listen to laser tests only; measure the others separately"
         )
     return out
 
@@ -200,8 +200,11 @@ def _fit(pairs: list[tuple[int, float]]) -> ClockFit:
 
 
 def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: float) -> list[float]:
-    """Laser time of every planned reading, (n,) s, rising: the middle of its window. Missing readings get interpolated times: between their
-    neighbours, before the first found one from ``start_s`` on, after the last found one at steps of ``apart_s``."""
+    """Return the laser time of every planned reading, shape (n,), s, rising: the middle of its window.
+
+    Missing readings get interpolated times. Before the first found reading these begin at ``start_s``, after the last they are ``apart_s``
+    apart.
+    """
     found = [(k, 0.5 * (one.start_s + one.end_s)) for k, one in enumerate(readings) if one is not None]
     at, times = [float(k) for k, _ in found], [t for _, t in found]
     last = len(readings) - 1
@@ -213,7 +216,7 @@ def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: 
 
 
 def _record(one: ListenRequest, reading: DwellReading | None, middle_s: float, heard: Heard, times: Callable[[F1], F1]) -> dict[str, Any]:
-    """Return a record of one standstill, as the sequencer makes it; for a missing one its nominal position, marked as missing."""
+    """Return the record of one standstill in the sequencer's form; a missing reading gets the nominal position and is marked as missing."""
     near = min(heard.readings, key=lambda r: abs(r.device_us * 1e-6 - middle_s))
     value: dict[str, Any] = {"displacement_tenth_nm": round(one.along_mm / MM_PER_COUNT), "missing": True}
     if reading is not None:

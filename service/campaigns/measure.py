@@ -122,7 +122,7 @@ LAST_LINE_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class AttemptContext:
-    """Runner, part, journal and live view of one attempt at a test."""
+    """Runner, attempt, journal and live view for one run of a test."""
 
     runner: Runner
     attempt: Attempt
@@ -331,7 +331,7 @@ async def measure_test(  # noqa: PLR0913 - a test, its devices, its destination,
     clock: Clock,
     context: AttemptContext | None = None,
 ) -> int:
-    """Measure one test as one run; an early end is written into the run before its error leaves."""
+    """Measure one test as one run; if it ends early, store the reason in the run before raising the error."""
     context = context or AttemptContext(Runner(session), Attempt(), NoJournal())
     runner, attempt, journal = context.runner, context.attempt, context.journal
     doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
@@ -418,6 +418,6 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
 
 
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
-    """Number of readings at standstill in a whole run: those of its steps and the carried ones, of which the last is read again."""
+    """Return the number of readings at standstill in a whole run: those of its steps and those kept, of which the last is read again."""
     count = sum(isinstance(step, ReadLaser | ReadBar) for step in test.steps)
     return {"standstills": count + max(0, len(attempt.resume_trail.carried) - 1)} if count else {}

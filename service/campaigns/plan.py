@@ -115,15 +115,15 @@ def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[
 
 
 BOUND_NOTE = (
-    "U is the posterior (Bayesian Cramer-Rao) bound of these readings over the inner 80 % of the volume, rigid motion taken out, and the "
-    "temperature of the scales; left out are error motions above the plan's order and that noise and typical sizes are estimated: "
-    "`abbe solve` states both, so its U may be larger; on a machine better than the priors it is smaller"
+    "U is the posterior (Bayesian Cramer-Rao) bound for these readings over the inner 80 % of the volume, without rigid motion, with the "
+    "temperature of the scales; it leaves out error motions above the plan's order, and that noise and typical sizes are only estimated; "
+    "`abbe solve` includes both, so its U may be larger; on a machine better than the priors its U is smaller"
 )
 
 
 @dataclass(frozen=True)
 class PlannedCampaign:
-    """A plan with its recipes, campaign, dry run of every test, and recipe file text. ``notes``: for a person, before it runs."""
+    """A plan with its recipes, campaign, dry run of every test, and recipe file text; ``notes``: what a person should know beforehand."""
 
     plan: Plan
     recipes: tuple[Recipe, ...]
@@ -234,7 +234,7 @@ def goal_lines(plan: Plan) -> list[str]:
 
 
 def step_rows(plan: Plan) -> list[tuple[str, ...]]:
-    """Table of a plan: set-up, label, measurement, minutes, minutes so far, worst and mean U (k = 2) after it, µm."""
+    """Return the rows of a plan: set-up, label, measurement, minutes, minutes so far, worst and mean U (k = 2) afterwards, µm."""
     before = tuple(_um(COVERAGE * u) for u in plan.u_before_mm)
     rows: list[tuple[str, ...]] = [("", "", "from the priors alone", "", "0", *before)]
     for s in plan.steps:
@@ -244,7 +244,7 @@ def step_rows(plan: Plan) -> list[tuple[str, ...]]:
 
 
 def plan_report(site: Site, planned: PlannedCampaign) -> Document:
-    """Report with the picture of the set-ups and the gain of each measurement."""
+    """Return a report with a picture of the set-ups and the gain of each measurement."""
     plan = planned.plan
     paths = [
         DrawnTest(int(s.setup_id.removeprefix("S")), _kind(s.test), describe(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
@@ -276,7 +276,7 @@ def _mount_mm(test: Measurement, path_mm: F2) -> F1:
 
 
 def plan_doc(planned: PlannedCampaign) -> dict[str, Any]:
-    """Plan as JSON object, in micrometres and minutes."""
+    """Return a plan as JSON object, in micrometres and minutes."""
     plan, goal = planned.plan, planned.plan.goal
     steps = [
         {

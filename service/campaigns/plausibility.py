@@ -1,8 +1,8 @@
 """Checks before anything moves: which devices a campaign needs and whether all of them answer, and what is wrong in a machine file.
 
-Errors and probable mistakes in a machine file are found now, not at night by a schedule. `abbe.service.config_schema` refuses impossible
-values (a stroke of 1e9 mm, 68 degrees C) when it reads the file. The laser check takes a reading and ignores the beam, which is aligned and
-zeroed only when the laser is mounted during the campaign.
+Errors and probable mistakes in a machine file are found at once, not by the schedule at night. `abbe.service.config_schema` refuses
+impossible values (a stroke of 1e9 mm, 68 degrees C) when it reads the file. The laser check takes a reading and ignores the beam, which is
+aligned and zeroed only when the laser is mounted during the campaign.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def check_configured(needed: Needed, there: Collection[str]) -> None:
     if missing:
         listed = " and ".join(f"{ROLE_NAMES[role]} for {needed.first[role]}" for role in missing)
         keys = ", ".join(f"{role} = ..." for role in missing)
-        raise ConfigError(f"this needs {listed}, and the machine file names none", f"add {keys} under [devices]")
+        raise ConfigError(f"the plan needs {listed}, and the machine file names none", f"add {keys} under [devices]")
 
 
 async def check_devices(session: Session, plan: CampaignPlan, *, air: bool = False) -> None:
@@ -178,7 +178,7 @@ def check_unattended(config: MachineFile, folder: Path) -> None:
 
 
 def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
-    """Reasons why scheduled checks and their automatic follow-ups could not run: recipe, strokes, feed, devices, fixture."""
+    """Return the reasons why scheduled checks and their automatic follow-ups could not run: recipe, strokes, feed, devices, fixture."""
     found = []
     for entry in config.schedule:
         found += _lines(entry, site, lambda entry=entry: recipe_plan(entry.recipe, site.machine))  # type: ignore[misc]
@@ -190,7 +190,7 @@ def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
 
 
 def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> list[str]:
-    """Messages about expired certificates of these instruments."""
+    """Return messages about expired certificates of these instruments."""
     return [
         f"the certificate of the {INSTRUMENTS[role]} has ended on {day}: what is measured now goes into no table ([calibration] {role})"
         for role, day in ended_certificates(site, today, roles).items()
@@ -198,7 +198,7 @@ def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) ->
 
 
 def ended_certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> dict[str, date]:
-    """Last valid days of the expired certificates of these instruments, by role."""
+    """Return the last valid days of the expired certificates of these instruments, by role."""
     return {role: day for role, day in site.calibrated_until.items() if role in roles and day < today}
 
 

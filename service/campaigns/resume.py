@@ -80,7 +80,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     Raises
     ------
     PreconditionsChanged
-        The plan, the machine, the table or the run of the controller is another.
+        The plan, the machine or the table is another, or the controller was restarted.
     UnsafeToMove
         Another process is measuring the campaign, or an interlock holds.
     """
@@ -90,7 +90,7 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     comp = await session.controller.comp_status()
     expected = ExpectedTable(lines.begun.boot_id, lines.begun.table_crc)
     check_expected(expected, comp.boot_id, comp.bank_crc[comp.active_bank])
-    messages = [f"campaign {campaign.name!r}: same plan, same machine, same run of the controller, same table"]
+    messages = [f"campaign {campaign.name!r}: plan, machine and table are the same, and the controller was not restarted"]
     status = await session.controller.status()
     check_ours(status)
     if status.moving:
@@ -122,7 +122,7 @@ def _same_plan(store: Store, campaign: CampaignRecord, lines: JournalEntries, si
         )
     if store.machines.get(campaign.machine_id).doc != site.doc:
         raise PreconditionsChanged(
-            f"campaign {campaign.name!r} is of another machine, or its description was changed", "measure a new campaign"
+            f"campaign {campaign.name!r} was measured on another machine, or the machine file was changed", "measure a new campaign"
         )
 
 

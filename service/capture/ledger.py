@@ -49,7 +49,7 @@ class SampleGap:
 
 @dataclass(slots=True)
 class Ledger:
-    """Account of one run's sequence numbers. Samples and gaps come in any order; `unaccounted` lists what no entry covers."""
+    """Account of one run's sequence numbers. Samples and gaps come in any order; `unaccounted` lists the numbers that no entry covers."""
 
     flagged: dict[str, int] = field(default_factory=dict)
     gaps: list[SampleGap] = field(default_factory=list)
@@ -131,8 +131,8 @@ class Ledger:
 BAR, GAPS, RUN = "bar", "gaps", "run"
 MAX_SAMPLES = 4096
 WIRE = "lost or damaged on the line"
-BOX = "the box lost them (buffer overrun)"
-SLOW = "this computer did not keep up: the ring was full"
+BOX = "lost in the ball-bar's box (buffer overrun)"
+SLOW = "this computer did not keep up: the driver's buffer was full"
 
 Item = tuple[int, BarBatch] | tuple[str, dict[str, Any]]
 """A batch with its stream, or a record with its channel."""
@@ -297,7 +297,7 @@ TORN = "the end of the segment is torn or damaged: the number of its samples is 
 def ledger_of(chunks: list[ChunkRecord], streams: dict[int, int] | None = None) -> Ledger:
     """Return the ledger of a stored run from the chunks of all its channels.
 
-    ``streams``: stream of a chunk by its number, if a segment has it; else a new stream begins where the numbers go back.
+    ``streams``: stream of each chunk by its number, from a segment. For other chunks a new stream begins where sequence numbers go back.
 
     Raises
     ------
@@ -371,7 +371,7 @@ def _holes(ledger: Ledger, scanned: Scan) -> list[SampleGap]:
     found = [SampleGap(stream, first, last, DAMAGED, None, None) for stream, first, last in ledger.unaccounted()]
     ends = ledger.ends()
     for record in scanned.records:
-        if record.kind == CLOSE:  # it states the last durable number
+        if record.kind == CLOSE:  # states the last durable sequence number
             stream, seq = decode_json(record.payload)[0].get("durable", {}).get(BAR, (0, -1))
             if seq >= ends.get(stream, 0):
                 found.append(SampleGap(stream, ends.get(stream, 0), seq, DAMAGED, None, None))

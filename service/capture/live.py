@@ -117,7 +117,7 @@ def _cut(path: int, numbers: list[int], values: Values, host_s: float) -> list[S
 
 
 def angles_along(points_mm: Sequence[Point], setup: Mapping[str, Any]) -> tuple[F1, float]:
-    """Angle about a ball-bar test's axis at `ANGLES` equally spaced positions of its path, degrees, unwrapped; and the path's length in mm.
+    """Return the angle about a ball-bar test's axis at `ANGLES` equally spaced path positions, degrees, unwrapped; and the path length, mm.
 
     Angles count from the first axis of the plane to its second, as in a recipe. The angles are empty if neither set-up nor path defines the
     axis: such a path has no polar plot.

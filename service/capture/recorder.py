@@ -246,7 +246,7 @@ Look = Callable[[BarBatch], None]
 
 
 def ignore_batch(_: BarBatch) -> None:
-    """No live view."""
+    """Ignore the batch: there is no live view."""
 
 
 class _Tap:
@@ -410,7 +410,7 @@ async def recording(
     if recorder.behind:
         raise StoreError(
             f"the database did not take all samples within {CATCH_UP_S:g} s; they are safe in {recorder.log.segment.path}",
-            "see to the database; the next `abbe` command that connects to the machine takes them over",
+            "check the database; the next `abbe` command that connects to the machine takes them over",
         )
 
 
@@ -443,14 +443,14 @@ def _opened(
     path = segment_path(folder, run_id)
     _active.add(_key(path))  # before a recovery could find the file
     try:
-        if path.exists():  # of a deleted database, whose numbers are used again
+        if path.exists():  # left by a deleted database, whose run numbers are used again
             set_aside(path, ORPHAN)
         drafter = Drafter(run_id, lambda: clock.utc().timestamp() - clock.monotonic_s())
         log, ingest = _begun(store, Segment(io, path), drafter, reserve, opening, published)
     except BaseException as error:
         _active.discard(_key(path))
         if isinstance(error, OSError):
-            raise fault(path, "open", error) from error
+            raise fault(path, "open the segment", error) from error
         raise
     return CaptureRecorder(log, ingest, settings.keep, io, temporary=temporary)
 
@@ -469,7 +469,7 @@ def _make(folder: Path, io: FileIO) -> None:
 def _begun(
     store: Store, segment: Segment, drafter: Drafter, reserve: Reserve, opening: dict[str, Any], published: Published
 ) -> tuple[CaptureLog, Ingest]:
-    """Start both threads of a recording, or neither; then the segment is closed."""
+    """Start both threads of a recording; if one fails, end both and close the segment."""
     logs: list[CaptureLog] = []
     with ExitStack() as undo:
         undo.callback(segment.close)

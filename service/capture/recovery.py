@@ -87,7 +87,7 @@ def exclusive_lock(path: Path, wait_s: float = WAIT_S) -> Iterator[bool]:
     try:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
     except OSError as error:
-        raise CaptureFault(f"{path}: lock: {error.strerror}", "look at the folder of the segments and its rights") from error
+        raise CaptureFault(f"{path}: cannot be locked: {error.strerror}", "check the folder of the segments and its permissions") from error
     try:
         until_s = time.monotonic() + wait_s
         while not (locked := _try_lock(handle)) and time.monotonic() < until_s:
@@ -208,7 +208,7 @@ def _read(path: Path) -> Scan:
 def _recover_one(store: Store, path: Path, known: _KnownRuns, settings: CaptureSettings) -> RecoveredRun | None:
     number = path.stem.rpartition("-")[2]
     if not number.isdecimal() or path.name != segment_path(path.parent, int(number)).name:
-        return _aside(path, CONFLICT, None, "it has the name of no segment")
+        return _aside(path, CONFLICT, None, "its name is not that of a segment")
     run = known.get(int(number))
     if is_active(path) or (run is not None and run.status == RUNNING and not _abandoned(run)):
         return None
@@ -217,7 +217,7 @@ def _recover_one(store: Store, path: Path, known: _KnownRuns, settings: CaptureS
             if not free:
                 return _report(run, f"a recording process still writes {path.name}; nothing was done")
             return _take_over(store, path, run, settings)
-    except CaptureFault as error:  # of a newer version, which can recover it
+    except CaptureFault as error:  # the segment is of a newer version, which can recover it
         return _report(run, f"{path.name} was left as it is: {error}")
     except (CaptureConflict, ValueError, KeyError, TypeError, OSError) as error:
         return _give_up(store, path, run, error)
@@ -335,7 +335,7 @@ def _ending(scanned: Scan, added: int) -> str:
     why = "the process ended before the run was closed"
     if closing:
         end = decode_json(closing[0].payload)[0]
-        why = f"recorded to its end ({end['status']}), but the process ended before the database knew"
+        why = f"recorded to its end ({end['status']}), but the process ended before the database was updated"
     parts = [f"interrupted: {why}"]
     if added:
         parts.append(f"{added} chunks were taken over from the segment")

@@ -146,7 +146,7 @@ class Segment:
         except OSError as error:
             with suppress(CaptureFault, DiskFull):
                 self.close()  # releases the lock
-            raise fault(path, "make", error) from error
+            raise fault(path, "create the segment", error) from error
 
     def append(self, records: Sequence[Record]) -> list[tuple[int, int]]:
         """Write records and wait until they are on the disk; return offset and length of each.
@@ -201,7 +201,7 @@ class Segment:
             self._io.sync(self._handle)
         except OSError as error:
             self.dead = True
-            raise CaptureFault(f"{self.path}: sync: {error.strerror or error}", _DISK) from error
+            raise CaptureFault(f"{self.path}: cannot sync to the disk: {error.strerror or error}", _DISK) from error
 
     def _cut_back(self) -> None:
         try:
@@ -214,10 +214,10 @@ _DISK = "look at the disk and at the system's log; everything acknowledged befor
 
 
 def fault(path: Path, what: str, error: OSError) -> CaptureFault | DiskFull:
-    """Convert a disk error to DiskFull or CaptureFault."""
+    """Convert a disk error to DiskFull or CaptureFault; ``what``: the failed action, as a verb."""
     if error.errno in NO_SPACE:
-        return DiskFull(f"{path}: {what}: no space left on the disk", "free disk space, then measure this test again")
-    return CaptureFault(f"{path}: {what}: {error.strerror or error}", _DISK)
+        return DiskFull(f"{path}: cannot {what}: no space left on the disk", "free disk space, then measure this test again")
+    return CaptureFault(f"{path}: cannot {what}: {error.strerror or error}", _DISK)
 
 
 MAGIC = b"AbbC"
@@ -294,7 +294,7 @@ def encode(record: Record) -> bytes:
 
 
 def digest(encoded: bytes | memoryview) -> bytes:
-    """SHA-256 of an encoded record, for the next record."""
+    """Return the SHA-256 of an encoded record, for the next record."""
     return hashlib.sha256(encoded).digest()
 
 

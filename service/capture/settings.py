@@ -1,4 +1,4 @@
-"""Folder of the segments until the database has everything: beside a SQLite file, else from the machine file."""
+"""Settings of the capture, and the folder of the segments: beside a SQLite file, else from the machine file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class CaptureSettings:
 
 
 def is_memory(database_url: str) -> bool:
-    """Whether the database is in memory only: it ends with the process, and segments that outlast it would belong to no database."""
+    """Whether the database is in memory only: it ends with the process, so segments that outlast it would belong to no database."""
     parsed = parse_url(database_url)
     return parsed.drivername == "sqlite" and parsed.database in {None, "", ":memory:"}
 
@@ -75,13 +75,13 @@ def segment_folder(database_url: str, settings: CaptureSettings, database_id: st
 
 
 def _named(folder: str, name: str, what: str) -> Path:
-    """Subfolder per database: several databases may share a folder, and use the same run numbers."""
+    """Return the subfolder of one database: several databases may share a folder, and use the same run numbers."""
     readable = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-")
     return Path(folder) / f"{readable}-{hashlib.sha256(what.encode()).hexdigest()[:8]}"
 
 
 def other_folders(database_url: str, settings: CaptureSettings, present: Path) -> list[Path]:
-    """Folders where earlier versions or another machine file may have left segments of this database.
+    """Return the folders where earlier versions or another machine file may have left segments of this database.
 
     They may also hold segments of other databases: touch a segment only if its run is in this database.
     """
@@ -98,7 +98,7 @@ def other_folders(database_url: str, settings: CaptureSettings, present: Path) -
 
 
 def segment_path(folder: Path, run_id: int) -> Path:
-    """The segment of a run."""
+    """Return the path of a run's segment."""
     return folder / f"run-{run_id:08d}{SUFFIX}"
 
 

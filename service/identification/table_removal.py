@@ -58,7 +58,7 @@ def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
     if crc is None:
         return NO_TABLE
     if len(acted) < len(stated) or any(one.crc != crc for one in acted):
-        return CampaignTable(None, f"these runs were not all measured with one table: {NOT_REMOVED}")
+        return CampaignTable(None, f"the runs were measured with different compensation tables: {NOT_REMOVED}")
     image = images_of(store)(crc)
     if image is None:
         sure = any(one.acting for one in acted)  # runs of older versions do not state whether a table acted

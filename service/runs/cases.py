@@ -68,7 +68,7 @@ def _run(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Case
 
 
 def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Path:
-    """The path of a run, without its readings."""
+    """Return the path of a run, without its readings."""
     setup, t_s, q = run.setup, run.columns.t_s, run.columns.q_mm
     temp = run.columns.temperatures_c
     first = {s: v[:1] for s, v in temp.items()}
@@ -77,7 +77,7 @@ def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> P
     if t_s[0] < t_set - CLOCKS_S:
         raise MeasurementFault(
             f"run {run.run_id}: its first reading is {t_set - t_s[0]:.0f} s before its set-up was mounted (t_set_s)",
-            "write t_s and t_set_s in s of one clock for the whole campaign: what drifts is judged by them",
+            "write t_s and t_set_s in seconds of one clock for the whole campaign: drift is judged by them",
         )
     common: dict[str, Any] = {
         "label": run.run_id,
@@ -110,7 +110,7 @@ def _feed(run: Run) -> F1:
 
 
 def _driven_feed(q_mm: F2, t_s: F1, feed_mm_min: F1) -> F1:
-    """The stated feed, mm/min, or the feed from positions and times if both contradict each other."""
+    """Return the stated feed, mm/min, or the one from positions and times if they disagree."""
     took_s = np.diff(t_s)
     if not took_s.size or not (took_s > 0.0).all():
         return feed_mm_min

@@ -20,7 +20,7 @@ MAX_DIGITS = 308
 
 
 def refuse_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """``object_pairs_hook`` of ``json.loads`` for objects with distinct keys.
+    """Build an object with distinct keys, as ``object_pairs_hook`` of ``json.loads``.
 
     Raises
     ------
@@ -30,16 +30,16 @@ def refuse_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise ValueError(f"key {key!r} stands twice in one object")
+            raise ValueError(f"key {key!r} appears twice in one object")
         found[key] = value
     return found
 
 
 def strict_json(text: str, path: Path, *, finite: bool = True) -> Any:
-    """Value of a JSON text; ``path`` is named in errors.
+    """Parse a JSON text; ``path`` is named in errors.
 
-    ``finite``: refuse ``NaN``, ``Infinity`` and numbers beyond float64 such as ``1e999``. Callers that check numbers themselves, and can
-    name their place in the document, pass False.
+    ``finite``: refuse ``NaN``, ``Infinity`` and numbers beyond float64 such as ``1e999``. Callers that check numbers themselves pass
+    False, and can then name the key in the document.
 
     Raises
     ------
@@ -150,7 +150,8 @@ def check_run(path: Path, document: Doc) -> RunFile:
     for row in range(1, length):
         if times[row] < times[row - 1]:
             raise FileFormatError(
-                f"{path}: columns.t_s, row {row + 1}: expected at least {times[row - 1]}, got {times[row]}", "time never runs back"
+                f"{path}: columns.t_s, row {row + 1}: expected at least {times[row - 1]}, got {times[row]}",
+                "write the rows in order of time",
             )
     return found
 

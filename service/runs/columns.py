@@ -1,4 +1,4 @@
-"""Read stored runs: the only place where raw samples become columns. Before that the lossless packing of samples into chunks, pure:
+"""Read stored runs: the only place where raw samples become columns. Also the lossless packing of samples into chunks:
 
 ``bar/1``: zlib over ``<IQiH`` (seq, device_us, reading_nm, status) for each ball-bar sample.
 ``json/1``: zlib over JSON lines, one record per line, floats as written by Python's ``repr``.
@@ -45,7 +45,7 @@ def encode_bar(samples: Sequence[BarSample]) -> bytes:
 
 
 def pack_bar(samples: Sequence[BarSample]) -> bytes:
-    """Ball-bar samples as consecutive ``<IQiH``, uncompressed."""
+    """Pack ball-bar samples as consecutive ``<IQiH``, uncompressed."""
     return b"".join(_SAMPLE.pack(one.seq, one.device_us, one.reading_nm, one.status) for one in samples)
 
 
@@ -126,7 +126,7 @@ def load_run(store: Store, id_or_label: int | str) -> Run:
 
 
 def whole_run(store: Store, record: RunRecord) -> Run:
-    """A run with its pieces; raises like `load_run`."""
+    """Return a run with its pieces; raises like `load_run`."""
     run = single_run(record, store.chunks.of_run(record.id))
     pieces = record.start.pieces
     if not pieces:
@@ -144,7 +144,7 @@ def whole_run(store: Store, record: RunRecord) -> Run:
 
 
 def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
-    """A run as an ``abbe-run/1`` document. An imported run is as it was, including unknown keys."""
+    """Return a run as an ``abbe-run/1`` document; an imported run as it was, including unknown keys."""
     imported = _imported(record, chunks)
     if imported is None:
         return run.to_document()
@@ -152,7 +152,7 @@ def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> 
 
 
 def path_progress(store: Store, run: int) -> ReadProgress | None:
-    """Progress of a path after its last interrupted run and the earlier pieces; None if it has to start again."""
+    """Return the progress of a path after its last interrupted run and the earlier pieces; None if it has to start again."""
     record = store.runs.find(run)
     if record.reason.startswith(StretchDiffers.code):
         return None  # either of the two readings of the stretch may be wrong
@@ -170,7 +170,7 @@ def path_progress(store: Store, run: int) -> ReadProgress | None:
 
 
 def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
-    """A run without its pieces, from all its chunks in order of seq within a channel.
+    """Return a run without its pieces, from all its chunks in order of seq within a channel.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as err:
         raise StoreError(
-            f"run {record.campaign}/{record.label}: its documents lack or garble {err}",
+            f"run {record.campaign}/{record.label}: its documents have a missing or invalid field: {err}",
             "it was not written by Abbe, or is damaged: restore a backup",
         ) from None
 
@@ -214,7 +214,7 @@ def _check_documents(record: RunRecord) -> None:
 
 
 def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:
-    """An imported run exactly as it was; None for a measured one."""
+    """Return an imported run exactly as it was; None for a measured one."""
     imported = record.start_doc.get("imported")
     return None if imported is None else dict(imported) | {"columns": unpack_columns(chunks)}  # the key keeps its place
 

@@ -1,9 +1,9 @@
-"""Share of its commanded path that a run has read, and whether it is judged: the common rule for results, reports, pages and comparisons.
+"""Share of its commanded path that a run has read, and whether the run is judged: one rule for results, reports, pages and comparisons.
 
 A run that was stopped, aborted, interrupted or failed gives no result, and neither does one that has read less than `LEAST` of its path. A
-complete run with a few counted gaps is judged. A run that was measured in pieces counts with all of them.
+complete run with a few counted gaps is judged. A run that was measured in pieces counts with all its pieces.
 
-Also the axis of a ball-bar path and the angle about it, by which turns are counted here and drawn in pages and the live picture.
+Also the axis of a ball-bar path and the angle about it, for counting turns here and for drawing them in pages and the live view.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from abbe.service.domain.run import BarSetup, Run, RunState
 from abbe.service.errors import AbbeError, MeasurementFault
 
 STRAIGHT = 0.8
-"""Along its axis a helix advances: least ratio of net to total travel."""
+"""Smallest ratio of net to total travel along the axis of a helix."""
 ROUND = 0.5
-"""Across its axis a helix goes round: largest ratio of net to total travel. Less than a turn is not a helix."""
+"""Largest ratio of net to total travel across the axis of a helix, which goes round. Less than a turn is not a helix."""
 
 
 def helix_axis(stated: str, at_mm: F2) -> int | None:
-    """Axis of a helix, 0 to 2: as the set-up states it, else the axis along which the commanded path advances.
+    """Return the axis of a helix, 0 to 2: as the set-up states it, else the axis along which the commanded path advances.
 
     None if the set-up states no axis, and the path advances along none or along several.
 
@@ -49,20 +49,20 @@ def helix_axis(stated: str, at_mm: F2) -> int | None:
 
 
 def about_axis(at_mm: F2, axis: int) -> F1:
-    """Angle of points about an axis, rad, shape (n,), from the next axis towards the one after it (about Z: from X to Y)."""
+    """Return the angle of points about an axis, rad, shape (n,), from the next axis towards the one after it (about Z: from X to Y)."""
     a, b = (axis + 1) % 3, (axis + 2) % 3
     return np.asarray(np.arctan2(at_mm[:, b], at_mm[:, a]), dtype=np.float64)
 
 
 def circle_axis(plane: str) -> int:
-    """Axis normal to a plane given by two letters, 0 to 2. Raises MeasurementFault for anything else."""
+    """Return the axis normal to a plane given by two letters, 0 to 2. Raises MeasurementFault for anything else."""
     if len(plane) != 2:
         raise MeasurementFault(f"a circle lies in a plane of two axes, not in {plane!r}", "state the plane in its set-up, for example XY")
     return 3 - sum(AXES.index(letter) for letter in plane)
 
 
 def path_axis(run: Run, at_mm: F2) -> int:
-    """Axis of a ball-bar run: the normal of a circle's plane, or `helix_axis`.
+    """Return the axis of a ball-bar run, 0 to 2: the normal of a circle's plane, or `helix_axis`.
 
     Raises
     ------
@@ -81,12 +81,12 @@ def path_axis(run: Run, at_mm: F2) -> int:
 
 
 LEAST = 0.9
-"""Smallest share of the commanded path that must be read for a judgement: the missing part may contain the largest deviation."""
+"""Smallest share of the commanded path that a judged run must have read: the missing part may contain the largest deviation."""
 COMPLETE = "complete"
 GAP_MM, GAP_SAMPLES = 5.0, 10.0
 """Two valid readings farther apart than both limits leave the path between them unread."""
 LEAST_A_TURN = 8
-"""Minimum number of readings per turn; with fewer, this many count as one turn that was read."""
+"""Minimum number of readings per turn; in a run with fewer, each group of this many counts as one turn."""
 GAP_STEPS, GAP_SHARE = 3.0, 0.15
 """For a file, whose commanded path is unknown: two neighbours farther apart than this many median steps, and than this share of a laser run
 or of a turn, leave the path between them unread."""
@@ -105,7 +105,7 @@ def with_state(run: Run, record: RunRecord, begun: RunStart | None = None) -> Ru
 
 
 def covered_share(run: Run) -> float | None:
-    """Share of its commanded path that a run has read, 0 to 1.
+    """Return the share of its commanded path that a run has read, 0 to 1.
 
     None if neither the store nor the set-up states a path; NaN for a helix that is too short to determine its axis.
     """
@@ -113,7 +113,7 @@ def covered_share(run: Run) -> float | None:
 
 
 def not_judged(run: Run) -> str:
-    """Why a run gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
+    """Tell why a run gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
     status = COMPLETE if run.state is None else run.state.status
     share = covered_share(run)
     if status == COMPLETE and (share is None or share >= LEAST):
@@ -133,7 +133,7 @@ def check_judged(run: Run) -> None:
     """
     why = not_judged(run)
     if why:
-        raise MeasurementFault(f"run {run.run_id}: {why}", "measure it again, or go on with it: abbe measure MACHINE.toml --resume")
+        raise MeasurementFault(f"run {run.run_id}: {why}", "measure it again, or resume it: abbe measure MACHINE.toml --resume")
 
 
 def _of_path(run: Run, start: RunStart) -> float | None:
@@ -178,7 +178,7 @@ def _turned(setup: BarSetup, at: F2, *, circle: bool) -> float | None:
 
 
 def _read(x: F1, least: float) -> float:
-    """Range of the readings minus the gaps that are too wide for their usual step."""
+    """Return the range of the positions ``x`` minus the gaps that are much wider than the usual step."""
     steps = np.abs(np.diff(x))
     moved = steps[steps > 0.0]
     wide = steps[steps > max(least, GAP_STEPS * float(np.median(moved)))] if moved.size else steps

@@ -75,7 +75,7 @@ def _further(part: BaseModel) -> dict[str, Any]:
 
 
 def axis_function(one: formats.ErrorFunction) -> AxisFunction:
-    """The function that one entry of ``motions`` describes.
+    """Build the function that one entry of ``motions`` describes.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def _covariance(path: Path, given: Mapping[str, Any] | None, motions: ErrorMotio
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         return (
             None,
-            f"no uncertainty: the covariance of the errors file speaks of {unknown[0]!r}{more}, which is not a parameter of its functions",
+            f"no uncertainty: the covariance of the errors file names {unknown[0]!r}{more}, not a parameter of its functions",
         )
     return (names, matrix), _covered(names, motions)
 
@@ -139,7 +139,7 @@ def _covered(names: tuple[str, ...], motions: ErrorMotions) -> str:
         whole = not any(f"{key}.{k}" in named for k in range(function.parameters.size))
         certain += ([key] if left else []) if whole else _runs(key, left)
     text = f"u from the covariance of the errors file ({len(names)} parameters)"
-    return text + (f"; without uncertainty there, so counted as certain: {', '.join(certain)}" if certain else "")
+    return text + (f"; not in this covariance, so taken as exact: {', '.join(certain)}" if certain else "")
 
 
 def _runs(key: str, indices: list[int]) -> list[str]:

@@ -77,7 +77,7 @@ def _parsed(path: Path, run: Doc) -> Run:
     try:
         return Run.from_document(run)
     except StoreError as err:
-        raise FileFormatError(f"{path}: {err.detail}", "leave out what Abbe did not write, or correct it") from None
+        raise FileFormatError(f"{path}: {err.detail}", "correct this key or leave it out: only Abbe writes it") from None
 
 
 def import_folder(store: Store, folder: Path) -> int:

@@ -37,7 +37,7 @@ def with_reversals(run: Run, q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dt
     Returns
     -------
     path, rows
-        Positions with the reversals, shape (m, 3), and the index in it of every row, shape (n,).
+        Positions with the reversals, shape (m, 3), and the index of every row in them, shape (n,).
     """
     rows = np.arange(len(q_mm))
     if run.test != "laser_linear" or not np.isfinite(q_mm).all() or run.laser.end_mm is None:
@@ -62,7 +62,7 @@ def _along(run: Run) -> F1:
 
 
 def _went_beyond(run: Run, q_mm: F2, way: F1, turned: np.ndarray[tuple[int], np.dtype[np.intp]]) -> bool:
-    """Whether the two readings at a reversal differ like readings from opposite sides at the other places, rather than like repeats."""
+    """Whether the two readings at a reversal differ like readings from opposite sides elsewhere, rather than like repeats."""
     if run.is_sealed:
         return False
     y = run.columns.readings_mm
@@ -83,11 +83,11 @@ BLOCKS = 400
 LEAST = 10
 """Minimum number of valid readings of a run."""
 TESTS: dict[str, Test] = {"ballbar_helix": "helix", "ballbar_circle": "circle", "laser_diagonal": "diagonal", "laser_linear": "linear"}
-"""Tests of run-format.md 3; plain diagonals are laser_diagonal without an order."""
+"""Solver test for the ``test`` of a run; a plain diagonal is a laser_diagonal without an order of axes."""
 
 
 def run_data(run: Run, *, blocks: int = BLOCKS) -> RunData:
-    """Valid readings of a run as arrays; long ball-bar runs are block-averaged, single outliers left out and counted.
+    """Return the valid readings of a run as arrays; long ball-bar runs are block-averaged, without single outliers, which are counted.
 
     Raises
     ------
@@ -104,9 +104,9 @@ def run_data(run: Run, *, blocks: int = BLOCKS) -> RunData:
 def _run_data(run: Run, blocks: int) -> RunData:
     columns, setup, label = run.columns, run.setup, run.run_id
     if run.test not in TESTS:
-        raise MeasurementFault(f"run {label}: test {run.test!r} is not one this solver knows")
+        raise MeasurementFault(f"run {label}: the solver does not know the test {run.test!r}", "leave it out")
     if run.is_sealed:
-        raise MeasurementFault(f"run {label}: it is sealed, its readings are not there", "it can only be predicted")
+        raise MeasurementFault(f"run {label}: it is sealed, so it has no readings", "it can only be predicted")
     valid = columns.valid
     if int(valid.sum()) < LEAST:
         raise MeasurementFault(f"run {label}: only {int(valid.sum())} valid readings of {len(columns)}", "measure it again")
@@ -138,14 +138,14 @@ def _signs(run: Run) -> F2:
 
 
 def _since_first(deviation_mm: F1, *, first_valid: bool) -> F1:
-    """Laser deviations relative to the first valid record.
+    """Return laser deviations relative to the first valid record.
 
-    A laser run counts from its first record. If that one is invalid, the deviations are shifted to the first valid one; otherwise the
-    common offset would look like an error of the zero.
+    A laser run counts from its first record. If that record is invalid, the deviations are shifted to be zero at the first valid one;
+    otherwise the common offset would look like an error of the zero.
     """
     return deviation_mm if first_valid else deviation_mm - deviation_mm[0]
 
 
 def bar_noise_mm(run: Run) -> float:
-    """Standard deviation of one valid ball-bar reading, mm (`abbe.models.solvers.observations.reading_noise_mm`)."""
+    """Return the standard deviation of one valid ball-bar reading, mm (`abbe.models.solvers.observations.reading_noise_mm`)."""
     return reading_noise_mm(run.columns.readings_mm[run.columns.valid])

@@ -1,4 +1,4 @@
-"""A path measured in pieces: the progress of interrupted runs, and joining their readings with those of the last run."""
+"""Paths measured in pieces: the progress of an interrupted run, and the readings of each piece that count."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.service.domain.measured import RunEnd, RunPiece, RunRecord, RunStart
 from abbe.service.domain.run import Columns
 
 STRETCH_S, STRETCH_MM = 0.5, 5.0
-"""Duration, and least length, of the stretch that is read twice."""
+"""Duration and least length of the stretch that a resumed path reads a second time, to compare both readings."""
 LEAST_READINGS = 5
 MOST_LOST = 1e-3
 
@@ -32,7 +32,7 @@ class ReadProgress:
 
 
 def progress_of(record: RunRecord, columns: Columns) -> ReadProgress | None:
-    """Progress of an interrupted run with these columns; None if the path cannot be resumed from it."""
+    """Return the progress of an interrupted run with these columns; None if the path cannot be resumed from it."""
     start, end = record.start, record.end
     path = start.path
     if path is None or end.good_us is None or end.path_start_us is None or end.box_boot_id is None:
@@ -53,12 +53,12 @@ def progress_of(record: RunRecord, columns: Columns) -> ReadProgress | None:
 
 
 def along_mm(start: RunStart, end: RunEnd, columns: Columns) -> F1:
-    """Position of each reading of an interrupted run along its own path, mm from the first point, shape (n,).
+    """Return the position of each reading of an interrupted run along its own path, mm from the first point, shape (n,).
 
     Raises
     ------
     KeyError
-        The documents state no path, or not when it began.
+        The documents do not state when the path began.
     """
     if end.path_start_us is None:
         raise KeyError("path_start_us")
@@ -66,6 +66,6 @@ def along_mm(start: RunStart, end: RunEnd, columns: Columns) -> F1:
 
 
 def counted_columns(record: RunRecord, columns: Columns, to_mm: float) -> Columns:
-    """The columns of an interrupted run that count: those before position ``to_mm`` on the whole path."""
+    """Return the readings of an interrupted run that count: those before position ``to_mm`` on the whole path."""
     start = record.start
     return columns.rows(start.commanded.offset_mm + along_mm(start, record.end, columns) < to_mm)

@@ -11,7 +11,7 @@ class Recorder(Protocol):
     """Receives and stores the data of one run."""
 
     def tap(self) -> BarTap:
-        """The first receiver of every sample of a new stream."""
+        """Return the receiver of every sample of a new stream."""
         ...
 
     async def add_bar(self, batch: BarBatch) -> None:

@@ -1,10 +1,12 @@
 """Turn samples into columns: every reading of ball-bar or laser gets the commanded position at which it was taken.
 
-For a ball-bar in motion, the controller's "path running" output is wired to the bar's box, which samples it together with the reading. The
-first sample with this input set was taken within one period after the path began; no position depends on arrival times at the computer.
+For a ball-bar in motion, the controller's "path running" output (the sync line) is wired to the bar's box, which samples it together with
+the reading. The first sample with this input set was taken within one period after the path began; the arrival of a single sample at the
+computer places no reading.
 
-The two edges of that line tie the box's clock to the controller's (`run_clock`). The stamps and arrivals of both streams are an independent
-check by way of this computer's clock; a disagreement is reported. Arrival times are used for nothing else.
+The two edges of the sync line tie the box's clock to the controller's (`run_clock`). The device stamps and arrival times of both streams
+are an independent check by way of this computer's clock, and a disagreement is reported. If they give the ratio of the two clock rates with
+less uncertainty than the edges, it is taken from them.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ class Edges:
 
 
 def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunClock:
-    """Rate of the box's clock against the controller's, from the sync line or the arrivals, whichever has the smaller uncertainty.
+    """Return the rate of the box's clock against the controller's, from the sync line or the arrivals, whichever is less uncertain.
 
     A drift below `SURE` standard uncertainties is not corrected; ``u_rate`` covers it.
     """
@@ -82,7 +84,7 @@ def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunCl
 
 
 def _fits(chunks: Sequence[ChunkRecord], end: RunEnd, period_s: float) -> tuple[ClockFit, ClockFit] | str:
-    """Fits of the box's and the controller's clock to this computer's; a text if a clock jumped, empty with too few pairs."""
+    """Fit the box's and the controller's clock to this computer's; a text if a clock jumped, empty with too few pairs."""
     box = np.array([(c.last_device_us * 1e-6, c.last_host_s) for c in chunks], dtype=np.float64).reshape(-1, 2)
     cnc = np.array(end.clock_pairs, dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
     for name, pairs in (("ball-bar's box", box), ("controller", cnc)):
@@ -99,7 +101,7 @@ def _fit(pairs: Any, grid_s: float) -> ClockFit:
 
 
 def _compared(fits: tuple[ClockFit, ClockFit], end: RunEnd, edges: Edges) -> Doc:
-    """Edges by the arrivals minus edges by the controller, ms of controller time.
+    """Return the times of the edges by the arrivals minus those by the controller, ms of controller time.
 
     Positive: the arrivals date the edge later than the controller does, so by them the path began (or ended) earlier.
     """
@@ -128,7 +130,7 @@ DURATION_TOLERANCE = 0.01
 
 
 def sync_edges(samples: Sequence[BarSample], start: RunStart) -> Edges | None:
-    """Edges of the sync line in a run; None if no sample has it set."""
+    """Return the edges of the sync line in a run; None if no sample has it set."""
     at = [k for k, sample in enumerate(samples) if on_path(sample.status)]
     if not at:
         return None
@@ -152,9 +154,9 @@ def bar_columns(samples: Sequence[BarSample], start: RunStart, end: RunEnd, *, c
     samples : sequence of BarSample
         All samples of the run, also those before and after the path.
     start : RunStart
-        With its path.
+        Its start document, with the path.
     end : RunEnd
-        Empty for an interrupted run, which keeps its existing columns.
+        Its end document; empty for an interrupted run.
     complete : bool
         Whether the path ran to its end, so that durations can be checked.
     rate : float
@@ -196,7 +198,7 @@ def bar_columns(samples: Sequence[BarSample], start: RunStart, end: RunEnd, *, c
 
 
 def _start_s(start: RunStart, end: RunEnd) -> float:
-    """Start of the path on the campaign's clock, s: as the best of the documents states it."""
+    """Return the start of the path on the campaign's clock, s, from the best entry of the documents."""
     for stated_us in (end.path_start_us, start.path_start_us, start.clock_us):
         if stated_us is not None:
             return start.since_zero_s(stated_us)
@@ -242,7 +244,7 @@ def _check_durations(device_us: npt.NDArray[np.int64], path_us: tuple[int, int],
 
 
 def _counts(path: CommandedPath, arc_mm: Array) -> npt.NDArray[np.bool_]:
-    """Mask of the readings between the first and last measured point; feed-in and feed-out stay in the raw samples only."""
+    """Return a mask of the readings between the first and last measured point; feed-in and feed-out stay in the raw samples only."""
     if path.measured is None:
         return np.ones(arc_mm.size, dtype=np.bool_)
     first_mm, last_mm = path.counted_mm
@@ -311,9 +313,9 @@ def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
     Returns
     -------
     Columns
-        With ``status``, ``signal_permille``. Deviations count from the first record, or from the laser's zero if
-        that record is missing. A missing reading is a row with the commanded position, deviation 0 and ``valid`` 0, so that later rows keep
-        their places.
+        With ``temp_air_C``, ``pressure_air_Pa``, ``status``, ``signal_permille``. Deviations count from the first record, or from the
+        laser's zero if that record is missing. A missing reading is a row with the commanded position, deviation 0 and ``valid`` 0, so
+        that rows still match standstills.
     """
     first = records[0] if records else {}
     beam = start.setup["nominal_beam"]
@@ -341,5 +343,5 @@ def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[flo
 
 
 def _numbers(records: Sequence[dict[str, Any]], key: str) -> Array:
-    """One number of each record, shape (n,). Raises TypeError for null: NumPy would make it NaN."""
+    """Return one number of each record, shape (n,). Raises TypeError for null, which NumPy would turn into NaN."""
     return np.array([float(one[key]) for one in records], dtype=np.float64)

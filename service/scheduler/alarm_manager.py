@@ -146,7 +146,7 @@ class AlarmManager(RetryingStore):
         return await self._read(alarm_numbered, self._store, self._machine, number)
 
     async def settled(self, found: ApprovedProposal, after: int, reported: JobOutcome) -> JobOutcome:
-        """Record how a push later than ``after`` ended, by the journal; return the outcome."""
+        """Record how the push after push number ``after`` ended, as the push journal shows it; return the outcome."""
         done = reconciled(await self._read(self._of_proposal, found.proposal, after), reported)
         await self._record_pushed(found.alarm, found.proposal, after, done)
         return done
@@ -163,7 +163,7 @@ class AlarmManager(RetryingStore):
         await self._record_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
 
     def _of_proposal(self, proposal: int, after: int) -> JobOutcome | None:
-        """Return the outcome of a proposal's last push by the current journal."""
+        """Return the outcome of a proposal's last push after push number ``after``, from the present journal; None without such a push."""
         return JournalView.read(self._store, self._machine).of_proposal(proposal, after)
 
     async def _record_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
@@ -171,14 +171,14 @@ class AlarmManager(RetryingStore):
         await self.line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
 
     def _check_again(self, alarms: Sequence[Alarm]) -> FollowUp | None:
-        """Return the check to run once after a kept push: the one that raised the alarm. Its trend starts anew with this check."""
+        """Return the check to repeat once after a kept push: the one that raised the alarm. Its trend starts anew with this check."""
         for one in alarms:
             pushed = one.last(AlarmKind.PUSHED)
             schedule = self._schedule_of(one)
             if pushed is None or pushed.doc.get("word") != "kept" or one.judged_seq > pushed.seq or schedule is None:
                 continue
             if (one.number, pushed.seq) not in self._checked_again:
-                # Marked when it begins: a check that may not start yet is offered again.
+                # Marked only when it begins: a check that may not start yet is offered again.
                 begun = partial(self._checked_again.add, (one.number, pushed.seq))
                 return FollowUp(replace(schedule, name=f"{schedule.name} (after push)"), begun=begun)
         return None
@@ -204,7 +204,7 @@ class AlarmManager(RetryingStore):
         for one in alarms:
             schedule = self._schedule_of(one)
             if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
-                needs = replace(schedule.needs, idle=True)  # wait for a machine that works or that another process has
+                needs = replace(schedule.needs, idle=True)  # wait while the machine works or another process uses it
                 terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self.duties.campaign, needs=needs)
                 return FollowUp(terms, _Investigation(self, one, terms))
         return None
@@ -240,7 +240,7 @@ class AlarmManager(RetryingStore):
 
 
 class _AlarmJob(Job[JobOutcome]):
-    """Work for an alarm. It waits while another process has the machine, and that does not count as a try."""
+    """Work for an alarm. It waits while another process uses the machine; this does not count as a try."""
 
     def __init__(self, manager: AlarmManager, terms: Schedule) -> None:
         self._manager, self.terms = manager, terms
@@ -280,7 +280,7 @@ class _Investigation(_AlarmJob):
         return self._last
 
     async def defect(self, error: Exception) -> None:
-        """Record the defect: the next service must not fail at the same alarm again."""
+        """Record the defect, so that the next service does not fail at the same alarm again."""
         await self.failed(error)
 
     async def _note(self, kind: AlarmKind, doc: Doc) -> Alarm:

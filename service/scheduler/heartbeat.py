@@ -34,7 +34,7 @@ class HeartbeatSink(Protocol):
 
 
 class Heartbeat:
-    """Keeps a machine's row up to date. If the database does not accept a row now, the next one replaces it: nothing waits for this.
+    """Keeps a machine's row up to date. If the database does not accept a row, nothing waits: the next row replaces it.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Heartbeat:
         """Do nothing: progress is for the machine's own page."""
 
     def attention_changed(self) -> None:
-        """Note that what needs a person has changed."""
+        """Note that ``attention`` has changed."""
         self._changed.set()
 
     def job_ended(self, doc: Doc | None) -> None:

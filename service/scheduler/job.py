@@ -28,8 +28,8 @@ log = structlog.get_logger("abbe.job")
 
 T = TypeVar("T")
 FAILURES = (DriverError, AbbeError, OSError, ArithmeticError, ValueError)
-"""Failures that are not defect of this program: devices, the job's own errors, files, numerics
-(LinAlgError is a ValueError). Anything else ends the service with a traceback, and systemd starts it again."""
+"""Failures that are not defects of this program: devices, the job's own errors, files, numerics (LinAlgError is a ValueError). Anything else
+ends the service with a traceback, and systemd starts it again."""
 SHUTDOWN_RECORD_S = 1.0
 """How long a job may record its state when the service stops; the service has five seconds for everything."""
 
@@ -73,9 +73,9 @@ class Job(ABC, Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class FollowUp:
-    """Work outside the timetable: it has the machine to itself, as a check has, and starts under the preconditions of a schedule.
+    """Work outside the timetable. Like a check it has the machine to itself and starts under the preconditions of a schedule.
 
-    ``job``: None: the schedule's check. ``begun``: called when it has the machine.
+    ``job``: None for the schedule's check. ``begun``: called when the work gets the machine.
     """
 
     schedule: Schedule
@@ -159,9 +159,9 @@ async def _record_interruption(job: Job[T]) -> None:
 
 
 def is_defect(error: Exception) -> bool:
-    """Return whether something other than devices, data and numerics failed.
+    """Return whether an error is a defect of this program, not a failure of devices, data or numerics.
 
-    Devices that are watched side by side fail with a group; one unknown member makes the whole group a defect.
+    Devices that are watched side by side fail with a group; one other member makes the whole group a defect.
     """
     return not isinstance(error, FAILURES) and not (isinstance(error, ExceptionGroup) and error.split(FAILURES)[1] is None)
 

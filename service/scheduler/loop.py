@@ -1,7 +1,8 @@
 """Run the timetable: each slot is claimed once, one job runs at a time, and every missed slot is reported.
 
-A due slot waits until it may start: no other check runs, no maintenance window is open, the machine meets the schedule's preconditions. It
-waits at most for the schedule's grace; a slot found later than that is missed. `abbe.service.scheduler.outcomes` lists the outcomes.
+A due slot waits until no other check runs, no maintenance window is open and the machine meets the schedule's preconditions. It waits at
+most for the schedule's grace period; a slot found later is missed. With ``catch_up = "once"`` it waits without limit.
+`abbe.service.scheduler.outcomes` lists the outcomes.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class LoopTerms:
     follow_ups : FollowUps, optional
         Work outside the timetable; slots go first.
     run_job : callable, optional
-        Runs the jobs of follow-ups; default: people cannot steer them.
+        Runs the jobs of follow-ups; without it people cannot see or steer them.
     """
 
     maintenance: Sequence[Window] = ()
@@ -144,7 +145,7 @@ class Scheduler:
                 await self._ledger.release(waiting.schedule.name, waiting.slot)
 
     def take(self, name: str) -> str:
-        """Take the machine for work outside the timetable; return the name of what has it instead, or nothing. `give_back` releases it."""
+        """Take the machine for work outside the timetable; if other work has it, return the name of that, else "". `give_back` releases it."""
         if self._running is None:
             self._running = name
             return ""

@@ -1,4 +1,4 @@
-"""Slots that wait, and outcomes of slots that are not simply run: state (at most 30 characters), code of the alarm, sentence for both.
+"""Waiting slots, and outcomes of slots whose check did not simply run: state (at most 30 characters), code of the alarm, sentence for both.
 
 The job writes ``done: <verdict>``; ``interrupted`` is also written when the service is stopped. All others are made here:
 ``missed: <how> late`` (moving a machine hours after the planned time would surprise anyone next to it), ``skipped: busy``,
@@ -44,17 +44,17 @@ class Waiting:
 
 
 def busy(name: str) -> Hindrance:
-    """Another check has the machine."""
+    """Return the hindrance that another check has the machine."""
     return Hindrance("skipped: busy", f"{name!r} was still running")
 
 
 def maintenance(name: str) -> Hindrance:
-    """A maintenance window is open."""
+    """Return the hindrance that a maintenance window is open."""
     return Hindrance("missed: maintenance", f"it lies in the maintenance window {name!r}")
 
 
 def not_ready(text: str) -> Hindrance:
-    """A precondition of the schedule is not met."""
+    """Return the hindrance that a precondition of the schedule is not met."""
     return Hindrance("missed: not ready", text)
 
 
@@ -67,7 +67,7 @@ class SlotOutcome(NamedTuple):
 
 
 def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutcome:
-    """No service was running to start it in time."""
+    """Return the outcome of a slot that no service started in time."""
     allowed = span(timedelta(seconds=schedule.grace_s))
     how = span(late)
     return SlotOutcome(
@@ -76,26 +76,26 @@ def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutco
 
 
 def overrun(name: str, slot: datetime) -> SlotOutcome:
-    """The schedule's previous check still runs: it takes longer than the timetable allows."""
+    """Return the outcome of a slot that came due while the schedule's previous check still ran."""
     return SlotOutcome("skipped: busy", "SCH-002", f"{_slot(name, slot)} was skipped: {name!r} was still running")
 
 
 def kept_from_starting(waiting: Waiting, hindrance: Hindrance) -> SlotOutcome:
-    """It waited until its grace ended."""
+    """Return the outcome of a slot that waited until its grace period ended."""
     verb = hindrance.state.partition(":")[0]
     code = "SCH-002" if verb == "skipped" else "SCH-001"
     return SlotOutcome(hindrance.state, code, f"{_slot(waiting.schedule.name, waiting.slot)} was {verb}: {hindrance.text}")
 
 
 def superseded(waiting: Waiting, newer: datetime) -> SlotOutcome:
-    """It was still waiting when the next slot of its schedule came due."""
+    """Return the outcome of a slot that was still waiting when the next slot of its schedule came due."""
     text = f"{_slot(waiting.schedule.name, waiting.slot)} was skipped: slot {newer:%F %R} UTC is due as well"
     why = f"; it had to wait because {waiting.hindrance.text}" if waiting.hindrance is not None else ""
     return SlotOutcome("skipped: newer slot", "SCH-002", text + why)
 
 
 def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindrance | None = None) -> SlotOutcome:
-    """A later slot's run stands for it."""
+    """Return the outcome of a slot that is made up for by the run of a later one."""
     why = f"; it had to wait because {hindrance.text}" if hindrance is not None else ""
     return SlotOutcome(
         f"missed: see {by:%FT%RZ}", "SCH-005", f"{_slot(waiting_name, slot)} was missed: the run of slot {by:%F %R} UTC stands for it{why}"
@@ -103,17 +103,17 @@ def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindra
 
 
 def broken_off(name: str, slot: datetime) -> SlotOutcome:
-    """The service ended, for example by a power cut, while the check ran. The check is not repeated: how far it got is unknown."""
+    """Return the outcome if the service ended, for example by a power cut, while the check ran; the check is not repeated."""
     return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service ended while it ran")
 
 
 def stopped(name: str, slot: datetime) -> SlotOutcome:
-    """The service was stopped while the check ran: recorded at once, else it would only be missed at the next start."""
+    """Return the outcome if the service was stopped while the check ran; it is recorded at once, not at the next start."""
     return SlotOutcome("interrupted", "SCH-007", f"{_slot(name, slot)} was interrupted: the service was stopped while it ran")
 
 
 def whole_span(name: str, first: datetime, last: datetime) -> SlotOutcome:
-    """Too many slots to record each of them."""
+    """Return the common outcome of more slots than are recorded one by one."""
     return SlotOutcome(
         "missed: whole span", "SCH-004", f"{name}: every slot from {first:%F %R} to {last:%F %R} UTC was missed; they are too many to list"
     )
@@ -126,7 +126,7 @@ def caught_up(name: str, instead: Sequence[datetime], by: datetime) -> tuple[str
         if len(instead) > 1
         else f"slot {instead[0]:%F %R} UTC was"
     )
-    return "SCH-005", f"{name}: {slots} missed; the run of slot {by:%F %R} UTC replaces them"
+    return "SCH-005", f"{name}: {slots} missed; the run of slot {by:%F %R} UTC makes up for this"
 
 
 def still_waits(waiting: Waiting, hindrance: Hindrance) -> tuple[str, str]:

@@ -37,7 +37,7 @@ Look = Callable[[bool], Awaitable[DeviceReadings]]
 
 
 def look_at(urls: DeviceUrls) -> Look:
-    """Return how to read the devices behind ``urls``. Reading is refused while a job has the machine."""
+    """Return a function that reads the devices behind ``urls``; it refuses while a job has the machine."""
 
     async def look(with_air: bool) -> DeviceReadings:
         with lock_machine(urls.cnc):
@@ -92,7 +92,7 @@ class Ready:
         try:
             return self._of_devices(needs, await self._look(needs.air))
         except (DriverError, AbbeError, OSError) as trouble:
-            return f"the devices cannot be asked: {trouble}"
+            return f"the devices cannot be read: {trouble}"
 
     def _of_devices(self, needs: Needs, readings: DeviceReadings) -> str:
         if needs.operator == "absent" and person_may_be_inside(readings.status):
@@ -108,7 +108,7 @@ class Ready:
             if readings.air_c is None:
                 return "the air temperature is not measured: the machine file has no laser"
             if not low <= readings.air_c <= high:
-                return f"the air has {readings.air_c:.1f} C, allowed are {low:g}..{high:g} C"
+                return f"the air is at {readings.air_c:.1f} C, allowed are {low:g} to {high:g} C"
         return ""
 
     def active_min(self) -> float:

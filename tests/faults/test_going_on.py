@@ -228,7 +228,7 @@ async def test_a_changed_world_is_refused_in_one_line(place):
     with pytest.raises(PreconditionsChanged, match="begun with another recipe"):
         await resume(b.session, store, b.site, other, "c", yes)
     moved = replace(b.site, doc=b.site.doc | {"tool_mm": [0.0, 0.0, -100.0]})
-    with pytest.raises(PreconditionsChanged, match="another machine, or its description was changed"):
+    with pytest.raises(PreconditionsChanged, match="another machine, or the machine file was changed"):
         await resume(b.session, store, moved, plan, "c", yes)
     comp, registers = b.sim.world.controller.comp, b.sim.registers
     crc = comp.crcs[comp.active]

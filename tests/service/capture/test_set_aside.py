@@ -157,7 +157,7 @@ def test_bad_segments_stop_neither_the_others_nor_the_machine(store: Store, fold
 
     monkeypatch.setattr(recovery, "_read", reads)
     told = {one.run: one for one in recover_segments(store, PLAIN)}
-    assert "the name of no segment" in told[0].text
+    assert "its name is not that of a segment" in told[0].text
     assert (folder / "notes.conflict").exists()
     assert "Input/output error" in store.runs.find(str(unreadable)).reason
     assert {store.runs.find(str(one)).status for one in (unreadable, senseless, good)} == {"interrupted"}

@@ -176,6 +176,6 @@ def test_runs_of_another_table_or_of_none_keep_their_readings(tmp_path: Path) ->
     assert same == [False, False, True, True]  # the third is held out, and was measured with the compensation switched off
     with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
         before.runs[1] = replace(before.runs[1], table=RunTable(crc=6))
-        assert campaign_table(store, before).why.startswith("these runs were not all measured with one table")
+        assert campaign_table(store, before).why.startswith("the runs were measured with different compensation tables")
         off = replace(before, runs=[replace(run, table=RunTable(crc=6, acting=False)) for run in before.runs])
         assert campaign_table(store, off) == NO_TABLE

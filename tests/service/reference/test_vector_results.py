@@ -61,7 +61,7 @@ def test_the_key_of_a_machine_twice(folder, capsys):
     path.write_text(path.read_text().replace('"types": {', '"types": {"MB1": {}, ', 1))
     code, doc, _ = answer(folder, capsys)
     assert code == 2
-    assert "key 'MB1' stands twice" in doc["files"][0]["error"]
+    assert "key 'MB1' appears twice" in doc["files"][0]["error"]
 
 
 def put(doc, path, value):

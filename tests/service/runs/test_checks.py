@@ -13,7 +13,7 @@ FILE = Path("a.json")
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('{"a": {"b": 1, "b": 2}}', "key 'b' stands twice"),
+        ('{"a": {"b": 1, "b": 2}}', "key 'b' appears twice"),
         ("[" * 200_000, "nested too deeply"),
         ("9" * 6000, "an integer of 6000 digits"),
         ("-" + "9" * 309, "an integer of 309 digits"),

@@ -171,7 +171,7 @@ def test_a_laser_record_without_a_number_is_refused_it_does_not_become_nan(store
     damaged = encode_json([laser_record(1_000_000, 10.0, 50) | {key: None}])
     store.chunks.append(run_id, "laser", 0, 1, JSON_CODEC, damaged, 0.0, 0.0, 0, 0)
     store.runs.finish(run_id, "complete", "", {})
-    with pytest.raises(StoreError, match="its documents lack or garble"):
+    with pytest.raises(StoreError, match="its documents have a missing or invalid field"):
         load_run(store, "r02")
 
 
@@ -195,7 +195,7 @@ def test_imported_run_comes_back_as_it_was(store: Store) -> None:
 
 def test_documents_of_strangers_give_one_error(store: Store, campaign_id: int) -> None:
     run_id = store.runs.start(campaign_id, "r01", "ballbar_helix", "identify", {"machine": {}})
-    with pytest.raises(StoreError, match="c1/r01: its documents lack or garble 'path'"):
+    with pytest.raises(StoreError, match="c1/r01: its documents have a missing or invalid field: 'path'"):
         load_run(store, run_id)
     store.chunks.append(run_id, "bar", 0, 1, "bar/9", b"", 0.0, 0.0, 0, 0)
     with pytest.raises(StoreError, match="unknown codec 'bar/9'"):
@@ -210,12 +210,12 @@ def test_a_start_document_that_lost_a_field_is_refused_not_read_with_a_default(s
     part = stream()
     store.chunks.append(run_id, "bar", 0, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
     store.runs.finish(run_id, "complete", "", END)
-    with pytest.raises(StoreError, match="its documents lack or garble"):
+    with pytest.raises(StoreError, match="its documents have a missing or invalid field"):
         load_run(store, run_id)
 
 
 def test_an_end_document_without_the_start_of_its_path_is_refused(store: Store, campaign_id: int) -> None:
-    with pytest.raises(StoreError, match="lack or garble 'path_start_us'"):
+    with pytest.raises(StoreError, match="missing or invalid field: 'path_start_us'"):
         stored(store, campaign_id, stream(), {"path_end_us": END["path_end_us"]})
 
 

@@ -206,7 +206,7 @@ def test_uncertainty_is_that_of_finite_differences_through_the_command(bench: Be
     along = np.array([np.array(p["deviation_mm"]) / p["norm_mm"] for p in doc["points"]])
     assert_allclose([p["u_norm_mm"] for p in doc["points"]], np.sqrt(np.einsum("ni,nij,nj->n", along, wanted, along)), rtol=1e-5)
     left = "EXX.0 to EXX.1, EXX@reverse.1, EYX.2, EBX.0, EBX.2, ECY.2, EAZ.1, EAZ.3"
-    text = f"u from the covariance of the errors file (10 parameters); without uncertainty there, so counted as certain: {left}"
+    text = f"u from the covariance of the errors file (10 parameters); not in this covariance, so taken as exact: {left}"
     assert doc["uncertainty"] == {"given": True, "text": text}
 
 
@@ -224,7 +224,7 @@ def test_what_the_covariance_leaves_out_is_named(bench: Bench) -> None:
     done = bench()
     assert "U(dX)" in done.out
     assert (
-        "(1 parameters); without uncertainty there, so counted as certain: B0Z, A0Z, EXX, EXX@reverse, EYX, EBX, ECY, EAZ, EZZ" in done.out
+        "(1 parameters); not in this covariance, so taken as exact: B0Z, A0Z, EXX, EXX@reverse, EYX, EBX, ECY, EAZ, EZZ" in done.out
     )
 
 
@@ -234,7 +234,7 @@ def test_parameters_that_the_covariance_leaves_out_are_named_one_by_one(bench: B
     errors["motions"]["EXX"]["coefficients"] = [1e-3, -8.6e-5]
     errors["squareness_rad"]["B0Z"] = 0
     bench.errors = bench.write("e.json", errors)
-    assert bench.doc()["uncertainty"]["text"].endswith("counted as certain: C0Y, A0Z, EXX.1, EAZ.1 to EAZ.3, ECY")
+    assert bench.doc()["uncertainty"]["text"].endswith("taken as exact: C0Y, A0Z, EXX.1, EAZ.1 to EAZ.3, ECY")
 
 
 @pytest.mark.parametrize("strange", ["EXX.3", "EYX", "bar", "EXY.1", "EXX.-1", "EXX.1.0"])
@@ -242,7 +242,7 @@ def test_a_covariance_of_other_parameters_is_not_used_and_that_is_said(bench: Be
     bench.errors = bench.write("e.json", ERRORS | {"covariance": {"parameters": ["C0Y", strange], "matrix": [[1e-12, 0], [0, 1e-12]]}})
     doc = bench.doc()
     assert doc["uncertainty"]["given"] is False
-    assert f"speaks of {strange!r}, which is not a parameter of its functions" in doc["uncertainty"]["text"]
+    assert f"names {strange!r}, not a parameter of its functions" in doc["uncertainty"]["text"]
     assert doc["points"][0]["u_norm_mm"] is None
 
 

@@ -134,7 +134,7 @@ def test_bad_errors_file(bench: Bench, change: Change, message: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"EYX": {', '"EXX": {"kind": "polynomial", "coefficients": [0.5], "origin_mm": 0}, "EYX": {', "key 'EXX' stands twice"),
+        ('"EYX": {', '"EXX": {"kind": "polynomial", "coefficients": [0.5], "origin_mm": 0}, "EYX": {', "key 'EXX' appears twice"),
         ("0.001", "9" * 5000, "an integer of 5000 digits"),
         ('"covariance": null', '"covariance": ' + "[" * 100_000 + "]" * 100_000, "nested too deeply"),
         ('"covariance": null', '"covariance": ' + "[" * 900 + "]" * 900, "recursion limit exceeded"),
