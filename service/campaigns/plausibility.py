@@ -73,7 +73,7 @@ def check_configured(needed: Needed, there: Collection[str]) -> None:
     if missing:
         listed = " and ".join(f"{ROLE_NAMES[role]} for {needed.first[role]}" for role in missing)
         keys = ", ".join(f"{role} = ..." for role in missing)
-        raise ConfigError(f"the plan needs {listed}, and the machine file names none", f"add {keys} under [devices]")
+        raise ConfigError(f"this needs {listed}, and the machine file names none", f"add {keys} under [devices]")
 
 
 async def check_devices(session: Session, plan: CampaignPlan, *, air: bool = False) -> None:

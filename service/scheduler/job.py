@@ -28,8 +28,8 @@ log = structlog.get_logger("abbe.job")
 
 T = TypeVar("T")
 FAILURES = (DriverError, AbbeError, OSError, ArithmeticError, ValueError)
-"""Failures that are not defects of this program: devices, the job's own errors, files, numerics (LinAlgError is a ValueError). Anything else
-ends the service with a traceback, and systemd starts it again."""
+"""Failures that are not defects of this program: devices, the job's own errors, files, numerics (LinAlgError is a ValueError). Anything
+else ends the service with a traceback, and systemd starts it again."""
 SHUTDOWN_RECORD_S = 1.0
 """How long a job may record its state when the service stops; the service has five seconds for everything."""
 

@@ -145,7 +145,7 @@ class Scheduler:
                 await self._ledger.release(waiting.schedule.name, waiting.slot)
 
     def take(self, name: str) -> str:
-        """Take the machine for work outside the timetable; if other work has it, return the name of that, else "". `give_back` releases it."""
+        """Take the machine for work outside the timetable until `give_back`; return "", or the name of the work that has it."""
         if self._running is None:
             self._running = name
             return ""

@@ -28,11 +28,11 @@ async def test_the_simulated_machine_is_ready_until_somebody_has_it() -> None:
         ready = Ready(look_at(urls), [SCHEDULE], (seen.air_c - 5, seen.air_c + 5), (), SystemClock())
         assert await ready.lack(SCHEDULE) == ""
         colder = Ready(look_at(urls), [SCHEDULE], (seen.air_c - 9, seen.air_c - 5), (), SystemClock())
-        assert "the air has" in await colder.lack(SCHEDULE)
+        assert "the air is at" in await colder.lack(SCHEDULE)
         with lock_machine(urls.cnc):
             assert "is in use by" in await ready.lack(SCHEDULE)
         nowhere = Ready(look_at(replace(urls, cnc="modbus+tcp://127.0.0.1:1")), [SCHEDULE], (0.0, 40.0), (), SystemClock())
-        assert "the devices cannot be asked" in await nowhere.lack(SCHEDULE)
+        assert "the devices cannot be read" in await nowhere.lack(SCHEDULE)
     finally:
         process.stdin.close()
         await process.wait()

@@ -137,7 +137,7 @@ def test_what_a_recipe_needs_and_the_machine_file_lacks_is_said_below_the_figure
     machine.write_text(MACHINE_TOML + DEVICES.replace('laser = "modbus+tcp://127.0.0.1:9"\n', ""))
     found = measure(folder, "--dry-run")
     assert "c&1" in found.output
-    assert str(found.exception) == "the plan needs a laser for test f1, and the machine file names none - add laser = ... under [devices]"
+    assert str(found.exception) == "this needs a laser for test f1, and the machine file names none - add laser = ... under [devices]"
     written = measure(folder, "--nc", "iso", "--out", str(folder / "p.nc"))
     assert written.exit_code == 0, "a program for another day, or another computer, needs no device"
 
