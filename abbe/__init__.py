@@ -1,7 +1,7 @@
 """Abbe: how a 3-axis machine really moves, and its correction.
 
-This is the public interface (decision 0035): what is named here is documented and stays; everything else is private. Lengths are in mm,
-angles in rad, times in s, unless a name says otherwise. The parts are links to the folders beside this one (decision 0031).
+This is the public interface (decision 0035): the names below are documented and stable; everything else is private. Lengths are in mm,
+angles in rad, times in s, unless a name says otherwise. The subpackages are links to the folders beside this one (decision 0031).
 
     campaign = abbe.read_campaign("june/")
     solution = abbe.solve(campaign)
@@ -82,7 +82,7 @@ _WHERE = {
     "solve": "abbe.public.solution",
     "verification": "abbe.service.sequences.recipes.campaigns",
 }
-"""Module of each public name; imported at first use, so that a command does not pay for what it does not need."""
+"""Module of each public name. It is imported at first use, so that a command imports only what it needs."""
 
 __all__ = list(_WHERE)
 

@@ -1,1 +1,1 @@
-"""Simulators are the outside world: a machine tool with its errors, and the instruments that watch it."""
+"""Simulators of the outside world: a machine tool with its errors, and the instruments that measure it."""

@@ -1,4 +1,4 @@
-"""``python -m abbe.simulators``: the outside world as a process; ``truth``: its sealed truth as figures; ``hidden-suite``: sealed cases."""
+"""``python -m abbe.simulators`` runs the simulated devices; ``truth`` prints the true errors, ``hidden-suite`` writes sealed cases."""
 
 import argparse
 import asyncio
@@ -17,7 +17,7 @@ from abbe.simulators.scenario import Scenario, ScenarioError
 
 
 class _Parser(argparse.ArgumentParser):
-    """Reports errors in one line."""
+    """A parser that reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}\n")
@@ -26,13 +26,13 @@ class _Parser(argparse.ArgumentParser):
 def _parser(prog: str, what: str) -> _Parser:
     parser = _Parser(prog=prog, description=what)
     parser.add_argument("scenario", nargs="?", type=Path, default=scenarios.DEFAULT_PATH, help="TOML file (default: the packaged vmc.toml)")
-    parser.add_argument("--seed", type=int, help="draw another machine")
-    parser.add_argument("--hidden", type=int, metavar="SEED", help="instead of a scenario: let the seed choose one that may hide something")
+    parser.add_argument("--seed", type=int, help="seed of the machine's random errors")
+    parser.add_argument("--hidden", type=int, metavar="SEED", help="let this seed choose the scenario; it may hide a physical effect")
     return parser
 
 
 def _scenario(options: argparse.Namespace) -> Scenario:
-    """The scenario that the command line names, or the one that a seed stands for."""
+    """Return the scenario that the command line names, or the one that its ``--hidden`` seed picks."""
     if options.hidden is None:
         return scenarios.load(options.scenario)
     from abbe.simulators.hidden.suite import picked
@@ -43,7 +43,7 @@ def _scenario(options: argparse.Namespace) -> Scenario:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command line; gives the exit code."""
+    """Run the command line and return its exit code."""
     try:
         if argv[:1] == ["hidden-suite"]:
             from abbe.simulators.hidden.suite import main as hidden_suite
@@ -56,9 +56,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _serve(argv: Sequence[str]) -> int:
-    parser = _parser("simulators", "Simulated machine tool with ball-bar, laser, controller and fixture on real wires (127.0.0.1 only).")
+    parser = _parser(
+        "simulators", "Simulated machine tool with ball-bar, laser, controller and fixture on serial lines and TCP ports of 127.0.0.1."
+    )
     parser.add_argument("--speed", type=float, help="simulated seconds per second")
-    parser.add_argument("--boot-id", type=int, help="boot identity of the controller (default: another at each start)")
+    parser.add_argument("--boot-id", type=int, help="boot id of the controller (default: a new one at each start)")
     parser.add_argument("--link-dir", type=Path, help="directory for stable links to the serial lines")
     parser.add_argument("--watch-stdin", action="store_true", help="end when standard input ends")
     parser.add_argument("--ballbar", choices=("pty", "tcp"), help="transport of the ball-bar")
@@ -70,7 +72,7 @@ def _serve(argv: Sequence[str]) -> int:
 
 
 def _overridden(scenario: Scenario, options: argparse.Namespace) -> Scenario:
-    """Scenario with the options of the command line applied."""
+    """Return the scenario with the options of the command line applied."""
     changes: dict[str, Any] = {}
     for name in ("seed", "speed", "boot_id"):
         if getattr(options, name) is not None:
@@ -103,7 +105,7 @@ async def _run(scenario: Scenario, link_dir: Path | None, *, watch: bool) -> int
 
 
 def _watch_stdin(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
-    """Wait for the end of standard input: the parent is gone."""
+    """Set ``stop`` at the end of standard input: the parent process has gone."""
     while os.read(0, 4096):
         pass
     loop.call_soon_threadsafe(stop.set)
@@ -112,8 +114,8 @@ def _watch_stdin(loop: asyncio.AbstractEventLoop, stop: asyncio.Event) -> None:
 def _truth(argv: Sequence[str]) -> int:
     from abbe.simulators.sealed import truth
 
-    parser = _parser("simulators truth", "The sealed truth: volumetric figures of the machine, with or without a correction.")
-    parser.add_argument("--bank", type=Path, help="compensation image (docs/protocols/cnc.md), big-endian words; absent: no correction")
+    parser = _parser("simulators truth", "The machine's true volumetric errors, with or without a correction.")
+    parser.add_argument("--bank", type=Path, help="compensation image (docs/protocols/cnc.md), big-endian words (default: no correction)")
     parser.add_argument("--nodes", type=int, default=9, help="grid nodes per axis")
     parser.add_argument("--arrows", action="store_true", help="add grid and deviation vectors")
     options = parser.parse_args(argv)
@@ -122,7 +124,7 @@ def _truth(argv: Sequence[str]) -> int:
         scenario = dataclasses.replace(scenario, seed=options.seed)
         scenarios.check(scenario)
     if options.nodes < 2:
-        parser.error("--nodes: at least 2")
+        parser.error("--nodes must be at least 2")
     image = None if options.bank is None else options.bank.read_bytes()
     sys.stdout.write(json.dumps(truth(scenario, image, options.nodes, arrows=options.arrows)) + "\n")
     return 0

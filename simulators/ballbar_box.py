@@ -1,4 +1,4 @@
-"""``python -m abbe.simulators.ballbar_box``: only a ball-bar's box on a serial line, as fast as wanted, with its ledger in a file."""
+"""``python -m abbe.simulators.ballbar_box``: only the box of a ball-bar, on a pseudo terminal, at any speed, with its ledger in a file."""
 
 import argparse
 import asyncio
@@ -22,11 +22,11 @@ RADIUS_MM = 100.0
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run until standard input ends or a signal comes; gives the exit code."""
+    """Run until standard input ends or SIGTERM comes, and return the exit code."""
     parser = argparse.ArgumentParser(prog="abbe.simulators.ballbar_box", description="Only a ball-bar's box, on a pseudo terminal.")
     parser.add_argument("--link", type=Path, required=True, help="stable path of the serial line")
     parser.add_argument("--ledger", type=Path, required=True, help="file for the fate of every sample, written at every STOP")
-    parser.add_argument("--speed", type=float, default=1.0, help="device seconds per second: 20 at 1000 Hz is 20 kHz")
+    parser.add_argument("--speed", type=float, default=1.0, help="device seconds per second; 20 at 1000 Hz gives 20,000 samples per second")
     parser.add_argument("--spoil-every", type=int, default=0, help="flip a bit in every n-th sample")
     parser.add_argument("--buffer-kib", type=int, default=BUFFER_BYTES // 1024, help="buffer of the box for a slow host")
     parser.add_argument("--samples", type=int, default=0, help="stop a stream after this many samples")
@@ -50,7 +50,7 @@ async def _serve(options: argparse.Namespace) -> int:
 
 
 class _Box:
-    """The box, held by a tool that stands still."""
+    """The box of a ball-bar at a machine that stands still."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         world = World(load(DEFAULT_PATH))
@@ -76,7 +76,7 @@ class _Box:
             self.wire.ledger.write(self._options.ledger)
 
     def tick(self) -> None:
-        """Send what is due, again and again."""
+        """Send the samples that are due, and repeat this every `TICK_S`."""
         self._advance()
         self.wire.flush()
         self.port.pump()

@@ -21,7 +21,7 @@ class FixtureError(ValueError):
 
 
 class Box(Protocol):
-    """What the fixture does to the ball-bar's box besides mounting."""
+    """Logs of the site and the ball-bar's cable, which the fixture offers to tests."""
 
     def ledger(self) -> Answer:
         """Samples sent and dropped since the last start."""
@@ -40,7 +40,7 @@ class Box(Protocol):
         ...
 
     async def plug(self) -> str:
-        """Put the cable back; gives the URL."""
+        """Put the cable back and return the URL."""
         ...
 
 
@@ -75,7 +75,7 @@ class Fixture:
         }
 
     async def start(self, port: int) -> int:
-        """Listen on 127.0.0.1; gives the port."""
+        """Listen on 127.0.0.1 and return the port."""
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", port)
         return int(self._server.sockets[0].getsockname()[1])
 
@@ -92,7 +92,7 @@ class Fixture:
             while line := await reader.readline():
                 writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
                 await writer.drain()
-        except (ConnectionError, ValueError):  # gone, or a line without end
+        except (ConnectionError, ValueError):  # the client has gone, or its line is too long
             pass
         finally:
             self._writers.discard(writer)
@@ -188,11 +188,11 @@ class Fixture:
         elif name == "drives" and not on:
             controller.drives_off()
         else:
-            raise FixtureError("name: remote or program, alarm (on) or drives (off) is expected")
+            raise FixtureError("name: expected remote, program, alarm (only on) or drives (only off)")
         return {}
 
     async def _reset(self, request: Answer) -> Answer:
-        """The operator at the panel: everything released, alarm reset, drives on."""
+        """Act as the operator at the panel: release all switches, reset the alarm, switch the drives on."""
         controller = self._world.controller
         controller.set_estop(pressed=False)
         controller.set_door(is_open=False)
@@ -209,7 +209,7 @@ class Fixture:
         return {"commands": [[c.time_s, c.kind, list(c.args), c.moving] for c in log]}
 
     async def _tables(self, request: Answer) -> Answer:
-        """What happened to banks, active table and lease, from the entry number ``since`` on."""
+        """Return the log of attempts to change banks, active table or lease, from entry ``since`` on."""
         since = request.get("since", 0)
         if not isinstance(since, int) or since < 0:
             raise FixtureError("since: 0 or the number of an entry is expected")
@@ -217,12 +217,12 @@ class Fixture:
         return {"accesses": [[a.time_s, a.kind, a.bank, a.first, list(a.words), a.by, a.taken, a.owner, a.active, a.gen] for a in found]}
 
     async def _air(self, request: Answer) -> Answer:
-        """Open the shop gate: from now on the air is warmer by this much."""
+        """Make the air warmer by ``plus_c`` K from now on, as an open shop gate does."""
         self._world.warm_air(_number(request, "plus_c"))
         return {}
 
     async def _program(self, request: Answer) -> Answer:
-        """The operator starts an NC program: ``blocks`` of ["go", x, y, z, feed in mm/min] and ["rest", seconds]."""
+        """Start an NC program as the operator does: ``blocks`` of ["go", x, y, z, feed in mm/min] and ["rest", seconds]."""
         controller = self._world.controller
         here, blocks = controller.position_mm, []
         for block in request.get("blocks") or []:

@@ -1,4 +1,4 @@
-"""Modbus servers (TCP, RTU): the only file that knows pymodbus. A register map answers words, pymodbus carries them."""
+"""Modbus servers (TCP, RTU): the only simulator file that uses pymodbus. A register map provides the words, pymodbus transports them."""
 
 import asyncio
 import logging
@@ -15,13 +15,13 @@ _WRITE = (6, 16)
 
 
 class RegisterMap(Protocol):
-    """What a device shows over Modbus. ``None`` / ``False`` = illegal address (exception 2)."""
+    """Registers of a device. ``None`` from `read` and ``False`` from `write` mean an illegal address (exception 2)."""
 
     size: int
-    """Registers from address 0 on."""
+    """Number of registers from address 0 on."""
 
     def read(self, address: int, count: int) -> list[int] | None:
-        """Words of ``count`` registers, now."""
+        """Return the current words of ``count`` registers."""
         ...
 
     def write(self, address: int, values: list[int]) -> bool:
@@ -30,7 +30,7 @@ class RegisterMap(Protocol):
 
 
 def _device(registers: RegisterMap, unit: int) -> SimDevice:
-    """Register block with a hook that edits only what a request asks for."""
+    """Return a pymodbus device that passes each request to the register map."""
 
     async def action(
         function: int, start: int, address: int, count: int, block: list[int], values: list[int] | list[bool] | None
@@ -58,7 +58,7 @@ class ModbusTcp:
         self._server: ModbusTcpServer | None = None
 
     async def start(self, port: int) -> int:
-        """Listen; gives the port (any free one for 0). Raises OSError when the port is taken."""
+        """Listen and return the port (any free one for 0). Raises OSError when the port is taken."""
         self._server = ModbusTcpServer(_device(self._registers, self._unit), address=("127.0.0.1", port))
         try:
             await self._server.serve_forever(background=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 
 class PseudoSerial:
-    """One open pty; ``received`` gets what the host writes. The host opens ``path``.
+    """One open pty. The host opens ``path``; ``received`` gets the bytes that it writes.
 
-    One end of the host's side stays open here, otherwise the master would read EIO whenever no host is there.
+    The slave stays open here, too, otherwise the master would read EIO whenever no host has opened it.
     """
 
     def __init__(self, received: Callable[[bytes], None], link: Path | None = None) -> None:
@@ -29,7 +29,7 @@ class PseudoSerial:
         self._loop.add_reader(self._master, self._readable)
 
     def _make_link(self, link: Path) -> None:
-        """Point the stable path at this terminal; an old link is replaced, anything else is left alone."""
+        """Point the stable path at this terminal. Replaces an old link, but no other file."""
         link = link.absolute()
         if link.is_symlink():
             link.unlink()
@@ -47,7 +47,7 @@ class PseudoSerial:
         self.pump()
 
     def pump(self) -> None:
-        """Pass on what waits."""
+        """Send the buffered bytes, as far as the terminal accepts them."""
         while self._out:
             try:
                 written = os.write(self._master, self._out)
@@ -56,7 +56,7 @@ class PseudoSerial:
             del self._out[:written]
 
     def close(self) -> None:
-        """Hang up: readers of the terminal get its end."""
+        """Hang up: readers of the terminal get end of file."""
         self._loop.remove_reader(self._master)
         os.close(self._master)
         os.close(self._slave)

@@ -1,4 +1,4 @@
-"""Scenario: which machine stands there, how large its errors may be, and where its devices are reached (TOML)."""
+"""Scenario (TOML): the simulated machine, how large its errors may be, and how its devices are reached."""
 
 import dataclasses
 import tomllib
@@ -91,10 +91,10 @@ class PortConfig:
 
 @dataclass(frozen=True, slots=True)
 class HiddenConfig:
-    """One undisclosed effect (simulators/hidden); no name: none.
+    """One hidden effect (simulators/hidden); an empty ``name`` means none.
 
-    ``key``: axis, component or plane; ``parameters``: ``strength`` in the unit of the exchange files and what else the effect needs;
-    ``wild``: seed of how it departs from the textbook, 0: not at all.
+    ``key``: axis, component or plane; ``parameters``: ``strength`` in the effect's unit, and further ones that the effect needs; ``wild``:
+    seed of its departures from the textbook form, 0: none.
     """
 
     name: str = ""
@@ -107,7 +107,7 @@ class HiddenConfig:
 class Scenario:
     """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit.
 
-    ``boot_id``: of the controller; 0: another at each start, as of a controller that was switched off in between.
+    ``boot_id``: of the controller; 0: a new one at each start, as after switching the controller off and on.
     """
 
     seed: int = 1
@@ -156,7 +156,7 @@ def check(scenario: Scenario) -> None:
     if scenario.seed < 0:
         raise ScenarioError("seed: must not be negative")
     if not 0 <= scenario.boot_id < 2**32:
-        raise ScenarioError("boot_id: must have 32 bits")
+        raise ScenarioError("boot_id: must be 0..4294967295")
     for name, value, allowed in (
         ("ballbar.transport", scenario.ballbar.transport, ("pty", "tcp")),
         ("laser.transport", scenario.laser.transport, ("tcp", "rtu")),

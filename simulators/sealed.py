@@ -13,7 +13,7 @@ from abbe.simulators.truth.draws import describe, draw_machine
 from abbe.simulators.truth.machine import Geometry, Machine
 
 Correction = Callable[[F], F]
-"""Commanded positions (n, 3) mm to what is added to them (n, 3) mm."""
+"""Maps commanded positions (n, 3) mm to the corrections added to them, (n, 3) mm."""
 
 DIAGONALS = {"ppp": (1, 1, 1), "npp": (-1, 1, 1), "pnp": (1, -1, 1), "ppn": (1, 1, -1)}
 DIAGONAL_POINTS = 31
@@ -21,7 +21,7 @@ FINE_NODES = 13
 
 
 def no_correction(command_mm: F) -> F:
-    """Add nothing."""
+    """Return zero corrections."""
     return np.zeros_like(command_mm)
 
 
@@ -40,7 +40,7 @@ def deviation(machine: Machine, command_mm: F, correction: Correction = no_corre
 
 
 def without_rigid_motion(points_mm: F, deviation_mm: F) -> F:
-    """Deviations (n, 3) mm less their best-fit rigid motion (translation + small rotation, least squares)."""
+    """Return deviations (n, 3) mm minus their best-fit rigid motion (translation + small rotation, least squares)."""
     arm = points_mm - points_mm.mean(axis=0)
     n = len(arm)
     design = np.zeros((n, 3, 6))
@@ -55,9 +55,9 @@ def without_rigid_motion(points_mm: F, deviation_mm: F) -> F:
 
 
 def without_one_axis_functions(deviation_mm: F, nodes: int) -> F:
-    """Deviations on a cubic grid less their best additive part: what nine perfect one-axis tables would leave, (nodes^3, 3) mm.
+    """Return what nine perfect one-axis tables would leave of deviations on a cubic grid, (nodes^3, 3) mm.
 
-    On a full product grid the least-squares additive part is the mean plus the main effects.
+    The tables are the least-squares sum of one-axis functions: on a full product grid this is the mean plus the main effects.
     """
     field = deviation_mm.reshape(nodes, nodes, nodes, 3)
     mean = field.mean(axis=(0, 1, 2))
@@ -85,14 +85,14 @@ def body_diagonals_um(machine: Machine, correction: Correction = no_correction) 
 
 
 def best_nine_tables_rms_um(machine: Machine, nodes: int = FINE_NODES) -> float:
-    """Rms in µm that nine perfect one-axis tables would leave on this machine, rigid motion removed."""
+    """Return the rms of the deviations in µm that nine perfect one-axis tables would leave on this machine, rigid motion removed."""
     points = grid(machine, nodes)
     rest = without_one_axis_functions(deviation(machine, points), nodes)
     return 1000.0 * rms_norm(without_rigid_motion(points, rest))
 
 
 def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool = False) -> dict[str, object]:
-    """All figures of the machine under a correction (µm); ``arrows`` adds grid and deviation vectors for plotting."""
+    """Return all error figures of the machine with a correction (µm); ``arrows`` adds grid and deviation vectors for plotting."""
     points = grid(machine, nodes)
     rest = without_rigid_motion(points, deviation(machine, points, correction))
     diagonals = body_diagonals_um(machine, correction)
@@ -111,7 +111,7 @@ def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool
 
 
 def truth(scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool = False) -> dict[str, object]:
-    """Evaluate a machine without any wire; ``image`` is a compensation image as big-endian bytes, None for no correction."""
+    """Return the true errors of a scenario's machine; ``image`` is a compensation image as big-endian bytes, None for no correction."""
     draws = draw_machine(scenario)
     machine = Machine(Geometry(scenario.machine), draws)
     secret = live_of(scenario.hidden, machine.geometry.low_mm, machine.geometry.high_mm)
@@ -122,7 +122,7 @@ def truth(scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool =
 
 def _correction(image: bytes) -> bank.Correction:
     if len(image) % 2:
-        raise ScenarioError("bank image: an odd number of bytes")
+        raise ScenarioError("bank image: it has an odd number of bytes")
     try:
         return bank.parse(list(struct.unpack(f">{len(image) // 2}H", image)))[1]
     except bank.ImageError as exc:

@@ -1,4 +1,4 @@
-"""The site: the world with its devices on real wires, kept in step with wall time."""
+"""The site: the simulated world with its devices on serial lines and TCP ports, kept in step with wall time."""
 
 import asyncio
 import secrets
@@ -21,7 +21,7 @@ BAUD = 115200
 
 
 class RtuLine:
-    """A Modbus RTU device at a path. pymodbus opens a terminal by its name, so it gets one of its own."""
+    """A Modbus RTU device at a path. pymodbus opens a terminal by name, so device and host each get a pseudo terminal, joined here."""
 
     def __init__(self, registers: RegisterMap, link: Path | None) -> None:
         self._server = ModbusRtu(registers)
@@ -30,7 +30,7 @@ class RtuLine:
         self._device: PseudoSerial | None = None
 
     async def start(self) -> str:
-        """Open both terminals and serve; gives the URL."""
+        """Open both terminals, serve the device, and return the URL."""
         host = self._host = PseudoSerial(self._to_device, self._link)
         self._device = PseudoSerial(host.send)
         await self._server.start(self._device.path, BAUD)
@@ -50,12 +50,12 @@ class RtuLine:
 
 TICK_S = 0.005
 REST_S = 0.2
-"""Time between two ticks while nothing streams or waits in the buffer: every request brings the world up to date anyway."""
+"""Time between two ticks while nothing streams or is buffered. This suffices because every request brings the world up to date."""
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
 
 
 class Site:
-    """All wires of one world. Simulated time = speed x wall time since ``start``."""
+    """All connections of one simulated world. Simulated time = speed x wall time since ``start``."""
 
     def __init__(self, scenario: Scenario, link_dir: Path | None = None) -> None:
         self.world = World(scenario)
@@ -108,7 +108,7 @@ class Site:
         await self._cnc.stop()
 
     def advance(self) -> None:
-        """Bring the world up to wall time. Called before every request, which may set something in motion: a tick follows at once."""
+        """Bring the world up to wall time. Called before every request; because this may start a motion, a tick follows at once."""
         self._advance()
         if self._resting and self._ticking is not None:
             self._ticking.cancel()
@@ -119,7 +119,7 @@ class Site:
         self.world.advance(self._scenario.speed * (asyncio.get_running_loop().time() - self._begin_s))
 
     def _tick(self) -> None:
-        """Advance and pass on the samples that are due, again and again."""
+        """Advance the world, send the samples that are due, and schedule the next tick."""
         self._advance()
         self.box.flush()
         self._port.pump()
@@ -133,14 +133,14 @@ class Site:
     # ---- the cable of the ball-bar's box -------------------------------------------------------------------------
 
     async def unplug(self) -> None:
-        """Pull the cable: the line ends, and the box, fed by it, goes dark."""
+        """Pull the cable: the line closes, and the box, which the cable powers, restarts."""
         if self._plugged:
             self._plugged = False
             await self._port.close()
             self.box.restart(secrets.randbits(32))
 
     async def plug(self) -> str:
-        """Put the cable in; gives the URL."""
+        """Put the cable in and return the URL."""
         if not self._plugged:
             await self._port.open(self._received)
             self._plugged = True

@@ -1,4 +1,4 @@
-"""The world: one machine and the instruments that watch it, moved on by one ``advance``."""
+"""The simulated world: one machine and its instruments, whose common clock moves with ``advance``."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ LASER_CLOCK_US = 987_654_321
 class World:
     """Everything that is simulated, at one instant ``time_s`` (s since the controller was switched on).
 
-    Nothing here sleeps or knows wall time. Commands to the devices take effect at the instant last advanced to.
+    Nothing here sleeps or knows wall time. Commands to the devices take effect at ``time_s``.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -32,7 +32,7 @@ class World:
         self.hidden = live_of(scenario.hidden, geometry.low_mm, geometry.high_mm)
         self.draws = with_hidden_bar(draw_machine(scenario), scenario)
         self.machine = Machine(geometry, self.draws)
-        # a host's lease lives in wall time, see Compensation
+        # a host's lease runs in wall time, see Compensation
         self.controller = Controller(geometry, lease_scale=scenario.speed)
         self.ballbar = BallbarDevice(self.draws, scenario.magnitudes, self.locate, clock_offset_us=BALLBAR_CLOCK_US)
         self.air = Air(scenario.seed)
@@ -45,9 +45,9 @@ class World:
         self.laser.record(0, 0.0, self._play.position_mm)
 
     def advance(self, to_s: float) -> None:
-        """Move on to an instant; an earlier one does nothing.
+        """Advance to an instant (s); an earlier one changes nothing.
 
-        All instants at which something is read, and all at which an axis may turn round, are worked through in order.
+        On the way, all instants at which an instrument reads or an axis may reverse are evaluated in order.
         """
         if to_s <= self.time_s:
             return
@@ -77,38 +77,38 @@ class World:
         return actual
 
     def add_scale(self, axis: int, scale: float) -> None:
-        """Let an axis grow a scale error (mm/mm) from now on; what was sampled before is not changed."""
+        """Add a scale error (mm/mm) to an axis from now on; earlier samples do not change."""
         self.ballbar.settle()
         self.laser.output()
         self.machine.extra_scale[axis] += scale
 
     def warm_air(self, plus_c: float) -> None:
-        """Let the air become warmer (K) from now on; what was sampled before is not changed."""
+        """Make the air warmer by ``plus_c`` K from now on; earlier samples do not change."""
         self.laser.output()
         self.air.warmer_c += plus_c
 
     def _axes(self, times_s: F) -> F:
-        """Where the axes stand at n instants from now on, in order: lost motion and hidden effects remember what went before, (n, 3) mm."""
+        """Return the axis positions at n ordered instants from now on, (n, 3) mm; lost motion and hidden effects remember them."""
         drives = self._drives(times_s)
         axes = self._play.run(drives)
         return axes if self.hidden is None else np.asarray(axes + self.hidden.displacement(times_s, drives))
 
     def _drives(self, times_s: F) -> F:
-        """Where the drives are at n instants from now on: command + correction, (n, 3) mm."""
+        """Return the drive positions at n instants from now on: command + correction, (n, 3) mm."""
         command = self.controller.commanded(times_s)
         driven: F = command + self.controller.comp.correction(command)
         return driven
 
 
 def with_hidden_bar(draws: Draws, scenario: Scenario) -> Draws:
-    """The draws, with the bar error that a hidden effect asks for."""
+    """Return the draws, with the bar length error of a hidden effect added."""
     if scenario.hidden.name != "bar_length_error":
         return draws
     return replace(draws, bar_length_error_mm=draws.bar_length_error_mm + scenario.hidden.parameters["strength"] * UM)
 
 
 def laser_sizes(scenario: Scenario) -> Magnitudes:
-    """Sizes of the laser's set-up; a hidden cosine error (mrad) puts every beam askew by that much."""
+    """Return the magnitudes for the laser; a hidden cosine error (mrad) sets the misalignment of every beam to about its strength."""
     if scenario.hidden.name != "laser_cosine":
         return scenario.magnitudes
     askew = 1e3 * scenario.hidden.parameters["strength"]

@@ -1,1 +1,1 @@
-"""The functions behind `import abbe`: thin, typed, in the units of the package, on the same code as the commands."""
+"""The functions behind `import abbe`: thin, typed wrappers of the code that the commands use."""

@@ -24,7 +24,7 @@ def read_campaign(source: str | Path, *, database: str | None = None) -> Campaig
     Raises
     ------
     FileFormatError
-        A file has a mistake; the message names file, key, row, and the expected value of the first one.
+        A file has a mistake; the message names file, key, row and expected value of the first mistake.
     StoreError
         The campaign or the database does not exist.
     """
@@ -33,7 +33,7 @@ def read_campaign(source: str | Path, *, database: str | None = None) -> Campaig
             return from_store(store, str(source))
     folder = Path(source)
     if not folder.is_dir():
-        raise FileFormatError(f"{folder}: no such folder", "give a folder with campaign.json, or the database of the campaign")
+        raise FileFormatError(f"{folder}: no such folder", "give a folder with campaign.json, or the URL of the campaign's database")
     return from_folder(folder)
 
 
@@ -43,6 +43,6 @@ def read_errors(source: str | Path) -> ErrorMotions:
     Raises
     ------
     FileFormatError
-        The file has a mistake; the message names file and key of the first one.
+        The file has a mistake; the message names file and key of the first mistake.
     """
     return read_file(Path(source)).motions

@@ -1,4 +1,4 @@
-"""Find effects that the simulation of a machine lacks, and prove them on runs outside the fit."""
+"""Find effects that the model of a machine lacks, and prove them on runs outside the fit."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class DiscoveryAnswer:
     effects : dict
         Signed strength with standard uncertainty by label, e.g. ``"backlash:X"``.
     gap : dict
-        By role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated ``before_um`` and ``after_um`` the effects, and
-        ``floor_um``, the noise that no model removes.
+        By role of runs (``"identify"``, ``"holdout"``), in µm: rms of measured minus simulated readings without the effects
+        (``before_um``) and with them (``after_um``), and the noise that no model removes (``floor_um``).
     next_measurement : dict or None
         The most informative next measurement: what it ``adds``, which suspects it ``separates``, ``minutes``, and ``why``.
     """
@@ -69,7 +69,7 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     effects : tuple of Effect
         Additional effects to search for beside the catalogue; each must pass the self-test.
     progress : callable, optional
-        Receives the share of the work, from 0 to 1, with a line of text.
+        Receives `abbe.service.domain.progress.Progress` objects: ``done`` is the share of the work from 0 to 1, ``message`` a line of text.
 
     Raises
     ------

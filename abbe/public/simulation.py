@@ -34,10 +34,10 @@ SETUP_S = 300.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedInstruments:
-    """Standard deviations of the random values in a simulated campaign.
+    """Standard deviations of the random values in a simulated campaign, and the rate of the bar's readings.
 
     ``bar_noise_mm``, ``laser_noise_mm``: of one reading; ``cup_mm``: of each component of a cup's position; ``bar_length_mm``: of the bar's
-    calibrated length, with one bar for all radii. ``readings_per_s``: of the bar, at most the recipe's rate.
+    calibrated length, whose error is the same for all radii. ``readings_per_s``: at most the recipe's rate is used.
     """
 
     bar_noise_mm: float = 3e-4
@@ -57,7 +57,7 @@ def simulate(
     instruments: SimulatedInstruments | None = None,
     seed: int = 1,
 ) -> Campaign:
-    """Simulate the runs of a plan on a machine with known errors, to first order.
+    """Simulate the runs of a plan on a machine with known errors, to first order in the errors.
 
     Parameters
     ----------
@@ -75,7 +75,8 @@ def simulate(
     Raises
     ------
     EffectUnknown, Unusable
-        An effect is unknown, has no such key, or has several coefficients, so that its strength does not determine the readings.
+        An effect is unknown, has no such key, cannot have this strength, or has several coefficients, so that its strength alone does not
+        determine the readings.
     ConfigError
         A recipe does not fit the machine.
     """
@@ -139,7 +140,7 @@ class _SimulatedMachine:
 
 
 def _effect(label: str, strength: float, known: tuple[Effect, ...]) -> tuple[Effect, str, float]:
-    """The effect, its key, and the coefficient that has this strength."""
+    """Return the effect of a label, its key, and the coefficient for this strength."""
     name, _, key = label.partition(":")
     effect = next((e for e in known if e.name == name), None)
     if effect is None:
@@ -148,19 +149,19 @@ def _effect(label: str, strength: float, known: tuple[Effect, ...]) -> tuple[Eff
         raise Unusable(f"{name} has no key {key!r}", f"it has {', '.join(effect.keys) or 'none'}")
     usual = {p.name: p.typical for p in effect.shape}
     if effect.signal(probe_paths(), key, usual)[0].shape[1] != 1:
-        raise Unusable(f"{name} has several coefficients: its strength alone does not say what is read", "simulate another effect")
+        raise Unusable(f"{name} has several coefficients: its strength alone does not determine the readings", "simulate another effect")
     return effect, key, _coefficient(effect, strength, usual)
 
 
 def _coefficient(effect: Effect, strength: float, values: Values) -> float:
-    """The coefficient that has this strength, solved numerically, because a strength may be a root of it."""
+    """Return the coefficient for this strength, solved numerically because the strength may be a non-linear function of it."""
 
     def above(coefficient: float) -> float:
         return effect.strength(np.array([coefficient]), values) / effect.per_unit - strength
 
     reach = next((r for r in 10.0 ** np.arange(0.0, 19.0) if above(-r) * above(r) <= 0.0), None)
     if reach is None:
-        raise Unusable(f"{effect.name} cannot have the strength {strength:g} {effect.unit}", "use a size in its range, with its sign")
+        raise Unusable(f"{effect.name} cannot have the strength {strength:g} {effect.unit}", "choose another size or the other sign")
     return float(scipy.optimize.brentq(above, -reach, reach, xtol=1e-12))
 
 
@@ -188,11 +189,11 @@ def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float
 
 
 _Rows = tuple[F1, F2, F1, F1]
-"""Time, commanded positions, feed in mm/min, direction."""
+"""Time (n,) s, commanded positions (n, 3) mm, feed (n,) mm/min, direction (n,)."""
 
 
 def _path_rows(step: RecordPath, begins_s: float, instruments: SimulatedInstruments) -> _Rows:
-    """Rows along a polyline at constant feed; feed-in and feed-out have no readings."""
+    """Return the rows of a polyline at constant feed, without feed-in and feed-out."""
     points = np.asarray(step.points_mm)
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     first, last = step.measured or (0, len(points) - 1)
@@ -203,7 +204,7 @@ def _path_rows(step: RecordPath, begins_s: float, instruments: SimulatedInstrume
 
 
 def _stationary_rows(test: TestPlan, begins_s: float) -> _Rows:
-    """Rows of a test that reads at standstill."""
+    """Return the rows of a test that reads at standstill."""
     now_s, here, feed = begins_s, None, 0.0
     rows: list[tuple[float, tuple[float, ...], float, float]] = []
     for step in test.steps:

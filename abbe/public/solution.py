@@ -53,7 +53,7 @@ class Solution:
 
     @property
     def model(self) -> str:
-        """``"rigid6"`` or ``"rigid21"``."""
+        """Model of the solution: ``"rigid6"`` or ``"rigid21"`` (see `solve`)."""
         return self._found.joint.model
 
     @property
@@ -64,7 +64,7 @@ class Solution:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Oddities of single runs; an open flag forbids tables."""
+        """Doubts about single runs, one line each; while there are any, `tables` refuses."""
         return tuple(f.line for f in self._found.solved.flags)
 
     @property
@@ -74,7 +74,7 @@ class Solution:
 
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
-        """Scales (``"EXX"``, µm/m) and squareness (``"C0Y"``, µrad), means over the volume; lost motion, cups, bars and mirrors."""
+        """Estimates by name: mean scales (``"EXX"``, µm/m) and squareness (``"C0Y"``, µrad), lost motion, cups, bars and mirrors."""
         status = {m.name: m.status for m in self._found.observability.motions}
         return {
             row.name: Estimate(row.value, row.u, row.unit, status.get(row.name, "observed"))
@@ -102,14 +102,14 @@ class Solution:
         return Deviation(predicted.deviation_mm, predicted.expanded_mm)
 
     def tables(self, counts: tuple[int, int, int], *, unit_mm: float = 1e-4) -> NineTables:
-        """Nine compensation tables (corrections in mm), rounded to the control's unit. Nothing is written to any machine.
+        """Return nine compensation tables (corrections in mm), rounded to the control's unit. Nothing is written to any machine.
 
         Parameters
         ----------
         counts : (int, int, int)
             Grid points of X, Y and Z.
         unit_mm : float
-            The control's smallest step.
+            Unit of a table value in the control, mm.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class Solution:
         return quantise(nine_tables(self._found.joint, counts, sources=self._found.sources), unit_mm)
 
     def plot(self) -> Picture:
-        """The error motions over their strokes with bands of U (k = 2)."""
+        """Plot the error motions over their strokes with bands of U (k = 2)."""
         curves = list(self.motions.values())
         units = dict.fromkeys(c.unit for c in curves)
         return Picture("".join(motion_bands([c for c in curves if c.unit == unit], key=f"motions{i}") for i, unit in enumerate(units)))

@@ -1,4 +1,4 @@
-"""The ball-bar as a state machine: mounting, streaming, samples. No bytes; mm inside, nm and µs where the box counts in them."""
+"""The ball-bar as a state machine: mounting, streaming, samples. No bytes; lengths in mm, samples in nm and µs as the box sends them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ OUT_OF_RANGE, OVERRUN, SYNC, NO_BAR = 1, 4, 8, 16
 MM_PER_INCH = 25.4
 
 Locate = Callable[[F, F], F]
-"""Times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
+"""Maps times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class _Taken:
-    """Raw material of samples: what the world looked like at each instant."""
+    """Samples before their readings are computed: axis positions and sync level at each instant."""
 
     seq: I64
     time_us: I64
@@ -40,7 +40,7 @@ class _Taken:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How the box reads: a person changes unit, range and zero at its panel. ``number`` counts the changes since it was switched on."""
+    """Settings of the box, which a person changes at its panel. ``number`` starts at 1 and counts the changes since power-on."""
 
     number: int = 1
     inch: bool = False
@@ -49,7 +49,7 @@ class Settings:
 
 
 class BallbarDevice:
-    """Samples on its own clock, which runs ``clock_offset_us`` ahead of the world's: it was switched on earlier."""
+    """The ball-bar and its box, whose clock runs ``clock_offset_us`` ahead of the world's, because it was switched on earlier."""
 
     def __init__(self, draws: Draws, sizes: Magnitudes, locate: Locate, *, clock_offset_us: int = 0) -> None:
         self._draws, self._sizes, self._locate = draws, sizes, locate
@@ -67,7 +67,7 @@ class BallbarDevice:
         self._mounts = 0
         self._pushed = False
         self.too_much: Callable[[F, float, float], F] | None = None
-        """Hidden effect: error of the readings (n,) mm from times (n,) s, the time when the bar was hung in, and its length in mm."""
+        """Hidden effect: error of the readings (n,) mm from times (n,) s, the time when the bar was mounted (s), and its length (mm)."""
         self._noise = generator(draws.seed, STREAM_BAR_NOISE)
         self._taken: list[_Taken] = []
         self._ready: list[Samples] = []
@@ -75,7 +75,7 @@ class BallbarDevice:
     # ---- people --------------------------------------------------------------------------------------------------
 
     def mount(self, radius_mm: float, tool_mm: F, now_s: float) -> None:
-        """Put the cup at the tool's actual position (3,), a little beside it, and hang in the bar of nominal length ``radius_mm``."""
+        """Put the cup near the tool's actual position (3,) mm, with a small random offset, and mount the bar of length ``radius_mm``."""
         self.settle()
         rng = generator(self._draws.seed, STREAM_CUP, self._mounts)
         self._mounts += 1
@@ -85,13 +85,13 @@ class BallbarDevice:
         self._radius_mm, self._bar_in, self._hung_in_s = radius_mm, True, now_s
 
     def take_out(self) -> bool:
-        """Take the bar out; the cup stays. False: no cup stands."""
+        """Take the bar out; the cup stays. Return False if there is no cup."""
         self.settle()
         self._bar_in = False
         return self._cup_mm is not None
 
     def change(self, radius_mm: float, now_s: float) -> bool:
-        """Hang the bar of another nominal length in; the cup stays, the bar comes from the hand. False: no cup stands."""
+        """Mount a bar of another nominal length, warm from the hand; the cup stays. Return False if there is no cup."""
         self.settle()
         if self._cup_mm is None:
             return False
@@ -99,12 +99,12 @@ class BallbarDevice:
         return True
 
     def unmount(self) -> None:
-        """Take the bar away."""
+        """Take bar and cup away."""
         self.settle()
         self._cup_mm, self._bar_in = None, False
 
     def switch(self, *, inch: bool | None = None, range_mm: float | None = None, zero_mm: float | None = None) -> None:
-        """Change the settings from the next sample on; what is not given stays."""
+        """Change the given settings from the next sample on; the others stay."""
         self.settle()
         old = self.settings
         self.settings = Settings(
@@ -115,7 +115,7 @@ class BallbarDevice:
         )
 
     def forget_settings(self) -> None:
-        """Have the settings of a box just switched on."""
+        """Reset the settings to those of a box just switched on."""
         self.settle()
         self.settings = Settings()
 
@@ -127,7 +127,7 @@ class BallbarDevice:
     # ---- commands ------------------------------------------------------------------------------------------------
 
     def start(self, rate_hz: int, now_s: float) -> bool:
-        """Start streaming, numbered from 0; the first sample comes one period from now. False for an impossible rate."""
+        """Start a stream, numbered from 0; the first sample comes one period from now. Return False for an impossible rate."""
         if not 0 < rate_hz <= MAX_RATE_HZ or MAX_RATE_HZ % rate_hz:
             return False
         self._taken.clear()
@@ -157,13 +157,13 @@ class BallbarDevice:
         return (self._start_us + self._period_us * ticks) * 1e-6
 
     def record(self, axes_mm: F, sync: B) -> None:
-        """Take the next n samples: axis positions (n, 3) mm and sync levels (n,) at the instants ``due_s`` named."""
+        """Take the next n samples: axis positions (n, 3) mm and sync levels (n,) at the instants that ``due_s`` returned."""
         seq = np.arange(self._next, self._next + len(axes_mm))
         self._taken.append(_Taken(seq, self._start_us + self._period_us * seq, axes_mm, sync))
         self._next += len(axes_mm)
 
     def take(self) -> Samples:
-        """Give all samples taken since the last call."""
+        """Return all samples taken since the last call."""
         self.settle()
         ready, self._ready = self._ready, []
         if len(ready) == 1:
@@ -172,7 +172,7 @@ class BallbarDevice:
         return Samples(*(np.concatenate([none, *(getattr(s, name) for s in ready)]) for name in Samples.__slots__))
 
     def settle(self) -> None:
-        """Turn raw material into readings, before anything the readings depend on is changed."""
+        """Compute the readings of the samples taken so far; called before anything that readings depend on changes."""
         if not self._taken:
             return
         parts, self._taken = self._taken, []

@@ -1,4 +1,4 @@
-"""The line the ball-bar's box speaks over: bytes in, bytes out, a bounded buffer, never blocking."""
+"""The line of the ball-bar's box: bytes in, bytes out, a bounded buffer, never blocking."""
 
 import asyncio
 from collections.abc import Callable
@@ -15,11 +15,11 @@ Received = Callable[[bytes], None]
 
 
 class BytePort(Protocol):
-    """What the box needs of its line."""
+    """The line of the box, as `BallbarWire` needs it."""
 
     @property
     def url(self) -> str:
-        """Where a host finds it."""
+        """URL at which a host reaches the box."""
         ...
 
     def room(self) -> int:
@@ -27,24 +27,24 @@ class BytePort(Protocol):
         ...
 
     def send(self, data: bytes) -> None:
-        """Send bytes (answers may exceed the room)."""
+        """Send bytes (replies may exceed the room)."""
         ...
 
     def pump(self) -> None:
-        """Pass on what waits in the buffer."""
+        """Send the buffered bytes, as far as the line accepts them."""
         ...
 
     async def open(self, received: Received) -> None:
-        """Be reachable from now on; ``received`` gets the host's bytes."""
+        """Open the line; ``received`` gets the host's bytes."""
         ...
 
     async def close(self) -> None:
-        """Be unplugged: the host sees the end of the line."""
+        """Close the line; the host gets end of file."""
         ...
 
 
 class PtyPort:
-    """A serial line: a pseudo terminal, at a stable path when ``link`` is given; the box keeps ``buffer_bytes`` for a host who is late."""
+    """A serial line: a pseudo terminal, at a stable path if ``link`` is given. The box buffers ``buffer_bytes`` for a slow host."""
 
     def __init__(self, link: Path | None, buffer_bytes: int = BUFFER_BYTES) -> None:
         self._link = link
@@ -72,23 +72,23 @@ class PtyPort:
             self._serial.send(data)
 
     def pump(self) -> None:
-        """Pass on what waits in the buffer."""
+        """Send the buffered bytes, as far as the terminal accepts them."""
         if self._serial is not None:
             self._serial.pump()
 
     async def open(self, received: Received) -> None:
-        """Make the terminal."""
+        """Open the terminal."""
         self._serial = PseudoSerial(received, self._link)
 
     async def close(self) -> None:
-        """Hang up and take the link away."""
+        """Hang up and remove the link."""
         if self._serial is not None:
             self._serial.close()
             self._serial = None
 
 
 class TcpPort:
-    """The same bytes over raw TCP on 127.0.0.1; the newest connection is the one that counts."""
+    """The same bytes over raw TCP on 127.0.0.1; a new connection replaces the old one."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -109,7 +109,7 @@ class TcpPort:
 
     @property
     def backlog(self) -> int:
-        """None: the transport passes its buffer on by itself."""
+        """Always 0: the transport sends its buffer by itself."""
         return 0
 
     def send(self, data: bytes) -> None:
@@ -118,16 +118,16 @@ class TcpPort:
             self._writer.write(data)
 
     def pump(self) -> None:
-        """Do nothing: the transport passes its buffer on by itself."""
+        """Do nothing: the transport sends its buffer by itself."""
 
     async def open(self, received: Received) -> None:
-        """Listen; the port found free is kept for the next time."""
+        """Listen; the next ``open`` uses the same port again."""
         self._received = received
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._port)
         self._port = int(self._server.sockets[0].getsockname()[1])
 
     async def close(self) -> None:
-        """Stop listening and drop the host."""
+        """Stop listening and close the host's connection."""
         self._drop()
         if self._server is not None:
             self._server.close()

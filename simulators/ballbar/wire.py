@@ -1,4 +1,4 @@
-"""Bytes of the ball-bar's box (docs/protocols/ballbar.md), little-endian, and the conversation over them."""
+"""Frames of the ball-bar's box (docs/protocols/ballbar.md), little-endian, and its replies to commands."""
 
 import json
 import struct
@@ -22,11 +22,11 @@ class BoxLedger:
         self.stream = -1
 
     def start(self) -> None:
-        """A new stream begins, numbered from 0."""
+        """Begin a new stream, whose samples are numbered from 0."""
         self.stream += 1
 
     def note(self, seqs: Sequence[int], fate: str) -> None:
-        """Successive numbers of the present stream have this fate."""
+        """Note the fate of successive sample numbers of the current stream."""
         if not len(seqs):
             return
         first, last = int(seqs[0]), int(seqs[-1])
@@ -36,7 +36,7 @@ class BoxLedger:
             self.runs.append([self.stream, first, last, fate])
 
     def write(self, path: Path) -> None:
-        """Write everything so far as JSON, in one step: a reader never sees half of it."""
+        """Write all runs so far as JSON, in one step, so that a reader never sees half a file."""
         part = path.with_name(path.name + ".part")
         part.write_text(json.dumps(self.runs), encoding="ascii")
         part.replace(path)
@@ -129,13 +129,13 @@ def encode_ack(tag: int, command: int, result: int) -> bytes:
 
 
 class Parser:
-    """Finds the host's frames in a stream of bytes; garbage and frames with a wrong CRC are skipped without a word."""
+    """Finds the host's frames in a stream of bytes; garbage and frames with a wrong CRC are skipped silently."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Give (type, payload) of each whole frame."""
+        """Yield (type, payload) of each whole frame."""
         self._buffer += data
         while True:
             begin = self._buffer.find(SYNC_BYTES)
@@ -158,7 +158,7 @@ class Parser:
 
 
 class BallbarWire:
-    """The box's conversation: answers commands, writes the samples that are due, drops whole samples when the host does not read."""
+    """The box on its line: answers commands, sends the samples that are due, drops whole samples when the host does not read."""
 
     def __init__(
         self,
@@ -179,16 +179,16 @@ class BallbarWire:
         self.samples_dropped = 0
         self.ledger = BoxLedger()
         self.spoil_every = 0
-        """Every n-th sample gets a bit flipped on its way; 0: none."""
+        """One bit of every n-th sample is flipped on the line; 0: none."""
 
     def received(self, data: bytes) -> None:
-        """Take bytes from the host. The world must be up to date."""
+        """Take bytes from the host. The caller must have advanced the world to now."""
         for kind, payload in self._parser.feed(data):
             self.flush()  # samples older than the command leave before its answer
             self._port.send(self._answer(kind, payload))
 
     def flush(self) -> None:
-        """Write all samples taken so far."""
+        """Send all samples taken so far."""
         samples = self._device.take()
         count = len(samples.seq)
         kept = min(count, self._port.room() // SAMPLE_BYTES)
@@ -206,7 +206,7 @@ class BallbarWire:
             self.ledger.note(samples.seq[kept:].tolist(), SUPPRESSED)
 
     def _spoilt(self, frames: bytes, seqs: list[int]) -> bytes:
-        """The frames as the line delivers them, and what became of each in the ledger."""
+        """Return the frames as the line delivers them, and note the fate of each in the ledger."""
         if not self.spoil_every:
             self.ledger.note(seqs, SENT)
             return frames
@@ -222,7 +222,7 @@ class BallbarWire:
         return bytes(spoilt)
 
     def restart(self, boot_id: int) -> None:
-        """Power cycle of the box: new boot id, not streaming, nothing remembered, settings as from the factory."""
+        """Restart the box as after a power cycle: new boot id, no stream, factory settings."""
         self._device.stop()
         self._device.forget_settings()
         self._device.take()

@@ -1,1 +1,1 @@
-"""Measuring campaigns on the simulated machine without any wire: for statistics over many machines."""
+"""Measurement campaigns on simulated machines without device protocols, for statistics over many machines."""

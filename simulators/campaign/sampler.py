@@ -1,4 +1,4 @@
-"""What a ball-bar and a laser would read on the true machine, run after run, without device protocols: for statistics over many machines.
+"""Readings of a ball-bar and a laser on the true machine, run after run, without device protocols: for statistics over many machines.
 
 The formulas are those of `abbe.simulators.ballbar.device` and `abbe.simulators.laser.device`; the machine is `abbe.simulators.truth`.
 """
@@ -16,15 +16,15 @@ from abbe.simulators.truth.surroundings import drift
 
 STREAM_SETUP, STREAM_NOISE, STREAM_LENGTH, STREAM_SCALE = range(20, 24)
 LEAD_IN_MM = 1.0
-"""Every run is approached in the direction of its first motion, farther than any lost motion."""
+"""Length of the approach to every run, in the direction of its first motion; longer than any lost motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """How well one measures: standard deviation of one reading, share and size of outliers, set-up, scale of the laser.
+    """Measuring conditions: standard deviation of one reading (``*_noise_mm``), share and size of outliers, errors of the instruments.
 
-    ``bar_length_sd_mm``: of the error of each bar (one bar per nominal radius). ``pause_s``: between two runs. ``drift``: whether the
-    machine's thermal drift acts.
+    ``bar_length_sd_mm``: standard deviation of each bar's length error (one bar per nominal radius). ``wavelength_sd``: that of the laser's
+    relative scale error. ``pause_s``: between two runs. ``drift``: whether the machine's thermal drift acts.
     """
 
     bar_noise_mm: float = 0.5e-3
@@ -52,19 +52,19 @@ class Rig:
         self._noise = generator(scenario.seed, STREAM_NOISE)
 
     def machine(self, tool_mm: F | None = None) -> Machine:
-        """The true machine with another tool; None: its own."""
+        """Return the true machine with another tool offset (3,) mm; None: its own."""
         geometry = Geometry(self.scenario.machine)
         if tool_mm is not None:
             geometry.tool_mm = np.asarray(tool_mm, dtype=np.float64)
         return Machine(geometry, self.draws)
 
     def bar_length_error_mm(self, radius_mm: float) -> float:
-        """True length minus nominal, taken with the sign of the reading (a reading is distance - radius + this), of the bar of a radius."""
+        """Return the length error of the bar of this nominal radius, mm: a reading is distance - radius + this error."""
         rng = generator(self.scenario.seed, STREAM_LENGTH, round(1000 * radius_mm))
         return float(rng.normal(scale=self.conditions.bar_length_sd_mm))
 
     def cup(self, centre_mm: F, tool_mm: F | None = None) -> F:
-        """Drive to a centre and set up the cup there, a little beside the tool's actual position: where it stands, (3,) mm."""
+        """Drive to a centre, set up the cup near the tool's actual position, and return the cup's position, (3,) mm."""
         at = self._locate(np.array([self.time_s]), np.asarray(centre_mm, dtype=np.float64)[None], tool_mm)[0]
         direction = self._setup.normal(size=3)
         size_mm = self._setup.uniform(*self.scenario.magnitudes.cup_offset_um) * UM
@@ -80,16 +80,16 @@ class Rig:
         t_s: F | None = None,
         cup_mm: F | None = None,
     ) -> F:
-        """Readings of a ball-bar, distance minus nominal radius, mm.
+        """Return the readings of a ball-bar, distance minus nominal radius, (n,) mm.
 
         Parameters
         ----------
         axes_mm : array, shape (n, 3)
             Commanded positions of the samples, in the order of the motion.
         centre_mm : array, shape (3,)
-            Nominal centre, where the cup is set up unless ``cup_mm`` (from `cup`) names one that stands already.
+            Nominal centre. The cup is set up there, unless ``cup_mm`` (from `cup`) is the position of one already set up.
         t_s : array, shape (n,), optional
-            Instants; without them 33 samples a second from now on.
+            Instants; None: 33 samples per second from now on.
         """
         if cup_mm is None:
             cup_mm = self.cup(centre_mm, tool_mm)
@@ -98,16 +98,16 @@ class Rig:
         return self._read(distance - radius_mm + self.bar_length_error_mm(radius_mm), self.conditions.bar_noise_mm)
 
     def laser(self, axes_mm: F, beam: F, tool_mm: F | None = None, t_s: F | None = None) -> F:
-        """Readings of a laser zeroed at the first position, displacement minus nominal, mm.
+        """Return the readings of a laser zeroed at the first position, displacement minus nominal, (n,) mm.
 
         Parameters
         ----------
         axes_mm : array, shape (n, 3)
             Commanded positions of the records.
         beam : array, shape (3,)
-            Nominal beam, away from the laser. Beam and mirror are set up anew, each a little askew.
+            Nominal beam, away from the laser. Beam and mirror are set up anew, each slightly misaligned.
         t_s : array, shape (n,), optional
-            Instants; without them one record in 2 s from now on.
+            Instants; None: one record every 2 s from now on.
         """
         nominal = np.asarray(beam, dtype=np.float64) / np.linalg.norm(beam)
         sizes = self.scenario.magnitudes
@@ -120,7 +120,7 @@ class Rig:
         return self._read(path - (axes_mm - axes_mm[0]) @ nominal, self.conditions.laser_noise_mm)
 
     def _locate(self, times_s: F, axes_mm: F, tool_mm: F | None) -> F:
-        """Where the tool really is at commanded positions, lost motion and drift included, (n, 3) mm; approached in its first direction."""
+        """Return the actual tool positions at commanded positions, (n, 3) mm, with lost motion and drift, after the approach."""
         first = np.array([_first_sign(axes_mm[:, a]) for a in range(3)])
         self._play.run(np.stack([axes_mm[0] - LEAD_IN_MM * first]))
         actual: F = self.machine(tool_mm).tool_position(self._play.run(axes_mm))
@@ -144,7 +144,7 @@ class Rig:
         return times
 
     def _sideways(self, direction: F, size_urad: tuple[float, float]) -> F:
-        """Small vector perpendicular to a unit vector, its length uniform between the ends."""
+        """Return a small random vector perpendicular to a unit vector; its length is uniform between the ends (µrad)."""
         across = self._setup.normal(size=3)
         across -= direction * (direction @ across)
         vector: F = across / np.linalg.norm(across) * self._setup.uniform(*size_urad) * URAD

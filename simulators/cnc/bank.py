@@ -1,4 +1,4 @@
-"""Compensation images: big-endian words (docs/protocols/cnc.md, "Banks") to a correction that is added to the command."""
+"""Decode compensation images (docs/protocols/cnc.md, "Banks") to a correction that is added to the command."""
 
 import struct
 import zlib
@@ -25,7 +25,7 @@ class ImageError(ValueError):
 
 
 def empty_image() -> list[int]:
-    """Words of a kind 0 image: no correction."""
+    """Return the words of a kind 0 image: no correction."""
     header = _HEADER.pack(MAGIC, FORMAT, 0, HEADER_WORDS, 0, LSB_NM, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1)
     return list(struct.unpack(f">{HEADER_WORDS}H", header))
 
@@ -36,17 +36,17 @@ def to_bytes(words: list[int]) -> bytes:
 
 
 def checksum(words: list[int]) -> int:
-    """CRC-32 over the LENGTH words the image says it has (caller has parsed it)."""
+    """Return the CRC-32 over the LENGTH words of an image that `parse` has checked."""
     return zlib.crc32(to_bytes(words[: words[3]]))
 
 
 def parse(words: list[int]) -> tuple[int, Correction]:
-    """Check an image; give its kind and its correction, commanded positions (n, 3) mm to additions (n, 3) mm.
+    """Check an image; return its kind and its correction, a function from commanded positions (n, 3) mm to additions (n, 3) mm.
 
-    Raises ImageError for anything the controller would not seal.
+    Raises ImageError for an image that the controller would not seal.
     """
     if len(words) < HEADER_WORDS:
-        raise ImageError("shorter than its header")
+        raise ImageError("the image is shorter than its header")
     magic, fmt, kind, length, _, lsb, _, nx, ny, nz, _, *ends = _HEADER.unpack(to_bytes(words[:HEADER_WORDS]))
     counts = (nx, ny, nz)
     if (magic, fmt, lsb) != (MAGIC, FORMAT, LSB_NM):
@@ -70,12 +70,12 @@ def parse(words: list[int]) -> tuple[int, Correction]:
 
 
 def _nothing(command_mm: F) -> F:
-    """Kind 0."""
+    """Return the correction of kind 0: zeros."""
     return np.zeros_like(command_mm)
 
 
 def _cell(position_mm: F, start_mm: float, step_mm: float, count: int) -> tuple[I64, F]:
-    """Index of the lower grid point and fraction towards the next one; beyond the grid the end point holds."""
+    """Return the index of the lower grid point and the fraction towards the next one; beyond the grid the end point holds."""
     place = np.clip((position_mm - start_mm) / step_mm, 0.0, count - 1.0)
     index = np.minimum(place.astype(np.int64), count - 2)
     return index, place - index

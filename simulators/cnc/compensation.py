@@ -29,8 +29,8 @@ class BankState(IntEnum):
 class Compensation:
     """Banks, GEN and lease. Times are controller seconds.
 
-    ``lease_scale`` is controller seconds per second of the lease: a lease guards against a host that died, and hosts live in wall
-    time however fast the simulated world runs.
+    ``lease_scale``: controller seconds per second of the lease. A lease guards against a host that died, so it runs in wall time, however
+    fast the simulated world runs.
     """
 
     def __init__(self, lease_scale: float = 1.0) -> None:
@@ -46,7 +46,7 @@ class Compensation:
         self._lease_end_s = 0.0
 
     def write(self, number: int, offset: int, values: list[int]) -> bool:
-        """Write words into a bank; False (nothing done) when it is the active one or the words do not fit."""
+        """Write words into a bank; do nothing and return False if the bank is active or the words do not fit."""
         if number == self.active or offset < 0 or offset + len(values) > bank.BANK_WORDS:
             return False
         self.words[number][offset : offset + len(values)] = values
@@ -59,7 +59,7 @@ class Compensation:
         return self._owner if now_s < self._lease_end_s else 0
 
     def lease_left_ms(self, now_s: float) -> int:
-        """Rest of the lease in milliseconds of the host's time."""
+        """Return the rest of the lease in milliseconds of wall time."""
         return int(1000.0 * (self._lease_end_s - now_s) / self._scale) if self.owner(now_s) else 0
 
     def lease(self, owner: int, lease_ms: int, now_s: float) -> CompResult:
@@ -72,14 +72,14 @@ class Compensation:
         return CompResult.OK
 
     def release(self, owner: int, now_s: float) -> CompResult:
-        """Give the lease back."""
+        """Release the lease."""
         if self.owner(now_s) not in (0, owner):
             return CompResult.LEASED
         self._owner = 0
         return CompResult.OK
 
     def seal(self, number: int, owner: int, now_s: float) -> CompResult:
-        """Check the image in a bank and fix its CRC."""
+        """Check the image in a bank and store its CRC."""
         refusal = self._refuse(number, owner, now_s)
         if refusal:
             return refusal
@@ -94,7 +94,7 @@ class Compensation:
         return CompResult.OK
 
     def activate(self, number: int, owner: int, expected: tuple[int, int], *, may_act: bool, now_s: float) -> CompResult:
-        """Make a sealed bank the acting one if its CRC and GEN are the ``expected`` ones; ``may_act``: stands, interlocks hold."""
+        """Make a sealed bank the active one if its CRC and GEN are ``expected``; ``may_act``: the machine stands still, interlocks hold."""
         refusal = self._refuse(number, owner, now_s)
         if refusal:
             return refusal
@@ -112,7 +112,7 @@ class Compensation:
         return CompResult.OK
 
     def _refuse(self, number: int, owner: int, now_s: float) -> CompResult:
-        """Checks common to SEAL and ACTIVATE."""
+        """Return why SEAL and ACTIVATE are refused, or OK."""
         if number not in (0, 1):
             return CompResult.BAD_ARGUMENT
         if owner == 0 or self.owner(now_s) != owner:

@@ -38,7 +38,7 @@ class Motion:
 
     @property
     def vertex_count(self) -> int:
-        """Vertices without the starting point."""
+        """Number of vertices without the starting point."""
         return len(self._vertices) - 1
 
     def set_factor(self, factor: float, now_s: float) -> None:
@@ -54,7 +54,7 @@ class Motion:
         self._vertices = np.vstack([self._vertices, vertices_mm])
 
     def travelled(self, times_s: F) -> F:
-        """Length run at n instants, mm."""
+        """Length travelled at n instants, (n,) mm."""
         run = self._ref_mm + self._speed * self._factor * (times_s - self._ref_s)
         clipped: F = np.clip(run, 0.0, self.total_mm)
         return clipped
@@ -73,7 +73,7 @@ class Motion:
         return self._ref_s + rest / speed if speed > 0.0 else float("inf")
 
     def vertex_times(self, from_s: float, to_s: float) -> F:
-        """Instants in (from_s, to_s] at which a vertex is passed: where an axis can turn round."""
+        """Instants in (from_s, to_s] at which a vertex is passed: an axis can reverse there."""
         speed = self._speed * self._factor
         if speed <= 0.0:
             return np.empty(0)
@@ -83,9 +83,9 @@ class Motion:
         return times
 
     def vertices_reached(self, now_s: float) -> int:
-        """Vertices reached, the starting point not counted."""
+        """Number of vertices reached, without the starting point."""
         run = float(self.travelled(np.array([now_s]))[0])
-        # a thousandth of a nanometre forgives the rounding of an arrival computed from its own instant
+        # a thousandth of a nanometre tolerates the rounding of an arrival computed from its own instant
         return int(np.searchsorted(self._length[1:], run + 1e-9, side="right"))
 
 
@@ -96,40 +96,40 @@ def _lengths(vertices_mm: F) -> F:
 
 
 class Timetable:
-    """What `Motion` is for one command, for a whole program: knots of program time and position, straight in between.
+    """An NC program under way, with the methods of `Motion`: positions at knots of program time, linear in between.
 
-    ``set_factor`` (feed hold, override) changes how fast program time runs; rests run with it.
+    ``set_factor`` (feed hold, override) changes how fast program time runs, also in a dwell.
     """
 
     def __init__(self, start_mm: F, blocks: list[tuple[F, float]], start_s: float) -> None:
-        """``blocks``: target (3,) and the seconds to reach it; to rest, repeat the present place."""
+        """``blocks``: target (3,) mm and the seconds to reach it; to dwell, repeat the current position."""
         self._knots = np.concatenate([[0.0], np.cumsum([seconds for _, seconds in blocks])])
         self._places = np.stack([start_mm, *(place for place, _ in blocks)])
         self._ref_s, self._ref, self._factor = start_s, 0.0, 1.0
 
     @property
     def total_mm(self) -> float:
-        """Way of the whole program."""
+        """Path length of the whole program."""
         return float(np.linalg.norm(np.diff(self._places, axis=0), axis=1).sum())
 
     @property
     def target_mm(self) -> F:
-        """Where it ends, (3,) mm."""
+        """End position, (3,) mm."""
         last: F = self._places[-1]
         return last
 
     @property
     def vertex_count(self) -> int:
-        """Blocks."""
+        """Number of blocks."""
         return len(self._places) - 1
 
     def set_factor(self, factor: float, now_s: float) -> None:
-        """Let program time run ``factor`` times as fast from now on."""
+        """Let program time run at ``factor`` times its normal speed from ``now_s`` on."""
         self._ref = self._program_s(now_s)
         self._ref_s, self._factor = now_s, factor
 
     def extend(self, vertices_mm: F) -> None:
-        """A program cannot be extended."""
+        """Raise ValueError: a program cannot be extended."""
         raise ValueError("an NC program runs")
 
     def position(self, times_s: F) -> F:
@@ -138,21 +138,21 @@ class Timetable:
         return np.stack([np.interp(program, self._knots, self._places[:, a]) for a in range(3)], axis=1)
 
     def end_s(self) -> float:
-        """Instant at which it ends at the present factor; infinity on hold."""
+        """Instant at which the program ends at the present factor; infinity on hold."""
         rest = float(self._knots[-1]) - self._ref
         if rest <= 0.0:
             return self._ref_s
         return self._ref_s + rest / self._factor if self._factor > 0.0 else float("inf")
 
     def vertex_times(self, from_s: float, to_s: float) -> F:
-        """Instants in (from_s, to_s] at which a block ends: where an axis can turn round."""
+        """Instants in (from_s, to_s] at which a block ends: an axis can reverse there."""
         if self._factor <= 0.0:
             return np.empty(0)
         times: F = self._ref_s + (self._knots - self._ref) / self._factor
         return times[(times > from_s) & (times <= to_s)]
 
     def vertices_reached(self, now_s: float) -> int:
-        """Blocks done."""
+        """Number of blocks done."""
         return int(np.searchsorted(self._knots[1:], self._program_s(now_s) + 1e-12, side="right"))
 
     def _program_s(self, now_s: float) -> float:
@@ -187,7 +187,7 @@ ALARM_NONE, ALARM_ESTOP, ALARM_STROKE = 0, 1, 2
 
 @dataclass(slots=True)
 class Switches:
-    """What people and the shop floor do to the controller."""
+    """Inputs of the controller that people and the shop floor set."""
 
     estop: bool = False
     door_open: bool = False
@@ -198,7 +198,7 @@ class Switches:
 
 
 class Controller:
-    """Motion side of the controller, with its compensation banks beside it."""
+    """The controller: its motion, and its compensation banks in ``comp``."""
 
     def __init__(self, geometry: Geometry, *, lease_scale: float = 1.0) -> None:
         self._low, self._high = geometry.low_mm, geometry.high_mm
@@ -213,7 +213,7 @@ class Controller:
         self.in_position = True
         self.in_position_s = 0.0
         self.motions_done = 0
-        """Motions finished since boot; the wire compares it to know whether its last command has finished."""
+        """Number of motions finished since boot; `CncRegisters` derives from it whether its last command has finished."""
         self.path_running = False
         self.path_start_s = 0.0
         self.path_end_s = 0.0
@@ -225,17 +225,17 @@ class Controller:
 
     @property
     def moving(self) -> bool:
-        """A motion command is under way (also while held)."""
+        """Whether a motion command is under way (also while held)."""
         return self._motion is not None
 
     @property
     def held(self) -> bool:
-        """Feed hold is in effect: asked for, or the door is open."""
+        """Whether feed hold acts: it was requested, or the door is open."""
         return self.hold == Hold.HOLD or self.switches.door_open
 
     @property
     def fifo_free(self) -> int:
-        """Points that still fit: those waiting and those of the running path not yet reached take room."""
+        """Number of points that still fit; waiting points and unreached points of the running path take room."""
         waiting = len(self._fifo)
         if self.path_running and self._motion is not None:
             waiting += self._motion.vertex_count - self.path_points_done
@@ -243,7 +243,7 @@ class Controller:
 
     @property
     def path_points_done(self) -> int:
-        """Points reached of the running or last path."""
+        """Number of points reached of the running or last path."""
         if self.path_running and self._motion is not None:
             return self._motion.vertices_reached(self.now_s)
         return self._path_points
@@ -274,7 +274,7 @@ class Controller:
     # ---- time ----------------------------------------------------------------------------------------------------
 
     def advance(self, to_s: float) -> None:
-        """Let time pass; a motion that arrives in between ends exactly at its own instant."""
+        """Advance to ``to_s``; a motion that arrives before ends exactly at its own instant."""
         motion = self._motion
         if motion is not None:
             end_s = motion.end_s()
@@ -317,7 +317,7 @@ class Controller:
         return Result.OK
 
     def run_program(self, blocks: list[tuple[F, float]]) -> Result:
-        """What the operator starts at the panel: places (3,) mm with the seconds to get there; "NC program running" until it ends."""
+        """Run an NC program, as the operator starts it at the panel: positions (3,) mm with the seconds to reach each."""
         if self.moving:
             return Result.BUSY
         if not self.may_move():
@@ -350,7 +350,7 @@ class Controller:
         return Result.OK
 
     def request_hold(self, request: Hold) -> None:
-        """Take the level of HOLD_REQUEST."""
+        """Apply the level of HOLD_REQUEST."""
         self.hold = request
         if request == Hold.ABORT:
             self._fifo.clear()
@@ -359,7 +359,7 @@ class Controller:
         self._apply_speed()
 
     def set_override(self, percent: int) -> None:
-        """Turn the feed override knob."""
+        """Set the feed override."""
         self.override_percent = percent
         self._apply_speed()
 
@@ -376,12 +376,12 @@ class Controller:
             self.raise_alarm(ALARM_ESTOP)
 
     def raise_alarm(self, code: int = ALARM_STROKE) -> None:
-        """Any alarm: motion ends where it is and does not count as done."""
+        """Raise an alarm: motion ends where it is and does not count as done."""
         self.alarm = code
         self._end_here()
 
     def drives_off(self) -> None:
-        """The drives drop out: motion ends where it is and does not count as done."""
+        """Switch the drives off: motion ends where it is and does not count as done."""
         self.drives_on = False
         self._end_here()
 
@@ -396,7 +396,7 @@ class Controller:
             self._motion = None
 
     def _refuse(self, feed_mm_min: float, points_mm: F) -> Result:
-        """Checks common to MOVE and PATH_START; OK = go."""
+        """Return why MOVE and PATH_START are refused, or OK."""
         if self.moving:
             return Result.BUSY
         if not self.may_move() or self.hold == Hold.ABORT:

@@ -1,4 +1,4 @@
-"""Log of a host's commands to the controller, with times: the oracle of tests about commands after an event."""
+"""Log of a host's commands to the controller, with times, for tests that check which commands follow an event."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class Command:
 
     @property
     def moves(self) -> bool:
-        """Whether it starts, feeds or frees a motion. Stopping does not count."""
+        """Whether the command starts, extends or resumes a motion; stopping one does not count."""
         return self.kind in MOTION or (self.kind == "run" and self.moving)
 
 
@@ -25,9 +25,10 @@ class Command:
 class TableAccess:
     """One attempt to change a bank, the active table or the lease, as it arrived, in order.
 
-    ``kind``: write, seal, activate, lease or release; one that carried an executed number and did nothing: "stale". ``bank``: which;
-    ``first`` and ``words``: what was written where. ``by``: owner that a command names, 0 for a write, which names none. ``taken``: whether
-    the controller did it. ``owner``: who held the lease just before; ``active``, ``gen``: active bank and generation just after.
+    ``kind``: write, seal, activate, lease or release, or "stale" for a command that did nothing because its number was not the next one.
+    ``bank``, ``first``, ``words``: bank, first register and words of a write; for a command, ``words`` are its number and its result
+    (stale: its code). ``by``: owner named in the command, 0 for a write. ``taken``: whether the controller executed it. ``owner``: owner of
+    the lease just before; ``active``, ``gen``: active bank and generation just after.
     """
 
     time_s: float

@@ -33,7 +33,7 @@ def words(data: bytes) -> list[int]:
 class CncRegisters:
     """The controller seen through its registers.
 
-    ``advance`` brings the world up to date; it is called before every request, so that a status is never older than its reading.
+    ``advance`` brings the world up to date; it is called before every request, so that a reply always shows the current state.
     """
 
     size = _BANKS_AT[1] + BANK_WORDS
@@ -160,7 +160,7 @@ class CncRegisters:
         return True
 
     def _take_bank(self, number: int, offset: int, values: list[int]) -> bool:
-        """Write into a bank. The log also keeps refused writes, which shows hosts that write without the right to."""
+        """Write into a bank. The log also keeps refused writes, so that tests find hosts that write without permission."""
         comp = self._cnc.comp
         owner = comp.owner(self._cnc.now_s)
         taken = comp.write(number, offset, values)

@@ -14,7 +14,7 @@ from abbe.simulators.truth.surroundings import Air, AirState
 RATE_HZ = 20
 
 Locate = Callable[[F, F], F]
-"""Times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
+"""Maps times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
 
 
 class LaserResult(IntEnum):
@@ -46,7 +46,7 @@ class Mount:
     zero_mm: F
 
     def displacement(self, position_mm: F) -> float:
-        """Growth of the path to the mirror since the zero, mm: the mirror plane meets the true beam further away."""
+        """Return the growth since the zero of the path, mm, to the point where the true beam meets the mirror plane."""
         return float(self.normal @ (position_mm - self.zero_mm) / (self.normal @ self.beam))
 
 
@@ -64,7 +64,7 @@ class LaserDevice:
         self._compensating = False
         self._zero_s = 0.0
         self.too_much: Callable[[float, float, float], float] | None = None
-        """What a hidden effect adds: instant, s since the zero, and path in mm to mm."""
+        """Hidden effect: error of a reading (mm) from the instant (s), the time since the zero (s), and the path (mm)."""
         self._pending: tuple[int, float, F] | None = None
         self._output = Output(0, 0.0, 0.0, 0, 0b10001, air.at(0.0))
 
@@ -76,7 +76,7 @@ class LaserDevice:
         return int(np.floor(time_s * RATE_HZ + 1e-6))
 
     def record(self, count: int, time_s: float, axes_mm: F) -> None:
-        """Take note of where the axes (3,) stood at an output instant."""
+        """Note the axis positions (3,) mm at an output instant."""
         self._pending = (count, time_s, axes_mm)
 
     def output(self) -> Output:
@@ -136,14 +136,14 @@ class LaserDevice:
             self._lost, self._zeroed = True, False
 
     def weaken(self, permille: int) -> None:
-        """Let less light come back, as from a dirty mirror; it still counts."""
+        """Set a weaker signal, as from a dirty mirror; the laser still counts."""
         self.output()
         self._signal = permille
 
     # ---- commands ------------------------------------------------------------------------------------------------
 
     def zero(self, position_mm: F) -> LaserResult:
-        """Make the present tool position (3,) the zero; refused while the beam is blocked or its loss not cleared."""
+        """Make the present tool position (3,) mm the zero; refused while the beam is blocked or its loss is not cleared."""
         self.output()
         if self._mount is None or self._blocked or self._lost:
             return LaserResult.BLOCKED

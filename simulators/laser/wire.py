@@ -17,7 +17,7 @@ class LaserRegisters:
     """The laser seen through its registers.
 
     ``advance`` brings the world up to date before every request; ``tool_position`` gives the actual tool position (3,) mm now.
-    The laser's clock runs ``clock_offset_us`` ahead of the world's: instruments are not switched on together.
+    The laser's clock runs ``clock_offset_us`` ahead of the world's, because it was switched on earlier.
     """
 
     size = _COMMAND_AT + _COMMAND_WORDS + _ACK_WORDS

@@ -23,7 +23,7 @@ def test_packaged_file_states_every_default() -> None:
         ({"seed": "one"}, "seed: 'one' is not of type int"),
         ({"seed": True}, "seed: True is not of type int"),
         ({"seed": -1}, "seed: must not be negative"),
-        ({"boot_id": 2**32}, "boot_id: must have 32 bits"),
+        ({"boot_id": 2**32}, "boot_id: must be 0..4294967295"),
         ({"speed": 0.0}, "speed: must be above 0"),
         ({"machine": 3}, "machine: a table is expected"),
         ({"machine": {"tool_mm": [0, 0]}}, "machine.tool_mm: a list of 3 numbers is expected"),
