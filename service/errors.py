@@ -300,7 +300,7 @@ class PushNotBegun(AbbeError):
 
 
 class TakenBack(TableRefused):
-    """A new table was active for a test of its effect, and failed it; the old table is in force again."""
+    """A new table was active for the test of its signs, and failed it; the old table is in force again."""
 
     code = "CMP-005"
 

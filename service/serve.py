@@ -2,7 +2,7 @@
 
 This is the core process: devices, timetable, jobs, MQTT. It answers no HTTP; the page is a process of its own (`abbe.service.web.process`)
 that the core starts and talks to over a channel (`abbe.service.channel`). Start: store, MQTT, timetable, page. Stop, within five seconds:
-a running check is cancelled (the devices hold the motion), the page closes, the state "offline" is published, the store closes.
+a running check is cancelled, which stops the axes, the page closes, the state "offline" is published, the store closes.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ JOURNAL_S = 0.25
 OpenPushReader = Callable[[], str]
 """Return the open push as a sentence; empty: none."""
 STOP_S = 4.5
-"""The process promises to end within 5 s of the signal; after this it is cut off. The store survives that."""
+"""Time after the stop signal, s, at which the process is cut off: it must end within 5 s. The store survives that."""
 LEAVE_S = 0.3
-"""Longest wait for a thread that still computes after everything has closed"""
+"""Longest wait, s, for a thread that still computes after everything has closed."""
 WORK_END_S = 2.5
 GOODBYE_S = 1.2
 FLUSH_S = 5.0
@@ -345,7 +345,7 @@ def leave_now(code: int) -> None:
 
 
 def notify(state: str) -> bool:
-    """Notify systemd (``sd_notify``); false if it does not listen now, which holds nothing up. Does nothing without systemd."""
+    """Notify systemd (``sd_notify``) without waiting; return false if it does not listen now. Without systemd, do nothing."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return True

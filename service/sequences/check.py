@@ -50,7 +50,7 @@ class DryRun:
 
 
 def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
-    """Every commanded position of a plan, in order."""
+    """Yield every commanded position of the steps, in order."""
     for step in steps:
         if isinstance(step, MoveTo):
             yield step.target_mm
@@ -59,7 +59,7 @@ def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
 
 
 def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
-    """Machine time of a step in s from a position, and the position after the step."""
+    """Return the machine time of a step, s, from the position ``here`` (None: unknown), and the position after it."""
     match step:
         case MoveTo(target, feed):
             return (0.0 if here is None else math.dist(here, target) / feed * 60.0), target
@@ -103,7 +103,7 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
 
 
 def paced(plan: CampaignPlan, max_feed_mm_min: float) -> CampaignPlan:
-    """The same campaign, moving between readings no faster than the machine file allows.
+    """Return the same campaign, moving between readings no faster than the machine file allows.
 
     Positions are read at standstill, so a slower approach changes no reading. A recorded path keeps the feed of its recipe.
     """
@@ -149,13 +149,13 @@ def _check_cup(plan: TestPlan) -> None:
     lowest = cup_of(setup).lowest(list(positions(plan.steps[own:])) or [as_point(cup_of(setup).pole)])
     if lowest < -LOW_SHARE:
         raise StrokeError(
-            f"test {plan.label}: the path goes {-lowest * setup['radius_mm']:.0f} mm below the centre of the cup, which stands there",
+            f"test {plan.label}: the path goes {-lowest * setup['radius_mm']:.0f} mm below the centre of the cup, into its support",
             f"use a partial arc ({LOW_SHARE:g} radii below the centre are allowed), or write under_the_cup = true if there is room",
         )
 
 
 def fastest(plan: TestPlan) -> float:
-    """Largest feed of a test, mm/min."""
+    """Return the largest feed of a test, mm/min."""
     return max((s.feed_mm_min for s in plan.steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=0.0)
 
 

@@ -1,7 +1,7 @@
-"""What stops motion: people, by control of a measurement from outside, and conditions of the machine, read from its status (interlocks).
+"""What stops motion: requests of people (`Control`), and conditions in the status of the machine (interlocks).
 
-Control is pause, resume, stop, abort, and a state that can be watched. Call it in the event loop of the measurement; from a signal handler
-or another thread use ``loop.call_soon_threadsafe``.
+A `Control` pauses, resumes, stops and aborts a measurement, and reports its state. Call it in the event loop of the measurement; from a
+signal handler or another thread use ``loop.call_soon_threadsafe``.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Watching:
 
 
 def tripped(status: ControllerStatus, tolerated: frozenset[str] = frozenset()) -> Interlock | None:
-    """The first condition of the controller that forbids motion; None: it may move."""
+    """Return the interlock of the first condition that forbids motion; None: the machine may move."""
     for condition, kind, text in FORBIDDEN:
         if condition in status.conditions and kind.condition not in tolerated:
             return kind(text, CLEAR_IT)
@@ -111,7 +111,7 @@ def check_ours(status: ControllerStatus) -> None:
 
 
 def person_may_be_inside(status: ControllerStatus) -> bool:
-    """Whether the door is open or the mode is not remote: a person may touch what is mounted."""
+    """Return whether the door is open or the mode is not remote: a person may touch what is mounted."""
     return Condition.DOOR_OPEN in status.conditions or not status.remote
 
 
@@ -129,7 +129,7 @@ def air_trouble(reading: LaserReading, window_c: tuple[float, float] | None) -> 
         return None
     low, high = window_c
     return TemperatureOutside(
-        f"the air has {reading.air_temp_c:.1f} C, allowed are {low:g}..{high:g} C", "wait until the room is as it should be, then go on"
+        f"the air has {reading.air_temp_c:.1f} C, allowed are {low:g}..{high:g} C", "wait until the air is within these limits, then go on"
     )
 
 
@@ -276,7 +276,7 @@ class Control:
         return self._abort
 
     def now(self, state: State, why: str = "") -> None:
-        """Report the sequencer's state to watchers; a pending request stays visible instead of it."""
+        """Report the sequencer's state to watchers; while a request is pending they see the request instead."""
         asked = (State.ABORTING, self._abort), (State.STOPPING, self._stop), (State.PAUSING, self._pause and state == State.RUNNING)
         wanted = next((one for one, is_asked in asked if is_asked), state)
         self._set(replace(self._now, state=state if state == State.ENDED else wanted, why=why))
@@ -293,7 +293,7 @@ class Control:
             raise Stopped(STOPPED.detail, STOPPED.remedy)
 
     async def gate(self) -> None:
-        """Wait here while a pause is requested; a safe place between two pieces of work. Raises as `check`."""
+        """Wait while a pause is requested. Call it between two pieces of work. Raises as `check`."""
         self.check()
         if self._pause:
             self.now(State.PAUSED)
@@ -339,7 +339,7 @@ class Control:
                 await asyncio.wait({task})
 
     async def unless_aborted(self, work: Coroutine[Any, Any, T]) -> T:
-        """Wait for work that handles a stop by itself; an abort cancels it. Its clean-up always runs to the end.
+        """Wait for work that handles a stop by itself; an abort cancels the work, whose clean-up always runs to the end.
 
         Raises
         ------

@@ -78,7 +78,7 @@ _KINDS: dict[type[Any], str] = {BegunLine: BEGUN, HandLine: HAND, RunLine: RUN, 
 
 
 def lines_of(journal: Iterable[CheckpointRecord], kind: type[Line]) -> list[Line]:
-    """All lines of one kind, oldest first.
+    """Return all lines of one kind, oldest first.
 
     Raises
     ------
@@ -171,5 +171,5 @@ def troubles(journal: Iterable[CheckpointRecord]) -> list[Trouble]:
 
 
 def not_written(journal: Iterable[CheckpointRecord]) -> int:
-    """Number of incidents that did not reach the database in time."""
+    """Return the number of incidents that did not reach the database in time."""
     return sum(int(one.doc.get("incidents_not_written", 0)) for one in journal if one.kind == ENDED)

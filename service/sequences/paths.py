@@ -74,7 +74,7 @@ def with_warning(error: BaseException) -> BaseException:
 
 
 def warnings_of(error: BaseException) -> list[str]:
-    """Notes of an error."""
+    """Return the notes of an error."""
     return list(getattr(error, "__notes__", []))
 
 
@@ -191,7 +191,7 @@ class Pump:
         BarOutOfRange, MeasurementFault
             The bar is out of range, or samples are lost.
         StretchDiffers
-            The stretch reads differently from before the interruption.
+            The stretch that is read twice gives other readings than before the interruption.
         """
         async for batch in batches:
             await self._recorder.add_bar(batch)

@@ -1,4 +1,4 @@
-"""Where an interrupted test resumes, and how the machine gets there. Pure.
+"""Where an interrupted test resumes, and how the machine gets there. Only computes; no device is used.
 
 A bar must not move through its sphere, nor a mirror out of its beam: the machine returns the way the test came, to the last checkpoint. A
 ball-bar path resumes where it was interrupted, or begins again. A laser run resumes after its last complete point, once that point has
@@ -7,7 +7,7 @@ been read again with the same result.
 While the ball-bar records, the controller's statuses show how far the axes came at constant feed (`PathProgress`). If the path is
 interrupted and bar and cup stay in place, the machine need not begin again: it drives back along the path beyond the last valid point, by a
 stretch and a lead, and comes forward again. On the lead every axis takes up its lost motion as before; on the stretch the bar must repeat
-its readings (`StretchComparison`). The runs up to their stretches, and the last run, form one path. Readings just before the interruption
+its readings (`StretchComparison`). The runs, each up to its stretch, and the last run form one path. Readings just before the interruption
 serve only for this comparison.
 """
 
@@ -100,7 +100,7 @@ class PathProgress:
         return float(gone_mm - at[near][np.argmin(np.abs(at[near] - gone_mm))]) if off.min() < STEADY_MM else None
 
     def doc(self) -> dict[str, Any]:
-        """Fields for the end document of an interrupted run; empty when the path cannot resume."""
+        """Return fields for the end document of an interrupted run; empty when the path cannot resume."""
         if self.good_us is None or self.boot_id is None:
             return {}
         return {"path_start_us": self.start_us, "good_us": self.good_us, "box_boot_id": self.boot_id}
@@ -110,7 +110,7 @@ class PathProgress:
 class PathRemainder:
     """Rest of an interrupted path: valid ``pieces``, and ``offset_mm``, the length of the whole path at which the rest begins.
 
-    ``arc_mm`` and ``deviation_mm``, shape (n,): earlier readings on the stretch, by length along the rest; ``boot_id``: of their box.
+    ``arc_mm`` and ``deviation_mm``, shape (n,): earlier readings on the stretch, by length along the rest; ``boot_id``: of the box then.
     """
 
     pieces: tuple[RunPiece, ...]
@@ -122,7 +122,7 @@ class PathRemainder:
     boot_id: int
 
     def doc(self) -> dict[str, Any]:
-        """As JSON object for ``path`` in the start document."""
+        """Return the JSON object for ``path`` in the start document."""
         return {"offset_mm": self.offset_mm, "pieces": [{"run": p.run, "to_mm": p.to_mm} for p in self.pieces]}
 
 
@@ -149,7 +149,7 @@ def rest_of_path(step: RecordPath, so_far: ReadProgress) -> tuple[RecordPath, in
 
 
 def _before(arc: F1, at_mm: float) -> int:
-    """The last point at or before a length; -1 if there is none."""
+    """Return the number of the last point at or before a length; -1 if there is none."""
     return int(np.searchsorted(arc, at_mm + 1e-9, side="right")) - 1
 
 
@@ -204,7 +204,7 @@ class StretchComparison:
         self.off_mm = float(np.median(off))
         if abs(self.off_mm) > self._allowed_mm + 3.0 * noise_mm:
             raise StretchDiffers(
-                f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um off its value before the break "
+                f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um off its value before the interruption "
                 f"(allowed: {1e3 * self._allowed_mm:.1f})",
                 "cup or bar was displaced, or the machine has drifted: the path starts again, or the bar is mounted again",
             )
@@ -214,9 +214,9 @@ BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
 STANDS = MountBar | TakeBarOut | ChangeBar | MountLaser
 """Steps after which the machine holds a bar, a cup or a mirror."""
 OFF_PATH_MM = 0.05
-"""Farther than this from the way it came, another program or person moved the machine, and the set-up is not reliable."""
+"""Largest distance of the machine from the way it came; farther off, a program or person has moved it, and the set-up is not reliable."""
 SAME_WAY_MM = 0.005
-"""Tolerance for two passages of one place: chords of a circle run beside it, and positions are rounded."""
+"""Tolerance for two passages of one place: chords deviate from the circle, and positions are rounded."""
 KEEP_FROM = 2
 """A laser run with fewer complete points begins again: a repeated reading has nothing to be compared with."""
 REFERENCE_MM = 0.003
@@ -227,8 +227,8 @@ REFERENCE_MM = 0.003
 class ResumeTrail:
     """How to resume: along ``trail`` (oldest point first) back to number ``to``, then forward to number ``upto``.
 
-    With ``carried`` records the last of them is read again there. On the way forward every axis moves as before, so that its lost motion is
-    the same. ``latest``: where the trail passes a place twice, the machine stands on the later passage. Empty trail: nothing is mounted.
+    With ``carried`` records the last one is read again at ``upto``. On the way forward every axis moves as before, so that its lost motion
+    is the same. ``latest``: where the trail passes a place twice, the machine stands on the later passage. Empty trail: nothing is mounted.
     Trail of one point: the machine must stand there, and nothing moves.
     """
 
@@ -311,7 +311,7 @@ def _to_beginning(trail: tuple[Point, ...], steps: tuple[Step, ...]) -> ResumeTr
 
 
 def _by_itself(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps before the first manual one: after it the set-up, and so the way, is another."""
+    """Return the steps before the first manual one, which changes the set-up and so the way."""
     cut = next((k for k, step in enumerate(steps) if isinstance(step, BY_HAND)), len(steps))
     return steps[:cut]
 
@@ -341,7 +341,7 @@ def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]
     segment, off_mm = _nearest(trail, here, resume_trail.to, latest=resume_trail.latest)
     if off_mm > OFF_PATH_MM:
         raise SetupDisturbed(
-            f"the machine stands {off_mm:.3f} mm beside the way that the test came",
+            f"the machine stands {off_mm:.3f} mm off the way that the test came",
             "it was moved during the break: the set-up is mounted anew",
         )
     if len(trail) == 1:
@@ -384,7 +384,7 @@ def anew(test: TestPlan, number: int) -> TestPlan:
 
 
 def end_of(test: TestPlan) -> Point | None:
-    """Position of the machine after a test."""
+    """Return the position of the machine after a test; None if it does not move."""
     return _final_position(test.steps)
 
 
@@ -404,7 +404,7 @@ def _trail(start: Point | None, steps: tuple[Step, ...]) -> tuple[Point, ...]:
 
 
 def _feed(steps: tuple[Step, ...]) -> float:
-    """Slowest feed of the remaining steps: the machine never returns faster than it came."""
+    """Return the slowest feed of the remaining steps: the machine never returns faster than it came."""
     return min((s.feed_mm_min for s in steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=1000.0)
 
 

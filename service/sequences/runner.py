@@ -223,7 +223,7 @@ class Runner:
     # ---- resuming --------------------------------------------------------------------------------------------------
 
     async def _gone_back(self, attempt: Attempt, recorder: Recorder, watch: Watch) -> Point | None:
-        """Return to the last checkpoint along the way that the test came; the new position, or None if the machine did not move."""
+        """Return to the last checkpoint along the way that the test came; return the new position, or None if nothing is mounted."""
         resume_trail = attempt.resume_trail
         if not resume_trail.trail:
             return None
@@ -250,7 +250,7 @@ class Runner:
         off_mm = abs(record["displacement_tenth_nm"] - last["displacement_tenth_nm"]) * MM_PER_COUNT
         if off_mm > REFERENCE_MM:
             raise SetupDisturbed(
-                f"the last point reads {1e3 * off_mm:.1f} um off its value before the break (allowed: {1e3 * REFERENCE_MM:.0f})",
+                f"the last point reads {1e3 * off_mm:.1f} um off its value before the interruption (allowed: {1e3 * REFERENCE_MM:.0f})",
                 "laser or mirror was displaced: the set-up is mounted anew",
             )
         for one in carried:
@@ -296,9 +296,7 @@ class Runner:
         """Refuse a path unless the machine stands at its start: from elsewhere the first move may lead through the sphere."""
         off_mm = math.dist((await self._s.controller.status()).position_mm, start_mm)
         if off_mm > OFF_PATH_MM:
-            raise MeasurementFault(
-                f"the machine stands {off_mm:.3f} mm beside where the path begins", "look at the machine, then begin again"
-            )
+            raise MeasurementFault(f"the machine stands {off_mm:.3f} mm off the start of the path", "look at the machine, then begin again")
 
     async def _recorded(self, step: RecordPath, recorder: Recorder) -> dict[str, int]:
         await self._stands_at(step.points_mm[0])
@@ -312,7 +310,7 @@ class Runner:
             await laser.set_environment_compensation(True)  # without it every length is 270 ppm too long
             await laser.zero()
         except Refused as error:
-            raise BeamLost(f"the laser takes no zero: {error.detail}", "free the beam; the test begins again") from error
+            raise BeamLost(f"the laser cannot be zeroed: {error.detail}", "free the beam; the test begins again") from error
 
     async def _kept(self, record: dict[str, Any], recorder: Recorder) -> None:
         await recorder.add_record(record)

@@ -1,4 +1,4 @@
-"""The step vocabulary. A plan is a tuple of these; one runner interprets them, one dry run checks them."""
+"""The steps of a test. A plan is a tuple of steps; one runner interprets them, one dry run checks them."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ReadLaser:
 class RecordPath:
     """Run a polyline at constant feed while the ball-bar streams. The machine stands at its first point.
 
-    ``measured``: first and last point of what counts; before and after it are feed-in and feed-out. None: all of it.
+    ``measured``: numbers of the first and last point that count; feed-in is before, feed-out after them. None: all points count.
     """
 
     points_mm: tuple[Point, ...]
@@ -78,7 +78,7 @@ class RecordPath:
 
 @dataclass(frozen=True, slots=True)
 class FollowPath:
-    """Run a polyline on the sphere, with the bar hung in and without recording, to the start of the next path."""
+    """Run a polyline without recording, such as the way along the sphere to the start of the next path."""
 
     points_mm: tuple[Point, ...]
     feed_mm_min: float
@@ -99,7 +99,7 @@ Step = MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroL
 
 @dataclass(frozen=True, slots=True)
 class TestPlan:
-    """One run: its kind, its set-up (run-format.md 3), and its steps."""
+    """One run: its kind, its set-up document (docs/schemas/run.schema.json), and its steps."""
 
     __test__ = False  # not a pytest class
 

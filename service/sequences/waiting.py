@@ -63,7 +63,7 @@ def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> Non
     if boot_id != expected.boot_id:
         raise PreconditionsChanged(
             f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",
-            "its clock began anew: measure a new campaign; the complete runs of this one stay",
+            "its clock started again: measure a new campaign; the complete runs of this one are kept",
         )
     if table_crc != expected.table_crc:
         raise PreconditionsChanged(
@@ -73,7 +73,7 @@ def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> Non
 
 
 LOOK_S = 0.1
-"""Polling interval of a pause: devices and requests."""
+"""Polling interval of devices and requests during a pause, s."""
 
 
 async def paused(
@@ -148,7 +148,7 @@ class Visits:
 
 
 def may_suspend(trouble: Interlock, suspending: Suspending) -> bool:
-    """Whether a condition only suspends: it can clear by itself, and the machine file allows it."""
+    """Return whether a condition only suspends: it can clear by itself, and the machine file allows it."""
     return trouble.condition in CAN_CLEAR & suspending.conditions
 
 

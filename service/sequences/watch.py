@@ -1,4 +1,4 @@
-"""The watcher beside a running test: polls controller and laser, and ends the test at an interlock or when one does not answer.
+"""The watcher beside a running test: polls controller and laser, and ends the test at an interlock or when a device does not answer.
 
 The latency from an event to the end of the motion command stream is one period, one exchange, and the stop. The controller's link carries
 one request at a time, so the watcher waits its turn and never has more than one request pending. While other tasks poll more often (along a
@@ -249,7 +249,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
             until_s, again = clock() + unknown_s, False
         elif late_s >= 0.0:
             raise StatusUnknown(
-                f"the controller's status is unknown for {1e3 * unknown_s:.0f} ms: {why}",
+                f"the controller's status has been unknown for {1e3 * unknown_s:.0f} ms: {why}",
                 "look at its link; nothing moves until it is known",
             )
         else:
@@ -257,7 +257,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
 
 
 def first_of(error: BaseException) -> BaseException:
-    """First leaf error of an exception group."""
+    """Return the first leaf error of an exception group."""
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
     return error

@@ -179,7 +179,7 @@ async def test_a_knocked_cup_is_seen_on_the_stretch_and_nothing_is_joined(place)
     bar._cup_mm = bar._cup_mm + 0.004 * outwards / np.linalg.norm(outwards)
     assert "test resumes at" in await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
-    assert "off its value before the break" in runs(store)[1].reason
+    assert "off its value before the interruption" in runs(store)[1].reason
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}  # nothing is kept that the cup could contradict
     assert "pieces" not in runs(store)[-1].start_doc["path"]
 

@@ -52,7 +52,7 @@ class Halt:
 
 @dataclass(frozen=True, slots=True)
 class Go:
-    """Straight to a point."""
+    """Straight move to a point."""
 
     target_mm: Point
     feed_mm_min: float
@@ -130,7 +130,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
 
 
 def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """Blocks of a test. A bar cannot hang in at the centre: the cup is placed there, and the bar is hung in beside the path's start."""
+    """Yield the blocks of a test. The cup is placed at the centre; the bar does not fit in there and is hung in beside the path's start."""
     here: Point | None = None
     steps = test.steps
     first = next((k for k, s in enumerate(steps) if isinstance(s, RecordPath | ReadBar)), 0)
@@ -196,7 +196,7 @@ def _by_hand(step: Step) -> str:
 
 
 def _path(test: TestPlan, step: RecordPath, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """Blocks of a path: exact arcs for a circle, else the polyline."""
+    """Yield the blocks of a path: exact arcs for a circle, else the polyline."""
     plane = test.setup.get("plane")
     if test.test != "ballbar_circle" or plane not in arcs:
         yield from (Go(p, step.feed_mm_min) for a, p in pairwise(step.points_mm) if p != a)

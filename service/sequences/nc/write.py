@@ -39,7 +39,7 @@ PLANE_CODES = {"XY": "G17", "ZX": "G18", "YZ": "G19"}
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """G-code of one controller. ``start`` and ``end``: first and last lines; ``safe``: modes; ``smooth``, ``exact``: corners."""
+    """G-code of one controller. ``start``, ``end``: first and last lines; ``safe``: modal codes; ``smooth``, ``exact``: corner modes."""
 
     title: str
     suffix: str
@@ -88,7 +88,7 @@ def gcode(made: Program, dialect: Dialect, number: int = 1) -> str:
 
 
 def plain(text: str, dialect: Dialect) -> str:
-    """Text for old controllers: ASCII, no brackets or quotes, capitals for Fanuc and ISO."""
+    """Return a text for old controllers: ASCII, no brackets or quotes, capitals for Fanuc and ISO."""
     ascii_text = text.replace("µ", "u").encode("ascii", "replace").decode()
     kept = "".join(c if c.isalnum() or c in " .,:;+-/=" else " " for c in ascii_text).replace(";", ",")
     kept = " ".join(kept.split())
@@ -148,8 +148,9 @@ TOLERANCE_MM = 0.001
 def heidenhain(made: Program, tool: int | None = None) -> str:
     """Return the program text; blocks are numbered from 0, as on the controller.
 
-    ``tool``: row of the tool table for the holder in the spindle. TOOL CALL sets the axis of the arcs' plane and the length. Only the
-    operator knows the row, and tool 0 would empty the spindle; without a row the program marks the place of the block and stops there.
+    ``tool``: row of the tool table for the holder in the spindle. TOOL CALL sets the tool axis, normal to the plane of the arcs, and the
+    length. Only the operator knows the row, and tool 0 would empty the spindle; without a row the program says where to write TOOL CALL and
+    stops there.
     """
     name = "".join(c for c in plain(made.name, ISO) if c.isalnum())[:16] or "ABBE"
     lines = [f"BEGIN PGM {name} MM", "; Heidenhain program written by Abbe", *(f"; {plain(text, ISO)}" for text in made.head)]
@@ -211,7 +212,7 @@ def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, se
     if dialect not in NAMES:
         raise ConfigError(f"there is no NC dialect {dialect!r}", f"use one of: {', '.join(sorted(NAMES))}")
     settings = settings or NcSettings()
-    arcs = ("XY",) if dialect == "heidenhain" else PLANES  # C runs in the plane across the tool's axis, which TOOL CALL names
+    arcs = ("XY",) if dialect == "heidenhain" else PLANES  # heidenhain: arcs (C) lie in the plane normal to the tool axis Z of TOOL CALL
     made = program(name, plan, machine.stroke_mm, arcs)
     pace = Pace(settings.acceleration_mm_s2)
     took = runtime(made.blocks, pace)
@@ -249,7 +250,7 @@ class Runtime:
 
 
 def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
-    """Time of all blocks: each line or arc from standstill to standstill; a sequence without stops counts as one."""
+    """Return the time of all blocks: each line or arc from standstill to standstill; a sequence without stops counts as one."""
     moving, resting, here = 0.0, 0.0, None
     smooth, run_mm, run_feed = False, 0.0, 0.0
     for block in blocks:
@@ -270,7 +271,7 @@ def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
 
 
 def one_move_s(way_mm: float, feed_mm_min: float, pace: Pace) -> float:
-    """Time in s from standstill to standstill: accelerate, run at the feed if the length allows it, brake, stop exactly."""
+    """Return the time in s from standstill to standstill: accelerate, run at the feed if the length allows it, brake, stop exactly."""
     if way_mm <= 0.0:
         return 0.0
     speed, rise = feed_mm_min / 60.0, pace.acceleration_mm_s2
@@ -293,7 +294,7 @@ def _minutes(made: Program, took: Runtime) -> str:
 
 
 def _runtime_comments(took: Runtime, pace: Pace) -> tuple[str, str]:
-    """Comments with the run time, rounded up: the operator should wait less than announced, not longer."""
+    """Return comments with the run time, rounded up: the operator should wait less than announced, not longer."""
     return (
         f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells; not counted are"
         " the stops for a person and the way to the first position",
@@ -303,6 +304,6 @@ def _runtime_comments(took: Runtime, pace: Pace) -> tuple[str, str]:
 
 def _too_long(dialect: str, size: int, memory_kib: float) -> str:
     return (
-        f"{size / 1024.0:.0f} KiB are more than the {memory_kib:g} KiB that a {dialect} control is taken to hold: run it from its card"
-        " or by drip feed, cut the recipe, or say under [nc] memory_kib what yours holds"
+        f"the program has {size / 1024.0:.0f} KiB, and a {dialect} control is assumed to hold {memory_kib:g} KiB: run it from its card or"
+        " by drip feed, shorten the recipe, or set memory_kib under [nc] to what your control holds"
     )

@@ -1,1 +1,1 @@
-"""Which test is measured: a few numbers that become steps, and the files that hold them."""
+"""Recipes: the few parameters of a test, which become steps, and the files that hold recipes."""

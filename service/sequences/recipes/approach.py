@@ -22,7 +22,7 @@ from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo
 
 
 def one_of(*choices: str) -> AfterValidator:
-    """Validator that accepts only these values."""
+    """Return a validator that accepts only these values."""
 
     def check(value: str) -> str:
         if value not in choices:
@@ -57,7 +57,7 @@ IN_FILE = "in_file"
 
 
 def inner(default: Any) -> Any:
-    """A field that no file sets: it follows from neighbouring tests, or belongs to a built-in campaign."""
+    """Return a field that no file sets: its value follows from neighbouring tests, or belongs to a built-in campaign."""
     return field(default=default, metadata={IN_FILE: False})
 
 
@@ -81,12 +81,12 @@ class TestRecipe:
 
 
 def file_fields(kind: type[TestRecipe]) -> dict[str, Field[Any]]:
-    """Fields of a recipe that a file sets, by key."""
+    """Return the fields of a recipe that a file sets, by key."""
     return {"setup" if f.name == "setup_id" else f.name: f for f in fields(kind) if f.metadata.get(IN_FILE, True)}
 
 
 def file_table(recipe: TestRecipe) -> dict[str, Any]:
-    """A recipe as a table of a file; omits empty values that equal the default."""
+    """Return a recipe as a table of a recipe file, without empty values that equal the default."""
     found = {key: (getattr(recipe, f.name), f.default) for key, f in file_fields(type(recipe)).items()}
     kind = {"kind": found.pop("kind")[0]}
     shown = {key: value for key, (value, default) in found.items() if value or value != default}
@@ -150,17 +150,17 @@ class CupTest(TestRecipe):
 
 
 def as_point(v: Array) -> Point:
-    """Three floats on the controller's 10 nm grid."""
+    """Return a position, rounded to the controller's 10 nm grid."""
     return as_points(v[np.newaxis])[0]
 
 
 def as_points(rows: Array) -> tuple[Point, ...]:
-    """Every row as such a point."""
+    """Return each row as a point, rounded to the controller's 10 nm grid."""
     return tuple((round(x, 5), round(y, 5), round(z, 5)) for x, y, z in rows.tolist())
 
 
 def before(path: tuple[Point, ...], machine: Machine) -> Point:
-    """Approach position: beside the path's start, against the first motion of each axis, inside the strokes."""
+    """Return the approach position: `BAR_APPROACH_MM` from the path's start, against the first motion of each axis, inside the strokes."""
     points = np.array(path)
     steps = np.diff(points, axis=0)
     first = np.array([next((np.sign(s) for s in steps[:, a] if s), 0.0) for a in range(3)])
@@ -175,7 +175,7 @@ def pole_of(recipe: CupTest) -> tuple[Point, Array]:
 
 
 def over_pole(cup: Cup, target_mm: Point, feed_mm_min: float) -> list[Step]:
-    """Steps from the centre, or from the axis above it, to a point of the sphere: up to the pole, down along the sphere.
+    """Return the steps from the centre, or from the axis above it, to a point of the sphere: up to the pole, down along the sphere.
 
     A straight move from the centre to a point below the equator would pass through the cup.
     """
@@ -186,7 +186,7 @@ def over_pole(cup: Cup, target_mm: Point, feed_mm_min: float) -> list[Step]:
 
 
 def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -> list[Step]:
-    """Steps along a sphere from one of its points to another; none if they coincide."""
+    """Return the steps along a sphere from one of its points to another; none if they coincide."""
     if math.dist(start_mm, end_mm) <= SAME_PLACE_MM:
         return []
     way = way_on_sphere(cup.centre, np.array(start_mm), np.array(end_mm), cup.up, LINK_CHORD_MM)
@@ -194,14 +194,14 @@ def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -
 
 
 def cup_of(setup: dict[str, Any]) -> Cup:
-    """Sphere of a ball-bar test from its set-up (run-format.md 3)."""
+    """Return the sphere of a ball-bar test from its set-up document."""
     up = np.zeros(3)
     up[AXES.index(setup["axis"])] = float(setup["opens"])
     return Cup(np.array(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"]), up)
 
 
 def to_path(recipe: CupTest, path: tuple[Point, ...], machine: Machine) -> list[Step]:
-    """Steps to the first point of a ball-bar path: mount, change the bar or move along the sphere, and approach.
+    """Return the steps to the first point of a ball-bar path: mount, change the bar or move along the sphere, and approach.
 
     No move passes the cup straight: from the centre, and after a change of the bar, the machine moves over the pole and along the sphere.
     ``link_mm`` lies on this sphere or (``change_bar``) on that of the previous bar; a straight move from there would cut the sphere.
@@ -217,7 +217,7 @@ def to_path(recipe: CupTest, path: tuple[Point, ...], machine: Machine) -> list[
         steps.append(TakeBarOut())
         if recipe.link_mm is not None:
             old = Cup(centre, math.dist(recipe.link_mm, recipe.centre_mm), up)
-            steps += along_sphere(old, recipe.link_mm, as_point(old.pole), RAPID_MM_MIN)  # nothing hangs in
+            steps += along_sphere(old, recipe.link_mm, as_point(old.pole), RAPID_MM_MIN)  # the bar is out
         steps += over_pole(cup, path[0], RAPID_MM_MIN)
         steps += [MoveTo(start, feed), ChangeBar(recipe.radius_mm)]
     elif recipe.link_mm is not None:

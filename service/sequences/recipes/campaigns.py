@@ -1,9 +1,9 @@
 """Built-in campaigns, scaled to any machine's strokes, and the sources of a campaign's plan. Nothing here reaches a device.
 
 The identification campaign lets the joint solution determine every error that nine tables can correct: helices about five centres,
-each axis on two opposite edges, step diagonals in two step orders (math.md 5.5: rank 67 of 67 for translations and one-tool angles).
+each axis on two opposite edges, step diagonals in two step orders (rank 67 of 67 for translations and the angles that one tool shows).
 The verification uses positions that the identification does not use. The campaign of the discovery demonstration separates most candidate
-effects in one session (effects.md 4).
+effects in one session.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) 
 
 
 def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identify") -> CampaignPlan:
-    """Five helices, six lines, eight step diagonals: about 22 minutes of machine time for a 600 x 500 x 450 mm machine."""
+    """Return five helices, six lines, eight step diagonals: about 22 minutes of machine time for a 600 x 500 x 450 mm machine."""
     recipes: list[Recipe] = []
     places = [(0.5, 0.5, 0.3), (0.32, 0.36, 0.2), (0.68, 0.64, 0.2), (0.32, 0.64, 0.25), (0.68, 0.36, 0.25)]
     for k, rel in enumerate(places):
@@ -51,20 +51,20 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
 
 
 def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", role: str = "holdout") -> CampaignPlan:
-    """One helix (with a centre and radius that the identification does not use) and the four plain body diagonals."""
+    """Return one helix (with a centre and radius that the identification does not use) and the four plain body diagonals."""
     recipes: list[Recipe] = [verification_helix(machine, rate_hz=rate_hz, role=role)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", role, d, 20, "") for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
 
 
 def verification_helix(machine: Machine, *, rate_hz: int = 100, role: str = "holdout") -> Helix:
-    """The helix of the verification."""
+    """Return the helix of the verification."""
     centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
     return Helix("check-helix", "VB", role, centre, radius, turns=4, rate_hz=rate_hz)
 
 
 def quick_check(machine: Machine, *, rate_hz: int = 100, name: str = "quick-check") -> CampaignPlan:
-    """The unattended check: the tests of the verification with half the positions, a few minutes of machine time."""
+    """Return the unattended check: the tests of the verification with half the positions, a few minutes of machine time."""
     centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
     recipes: list[Recipe] = [Helix("check-helix", "VB", "holdout", centre, radius, turns=3, rate_hz=rate_hz)]
     recipes += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 10, "") for d in DIAGONALS]
@@ -76,16 +76,17 @@ STEPS, LINE_N = 12, 13
 JUDGED = "pnp"
 BACK = "check-back"
 CHORD_MM = 0.5
-"""The position of a sample on its path is known to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. By the area law the usual
-chords are 1 mm long at the equator and 3 mm at the pole, and run 0.9 and 10 um inside the sphere: misplaced readings scatter there, and a
-clean machine seems disturbed. Even chords of 0.4 mm run at most 0.24 um inside."""
+"""The position of a sample on its path is known to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. With the usual
+chord and area law the chords run up to 10 um inside the sphere: misplaced readings scatter there, and a clean machine seems disturbed.
+Even chords of this length run at most 0.24 um inside at a radius of 120 mm."""
 ROUND: tuple[Literal[1, -1], ...] = (1, -1)
 
 
 def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "discover") -> CampaignPlan:
-    """Helices at two feeds both ways about one origin, both ways about another, step diagonals; late repeats of the axes and first origin.
+    """Return the campaign of the discovery demonstration: about 20 minutes of machine time for a 600 x 500 x 450 mm machine.
 
-    About 20 minutes of machine time for a 600 x 500 x 450 mm machine. A late helix of another feed and the second step order of a diagonal
+    A line along each axis; helices in both directions, at two feeds about one origin and at one feed about another; step diagonals; late
+    repeats of helices about the first origin and of the lines. A late helix of another feed and the second step order of a diagonal
     have the role holdout: they share a mounting with fitted runs, so that only the model can cause their deviation.
     """
     first = _helix(machine, "A", (0.5, 0.5, 0.3), 0.6, rate_hz)
@@ -105,7 +106,7 @@ def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "dis
 
 
 def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew") -> CampaignPlan:
-    """The verification, with its helix also run back slowly with the bar left in: the difference shows what changes while a bar hangs.
+    """Return the verification with a second helix: the same path slowly back, with the bar left in. The difference shows what changes then.
 
     One helix alone cannot tell a constantly warm bar from a longer one.
     """
@@ -117,7 +118,7 @@ def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew")
 
 
 def _lines(machine: Machine, when: str) -> list[Recipe]:
-    """One line per axis: its length shows growth during the session, independent of squareness."""
+    """Return one line per axis: its length shows growth during the session, independent of squareness."""
     return [
         Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, at_share=(0.5, 0.5), positions=LINE_N)
         for a in range(len(machine.stroke_mm))
@@ -130,7 +131,7 @@ def _helix(machine: Machine, setup: str, rel: tuple[float, float, float], share:
 
 
 def _series(like: Helix, name: str, ways: list[tuple[float, Literal[1, -1], str]]) -> list[Recipe]:
-    """Consecutive helices with one mounting of the bar."""
+    """Return consecutive helices with one mounting of the bar."""
     last = len(ways) - 1
     return [
         replace(like, label=_label(name, feed, way), role=role, feed_mm_min=feed, direction=way, mount=k == 0, unmount=k == last)
@@ -164,7 +165,7 @@ CAMPAIGNS: dict[str, BuiltinRecipe] = {IDENTIFICATION: identification, "verifica
 
 
 def named(recipe: str, rate_hz: int) -> str:
-    """Recipe name with its rate, as jobs and campaigns show it: ``quick-check at 1000 Hz``; omits the usual rate."""
+    """Return the recipe name with its rate, as jobs and campaigns show it: ``quick-check at 1000 Hz``; omits the usual rate."""
     return recipe if rate_hz == USUAL_HZ else f"{recipe} at {rate_hz} Hz"
 
 
@@ -190,7 +191,7 @@ def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
 class RecipeSource:
     """Source of a campaign's plan. The journal keeps it, so that a resumed campaign needs no file.
 
-    ``helix``: ``X,Y,Z,RADIUS`` in mm instead of a recipe. ``text``: of a recipe file, which ``recipe`` names.
+    ``helix``: ``X,Y,Z,RADIUS`` in mm instead of a recipe. ``text``: content of the recipe file that ``recipe`` names.
     """
 
     recipe: str

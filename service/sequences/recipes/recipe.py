@@ -66,7 +66,7 @@ from abbe.service.sequences.steps import (
 )
 
 MIN_TURNS = 3.0
-"""Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition 28 at 3 turns, 58 at 2, 1900 at 1; math.md 4.5)."""
+"""Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
 PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
 """Partial arc of ISO 230-4, and its feed-in and feed-out."""
 Turns = Annotated[float, Limits(ge=3.0, le=50.0)]
@@ -86,7 +86,7 @@ def joined(arcs: tuple[Array, Array, Array]) -> Path:
 
 
 def reversed_path(path: Path) -> Path:
-    """The same path the other way round."""
+    """Return the same path the other way round."""
     points, measured = path
     last = len(points) - 1
     return points[::-1], None if measured is None else (last - measured[1], last - measured[0])
@@ -94,12 +94,12 @@ def reversed_path(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Helix(CupTest):
-    """Hemispherical helix of the ball-bar test (math.md 4.3): continuous, constant feed, pole to equator or (direction -1) back.
+    """Hemispherical helix of the ball-bar test: continuous at constant feed, from pole to equator or (direction -1) back.
 
     ``chord_mm`` is the wanted mean spacing of the path's points; a long path gets longer chords to fit into the controller's memory. The
-    polyline then runs chord^2 / (8 radius) inside the sphere, and by the area law radius / (4 n) beside the pole: with 750 mm, 1.3 and
-    23 um. Columns and solvers use the commanded position on the polyline, not on the sphere: that costs accuracy only where the position
-    of a sample on the path is uncertain by a part of a chord. ``even``: almost equal spacing along the same curve.
+    polyline of n points then runs chord^2 / (8 radius) inside the sphere, and with the area law radius / (4 n) near the pole: 1.3 and 23 um
+    for a radius of 750 mm. Columns and solvers use the commanded position on the polyline, not on the sphere: this costs accuracy only if
+    the position of a sample on the path is uncertain by a part of a chord. ``even``: almost equal spacing along the same curve.
     ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles tangent to the path's ends, driven continuously with it, so that the
     recorded part is at constant feed; ``feed_in_deg`` comes first in either direction.
     """
@@ -266,7 +266,7 @@ BarRecipe = Helix | HelixPoints | Circle
 
 
 def _setup(recipe: BarRecipe, machine: Machine, **own: Any) -> dict[str, Any]:
-    """Set-up document of a ball-bar test (run-format.md 3), with the side of the spindle."""
+    """Return the set-up document of a ball-bar test, with the side of the spindle."""
     return {
         "setup_id": recipe.setup_id,
         "centre_mm": list(recipe.centre_mm),

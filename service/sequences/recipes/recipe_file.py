@@ -78,7 +78,7 @@ def _on_one_cup(before: BarRecipe, after: BarRecipe) -> str:
         return ""
     ends = ((before, before.path()[0][-1]), (after, after.path()[0][0]))
     if min(Cup(np.array(r.centre_mm), r.radius_mm, pole_of(r)[1]).lowest([p]) for r, p in ends) < -LOW_SHARE:
-        return "the bar is changed below the cup: from there the machine would move through it"
+        return "the bar would be changed below the cup, and the machine would then move through the cup"
     return ""
 
 
@@ -120,7 +120,7 @@ class RecipeFile(BaseModel):
 
 
 def read_recipe(path: Path) -> tuple[str, tuple[Recipe, ...]]:
-    """Name and recipes of a campaign recipe file, in the order of measuring.
+    """Return name and recipes of a campaign recipe file, in the order of measuring.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def recipe_source(path: Path) -> str:
 
 
 def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
-    """As `read_recipe`, from the text; ``source`` names it in errors."""
+    """Return name and recipes as `read_recipe`, from the file's text; ``source`` names the file in errors."""
     try:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
@@ -158,7 +158,7 @@ def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
 
 
 def _check_keys(content: dict[str, Any], source: str) -> None:
-    """Refuse keys that tests of the kind do not have in a file, and set the default role."""
+    """Refuse keys that a test of its kind cannot have in a file, and set the default role."""
     tests = content.get("test")
     for k, table in enumerate(tests if isinstance(tests, list) else []):
         kind = KINDS.get(str(table.get("kind"))) if isinstance(table, dict) else None

@@ -232,7 +232,7 @@ async def test_a_push_is_a_job_and_is_not_paused_while_a_table_is_not_verified(b
 
     bench.push = push
     assert await bench.book.run(bench.desk.push_job(ApprovedProposal(4, 9, NO_ALARM), YEARLY)) == "done: refused"
-    assert seen == [("conflict", "it cannot be paused now: a table that nobody has verified may be in force"), ("done", "")]
+    assert seen == [("conflict", "the job cannot be paused now: a table that nobody has verified may be in force"), ("done", "")]
     (job,) = bench.jobs()
     assert (job.kind, job.state, job.text) == ("push", "done: refused", "not today")
     assert pausing == [False, True]

@@ -103,7 +103,7 @@ async def test_a_job_by_hand_does_not_come_between(bench: Bench) -> None:
     await bench.clock.pass_time(3601)
     assert bench.ran == ["hourly"]
     refused = await bench.start()
-    assert (refused.outcome, refused.text) == ("busy", "the machine measures: hourly")
+    assert (refused.outcome, refused.text) == ("busy", "the machine is in use: hourly")
     running = bench.book.running
     assert running is not None
     assert await bench.steer(running.id, "pause") == "done"  # that of the timetable can be steered too

@@ -180,7 +180,7 @@ async def test_one_key_is_one_campaign_and_only_declared_ones_are_started(bench:
     assert (await bench.start(key="k")).job == first.job
     assert (await bench.start("quick-check", key="k")).outcome == "conflict"
     assert (await bench.start(who="user:eve")).outcome == "forbidden"
-    assert (await bench.start("quick-check")).text == "the machine measures: by hand: identification"
+    assert (await bench.start("quick-check")).text == "the machine is in use: by hand: identification"
     for recipe in ("identification at 300 Hz", "own.toml at 500 Hz", "other.toml"):
         refused = await bench.start(recipe)
         assert (refused.outcome, refused.text.endswith("quick-check, identification, own.toml")) == ("unknown", True)

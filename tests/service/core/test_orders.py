@@ -175,7 +175,7 @@ async def test_nothing_comes_between_two_jobs(bench: Bench) -> None:
     assert (await bench.book.start(StartJob("start", 1, "quick-check", "", "user:bob"))).outcome == "done"
     await settle()
     answer = await bench.ask()
-    assert (answer.outcome, answer.text) == ("busy", "the machine measures: quick-check")
+    assert (answer.outcome, answer.text) == ("busy", "the machine is in use: quick-check")
     await bench.ended()
     await settle()
     bench.scheduler.take("recovery of an interrupted run or push")

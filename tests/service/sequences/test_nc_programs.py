@@ -198,7 +198,7 @@ def test_a_program_longer_than_the_controls_memory_is_said(plan):
     assert made.size.startswith(f"{size} bytes, {len(made.text.splitlines())} blocks, about ")
     assert made.warning == ""
     small = nc_program("M", MACHINE, plan, "fanuc", NcSettings(memory_kib={"fanuc": size / 1024.0 - 0.1}))
-    assert "that a fanuc control is taken to hold" in small.warning
+    assert "a fanuc control is assumed to hold" in small.warning
     assert small.text == made.text
     assert nc_program("M", MACHINE, plan, "fanuc", NcSettings(memory_kib={"fanuc": size / 1024.0 + 0.1})).warning == ""
     assert nc_program("M", MACHINE, plan, "siemens", NcSettings(memory_kib={"fanuc": 0.1})).warning == ""

@@ -135,7 +135,7 @@ def test_the_same_stretch_is_the_same_and_a_knock_is_one():
     assert found is not None
     for seed in range(20):
         assert abs(read(found[2], 0.0, seed=seed).off_mm or 1.0) < 2e-4
-        with pytest.raises(StretchDiffers, match="off its value before the break"):
+        with pytest.raises(StretchDiffers, match="off its value before the interruption"):
             read(found[2], 1.4 * SAME_MM, seed=seed)
     with pytest.raises(StretchDiffers, match="too few readings"):
         read(found[2], 0.0, status=0b1001)
