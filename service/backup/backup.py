@@ -1,6 +1,6 @@
-"""`abbe backup`: database, samples not yet in it, and audit, consistent as of one instant, while the service runs.
+"""`abbe backup`: copy the database, samples not yet in it, and the audit's files, as they are at one instant, while the service runs.
 
-A backup is a folder with the database, samples not yet in it, the audit's files, and a list of all files.
+A backup is a folder with these files and a list of them.
 """
 
 from __future__ import annotations
@@ -58,7 +58,11 @@ class ListedAudit:
 
 @dataclass(frozen=True, slots=True)
 class BackupList:
-    """What a backup holds (``backup.json``). ``schema``: revision of the database; ``rows``: of its main tables; ``files``: by path."""
+    """List of a backup's content (``backup.json``).
+
+    ``schema``: schema revision of the database; ``rows``: row counts of its main tables; ``segments``: number of files with samples that
+    were not yet in the database; ``files``: by path.
+    """
 
     format: str
     made_utc: str
@@ -86,7 +90,7 @@ class Backup:
 
     @property
     def segments(self) -> list[Path]:
-        """Segments of the capture that were not yet in the database, or were set aside."""
+        """Segments of the capture (files of samples) that were not yet in the database, or were set aside as damaged."""
         return sorted((self.folder / CAPTURE).glob("run-*"))
 
 
@@ -116,7 +120,7 @@ def read_backup(folder: Path) -> Backup:
     Raises
     ------
     BackupRefused
-        The folder is not a backup, or one of a newer version; or names a file that is missing, additional or changed.
+        The folder is not a backup, or one of a newer version; or a file is missing, additional or changed.
     """
     try:
         doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
@@ -130,17 +134,17 @@ def read_backup(folder: Path) -> Backup:
     except OSError as err:
         raise BackupRefused(f"{folder} cannot be read: {err.strerror}", "look at its rights and at the disk") from None
     except (ValueError, AttributeError, Unusable) as err:
-        raise BackupRefused(f"{folder / LIST} is damaged: {err}", "take another backup") from None
+        raise BackupRefused(f"{folder / LIST} is damaged: {err}", "use another backup") from None
     if wrong:
         how = "missing" if wrong[0] not in found else "not of this backup" if wrong[0] not in wanted else "not as it was written"
-        raise BackupRefused(f"{folder / wrong[0]} is {how}", "take another backup")
+        raise BackupRefused(f"{folder / wrong[0]} is {how}", "use another backup")
     return Backup(folder, listed)
 
 
 def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, list[str]]:
-    """Number of records in the audit of a copied database, and all their faults.
+    """Number of records in the audit of a copied database, and all faults of the audit.
 
-    Without a key the audit cannot be checked, and the list of faults is empty.
+    ``heads``: file of the audit's heads; ``key``: file of its key. Without a key the audit cannot be checked: no faults are returned.
 
     Raises
     ------
@@ -199,13 +203,13 @@ def sqlite_file(url: str, what: str) -> Path:
 def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> BackupList:
     """Make a backup: the new folder ``target`` (0700, files 0600), complete or not at all. The service keeps running.
 
-    The backup holds everything that was on the disk at the call: samples first, because they leave their segment only when the database
-    has them; then the database as of one instant; finally the audit's heads up to that database.
+    The backup holds everything that was on the disk at the call. Segments are copied first, because their samples leave them only when the
+    database has them; then the database, as it is at one instant; finally the audit's heads up to the last copied record.
 
     Parameters
     ----------
     with_key : bool
-        Include the audit's key. Without it the holder of the backup cannot forge an audit, and `restore` asks for the key.
+        Include the audit's key. Without it, whoever holds the backup cannot forge an audit, and `restore` asks for the key.
 
     Returns
     -------
@@ -228,7 +232,9 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
         os.rename(part, target)
         sync_file(target.parent)
     except OSError as err:
-        raise BackupRefused(f"{target} could not be written: {err.strerror}", "look at disk space and rights; nothing was left") from err
+        raise BackupRefused(
+            f"{target} could not be written: {err.strerror}", "look at disk space and rights; no part of it was left"
+        ) from err
     finally:
         shutil.rmtree(part, ignore_errors=True)
     with Store.open(source.url) as store:
@@ -298,7 +304,7 @@ def _segments(folder: Path, source: BackupSource) -> int:
 
 
 def _audit(part: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
-    """Copy the audit's files. Heads come after the database, so that none is missing; later ones are dropped."""
+    """Copy the audit's files. Heads are copied after the database, so that none is missing; those of later records are dropped."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():

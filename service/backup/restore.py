@@ -111,7 +111,7 @@ def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Tar
 
 
 def _prove(part: Path, backup: Path) -> int:
-    """Prove a copied backup; return its number of audit records."""
+    """Prove that a copied backup is whole, known and unchanged; return its number of audit records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
         raise BackupRefused(f"{backup} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")
@@ -121,7 +121,7 @@ def _prove(part: Path, backup: Path) -> int:
         raise BackupRefused(f"{backup} has no key of the audit, so its {records} records prove nothing", "give --audit-key FILE")
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise BackupRefused(f"the audit in {backup} is broken: {found[0]}{more}", "take another backup, or the key that belongs to it")
+        raise BackupRefused(f"the audit in {backup} is broken: {found[0]}{more}", "use another backup, or the key that belongs to this one")
     return records
 
 

@@ -45,7 +45,7 @@ class Claims:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedContent:
-    """This machine, which the claims must match. ``base`` None: unknown here, so the claimed base is only reported."""
+    """This machine's values, which the claims must match. ``base`` None: unknown here, so that the claimed base is not checked."""
 
     machine: str
     limits: str
@@ -61,7 +61,7 @@ def claims_of(machine: str, form: str, files: Mapping[str, bytes], base: str, li
 
 
 def sign(claims: Claims, key: Ed25519PrivateKey) -> bytes:
-    """Bytes of FILE.sig."""
+    """Sign the claims; return the bytes of FILE.sig."""
     claimed = asdict(claims)
     return (
         canonical({"format": FORM, "key": public_of(key), "claims": claimed, "signature": key.sign(PURPOSE + canonical(claimed)).hex()})
@@ -97,11 +97,12 @@ def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, 
     ):
         if claimed != here:
             raise SignatureRefused(
-                f"signed for {what} {claimed[:64]!r}, and here it is {here[:64]!r}", "have it signed for this machine as it is now"
+                f"signed for {what} {claimed[:64]!r}, but here it is {here[:64]!r}", "have the files signed for this machine as it is now"
             )
     if not _utc(claims.signed_utc) <= now < _utc(claims.expiry_utc):
         raise SignatureRefused(
-            f"signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)", "have it signed anew, or set the clock"
+            f"the signature is not valid now: signed {claims.signed_utc[:16]}, holds until {claims.expiry_utc[:16]} (UTC)",
+            "have the files signed again, or set the clock of this computer",
         )
     return claims
 
@@ -110,7 +111,7 @@ def _check_files(claims: Claims, files: Mapping[str, bytes]) -> None:
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     if digests != claims.files:
         wrong = sorted(name for name in digests.keys() | claims.files.keys() if digests.get(name) != claims.files.get(name))
-        raise SignatureRefused(f"{', '.join(wrong)}: not the file that was signed", FILE_REMEDY)
+        raise SignatureRefused(f"{', '.join(wrong)}: differs from what was signed", FILE_REMEDY)
 
 
 def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
@@ -128,7 +129,7 @@ def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
             raise ValueError
         _utc(claims.signed_utc), _utc(claims.expiry_utc)
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-        raise SignatureRefused(f"no signature of the form {FORM}, or it was changed", FILE_REMEDY) from None
+        raise SignatureRefused(f"the .sig file is not of the form {FORM}, or was changed", FILE_REMEDY) from None
     return doc["key"], claims, signature
 
 

@@ -30,7 +30,7 @@ def new_key(path: Path) -> str:
         finally:
             os.close(file)
     except FileExistsError:
-        raise KeyRefused(f"{path} is there already, and a key is never overwritten", "give another name") from None
+        raise KeyRefused(f"{path} exists already, and a key is never overwritten", "give another name") from None
     except OSError as error:
         raise KeyRefused(f"{path}: cannot be written: {error.strerror}", "give a folder that may be written") from None
     return public_of(key)
@@ -46,12 +46,12 @@ def read_key(path: Path) -> Ed25519PrivateKey:
     """
     try:
         if os.name == "posix" and path.stat().st_mode & 0o077:
-            raise KeyRefused(f"{path}: others may read this key", f"chmod 600 {path}, or make a new one if others have")
+            raise KeyRefused(f"{path}: others may read this key", f"chmod 600 {path}, or make a new key if others may have read it")
         found = load_pem_private_key(path.read_bytes(), None)
     except OSError as error:
         raise KeyRefused(f"{path}: cannot be read: {error.strerror}", "make a key: abbe key new FILE") from None
     except (ValueError, TypeError, UnsupportedAlgorithm):
-        raise KeyRefused(f"{path} holds no private key without a password", "make a key: abbe key new FILE") from None
+        raise KeyRefused(f"{path} holds no private key, or one with a password", "make a key: abbe key new FILE") from None
     if not isinstance(found, Ed25519PrivateKey):
         raise KeyRefused(f"{path} holds no Ed25519 key", "make a key: abbe key new FILE")
     return found

@@ -93,16 +93,16 @@ def prove_copy(path: Path) -> str:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as copy:
             found = [str(row[0]) for row in copy.execute("PRAGMA integrity_check")]
             if found != ["ok"]:
-                raise StoreError(f"{path} is damaged: {'; '.join(found[:FAULTS_SHOWN])}", "take another backup")
+                raise StoreError(f"{path} is damaged: {'; '.join(found[:FAULTS_SHOWN])}", "use another backup")
             if orphans := copy.execute("PRAGMA foreign_key_check").fetchall():
                 raise StoreError(
-                    f"{path}: {len(orphans)} rows refer to missing rows (the first one in table {orphans[0][0]})", "take another backup"
+                    f"{path}: {len(orphans)} rows refer to missing rows (the first one in table {orphans[0][0]})", "use another backup"
                 )
             row = copy.execute("SELECT version_num FROM alembic_version").fetchone()
     except sqlite3.Error as err:
-        raise StoreError(f"{path} is not a database of Abbe: {err}", "take another backup") from err
+        raise StoreError(f"{path} is not a database of Abbe: {err}", "use another backup") from err
     if row is None:
-        raise StoreError(f"{path} has no schema: it was never used", "take another backup")
+        raise StoreError(f"{path} has no schema: it was never used", "use another backup")
     return str(row[0])
 
 
@@ -118,7 +118,7 @@ def rows_of(path: Path, query: str) -> list[tuple[Any, ...]]:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as copy:
             return [tuple(row) for row in copy.execute(query)]
     except sqlite3.Error as err:
-        raise StoreError(f"{path}: {err}", "take another backup") from err
+        raise StoreError(f"{path}: {err}", "use another backup") from err
 
 
 def processes_using(path: Path) -> list[int]:

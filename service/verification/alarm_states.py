@@ -1,8 +1,8 @@
 """Alarms as a pure state machine: raised, held, acknowledged, cleared; and the progress of the work on them.
 
-An alarm belongs to one recipe of one machine and is the sum of its append-only lines. A check with a signal raises it, every check that
-does not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not). Acknowledging is
-independent: a cleared alarm remains visible until a person acknowledges it.
+An alarm belongs to one recipe of one machine and follows from its append-only lines (`AlarmEntryRecord`). A check with a signal raises it,
+every check that does not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not).
+Acknowledging is independent: a cleared alarm remains visible until a person acknowledges it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ NO_ALARM = 0
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """Why a check raises an alarm: one figure and one reason, with the figures behind it.
+    """One reason why a check raises an alarm: the judged figure with its numbers.
 
-    ``kind``: ``limit`` (above its limit by more than U), ``jump``, ``drift``, ``days``. ``baseline``, ``baseline_u``: reference value of
-    ``jump`` and its standard uncertainty.
+    ``kind``: ``limit`` (above its limit by more than U), ``jump``, ``drift``, ``days`` (few days until the limit). ``baseline``,
+    ``baseline_u``: reference value of ``jump`` and its standard uncertainty.
     """
 
     figure: str
@@ -50,7 +50,7 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class FiredRule:
-    """Result of a check for the alarms. ``judged``: whether its figures can be judged (measured, and within the allowed temperature)."""
+    """Signals of a check. ``judged``: whether its figures can be judged (measured, and within the allowed temperature)."""
 
     judged: bool
     verdict: str
@@ -101,7 +101,7 @@ class Alarm:
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
-    """Effect of a check on the active alarm of its recipe (None: no alarm); None: no effect."""
+    """Return the effect of a check on the alarm of its recipe, ``now`` (None: there is no alarm); None: no effect."""
     if not found.judged:
         return None
     if now is None or not now.active:

@@ -19,17 +19,15 @@ from abbe.service.verification.alarm_states import Alarm, FiredRule, Signal, aft
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
 from abbe.service.verification.verify import judge
 
-# Signals of a machine's checks, from stored verifications alone: above a limit, a jump, a drift, few days until the limit.
-
-
 NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmTerms:
-    """Terms of an evaluation: checks of ``recipe`` after ``begins_utc``; ``warn_days``: 0 for no warning ahead of the limit.
+    """Which checks to evaluate, and how: those of ``recipe`` after ``begins_utc``.
 
-    ``compare``: figure -> value and standard uncertainty before the active alarm, so that a jump does not become its own reference.
+    ``warn_days``: warn so many days ahead of the limit, 0 for never. ``compare``: figure -> value and standard uncertainty before the
+    active alarm, so that the figures after a jump do not become its reference.
     """
 
     recipe: str
@@ -58,7 +56,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
     before = _before(one, records, terms)
     if before is not None and jumps(value - before[0], float(np.hypot(u, before[1])), limit):
         expanded = COVERAGE * float(np.hypot(u, before[1]))
-        text = f"{reading} is {value - before[0]:+.1f} ± {expanded:.1f}{unit} from the checks before"
+        text = f"{reading} differs by {value - before[0]:+.1f} ± {expanded:.1f}{unit} from the checks before"
         yield Signal(one.figure, "jump", value, one.expanded_uncertainty, limit, text, *before)
     if one.direction > 0:
         since = "" if one.since_utc is None else f" since {one.since_utc:%Y-%m-%d %H:%M} UTC"
@@ -69,7 +67,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
-    """Reference value and standard uncertainty for the latest figure while too few checks show their spread."""
+    """Reference for a jump: value and standard uncertainty, by default the mean of earlier checks while they are few; else None."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
         return kept
@@ -80,7 +78,7 @@ def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: Alar
 
 
 READ_CHECKS = 4 * MOST_CHECKS
-"""Checks to read: of several recipes, so a multiple of what the trend uses of one."""
+"""Number of checks to read: several recipes share it, and the trend of each uses at most `MOST_CHECKS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +126,7 @@ def active_alarm(store: Store, machine: str, recipe: str) -> Alarm | None:
 
 
 def series_begins(store: Store, machine: str) -> datetime | None:
-    """When the table in force came into force; earlier checks do not compare. None: Abbe has put none into force.
+    """When the table in force came into force; earlier checks cannot be compared. None: Abbe has put no table into force.
 
     A push that was rolled back does not begin a new series. Tables written by others are unknown here.
     """

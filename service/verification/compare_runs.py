@@ -47,7 +47,8 @@ class LoadedRun:
 class ComparedCurve:
     """Deviation along a run, µm, with the standard uncertainty from noise, repeatability and calibration (NaN: unknown).
 
-    ``x``: degrees about the axis of a ball-bar path, mm along a laser line. ``place``: direction of the bar, or ``x`` again, shape (n, k).
+    ``round``: whether it is a ball-bar path. ``x``: degrees about the axis of a ball-bar path, mm along a laser line. ``place``: unit
+    vector of the bar, shape (n, 3), or ``x`` again, shape (n, 1).
     """
 
     round: bool
@@ -94,7 +95,7 @@ def incomparable_reason(first: LoadedRun, other: LoadedRun) -> str:
     """Reason why two runs are not comparable, in one line; empty if they are."""
     if first.machine != other.machine:
         names = f"{other.label} was measured on machine {other.machine}, {first.label} on {first.machine}"
-        return f"{names}: runs of two machines have no difference"
+        return f"{names}: runs of two machines cannot be compared"
     if first.run.test != other.run.test:
         return f"{other.label} is {other.run.test}, {first.label} is {first.run.test}: only runs of one test can be compared"
     for key in KIND:
@@ -103,7 +104,7 @@ def incomparable_reason(first: LoadedRun, other: LoadedRun) -> str:
             return f"{key} of {other.label} is {b or 'none'}, of {first.label} {a or 'none'}: they ran along different paths"
     for one in (first, other):
         if why := not_judged(one.run):
-            return f"{one.label}: {why}; a part of a path has no difference"
+            return f"{one.label}: {why}; a part of a path cannot be compared"
     return ""
 
 
@@ -126,17 +127,17 @@ def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -
     for other in loaded[1:]:
         apart = [key for key in PLACE if not _same(getattr(first.run.setup, key, None), getattr(other.run.setup, key, None))]
         if apart:
-            out.append(f"{other.label} was measured elsewhere than {first.label} ({', '.join(apart)}): the difference holds that too")
+            out.append(f"{other.label} was measured elsewhere than {first.label} ({', '.join(apart)}): the difference includes this")
         tables = [r.run.table.crc for r in (first, other)]
         if tables[0] != tables[1]:
             out.append(f"{other.label} was measured with another compensation table in force than {first.label}")
         ways = [set(r.run.columns.direction.tolist()) for r in (first, other)]
         if ways[0] != ways[1]:
-            out.append(f"{other.label} was driven in another direction than {first.label}: reversal errors are in the difference")
+            out.append(f"{other.label} was driven in another direction than {first.label}: the difference includes reversal errors")
         feeds = [float(np.median(r.run.columns.feed_mm_min)) for r in (first, other)]
         if abs(feeds[1] - feeds[0]) > SAME_FEED * abs(feeds[0]):
             feeds_text = f"{feed(feeds[1])}, {first.label} with {feed(feeds[0])}"
-            out.append(f"{other.label} was driven with {feeds_text}: what depends on feed is in the difference")
+            out.append(f"{other.label} was driven with {feeds_text}: the difference includes effects of the feed")
     return out
 
 

@@ -95,7 +95,7 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
     Parameters
     ----------
     machine_path : Path
-        Abbe's machine file (TOML), or a machine object (run-format.md 1) as TOML or JSON.
+        Abbe's machine file (TOML), or a machine object (docs/schemas/machine.schema.json) as TOML or JSON.
     errors_path : Path
         ``abbe-errors/1``.
     points_path : Path
@@ -172,7 +172,7 @@ def _check_strokes(machine: Machine, points: PointsFile) -> None:
         more = f" (and {rows.size - 1} more rows)" if rows.size > 1 else ""
         raise FileFormatError(
             f"{points.place(index)}: {POSITION[axis]} = {points.axes_mm[index, axis]:g} is outside {stroke}{more}",
-            "nothing was measured there",
+            "leave the point out: the errors are not known there",
         )
 
 
@@ -183,7 +183,7 @@ def _check_finite(path: Path, points: PointsFile, off: F2, u: F2 | None) -> None
     if bad.any():
         what = "functions" if u is None else "functions or the covariance"
         raise FileFormatError(
-            f"{path}: the values are too large for a number at {points.place(int(np.argmax(bad)))}", f"correct the {what}"
+            f"{path}: the values are too large to compute the deviation at {points.place(int(np.argmax(bad)))}", f"correct the {what}"
         )
 
 

@@ -54,7 +54,10 @@ def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
 
 
 def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[AxisTest]]:
-    """Plain diagonals by group: ``body`` or a plane. Step diagonals are not test of ISO 230-6."""
+    """Plain diagonals by group: ``body``, or the plane of face diagonals. Step diagonals are not tests of ISO 230-6.
+
+    Appends unusable runs, with reason, to ``refused``.
+    """
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in _open(runs, "laser_diagonal"):
         setup = run.laser
@@ -161,7 +164,7 @@ def _turning_points(run: Run, name: str) -> list[float]:
 def _notes(group: list[Run]) -> list[str]:
     out = []
     if not any(r.laser.overrun_mm for r in group):
-        out.append("the end positions have no overrun on record: there the two sides may be one approach read twice, and B shows nothing")
+        out.append("no overrun is recorded: at the end positions both directions may be one approach read twice, and then B shows nothing")
     if len(group) > 1 and all(r.columns.readings_mm[0] == 0.0 for r in group):
-        out.append("every run was zeroed at its first reading: what that reading scatters is in R and A of all other positions")
+        out.append("every run was zeroed at its first reading: the scatter of that reading enters R and A of all other positions")
     return out

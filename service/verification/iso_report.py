@@ -56,7 +56,7 @@ def evaluate(runs: Sequence[Run], instruments: dict[str, Any] | None = None) -> 
     runs : sequence of Run
         As measured.
     instruments : dict, optional
-        ``instruments`` of the campaign (run-format.md 4): resolutions.
+        ``instruments`` of the campaign file, for their resolutions.
     """
     out = Evaluated()
     budget = scale_budget(instruments or {})

@@ -32,12 +32,12 @@ _TEXTS: dict[str, str] = {
     "check": "checked with the table in force: check {number} of {when}",
     "push": "verified by push {number} of {when}, which measured before and after; not checked since",
     "rollback": "unverified since the rollback of {when} (push {number})",
-    "accepted": "unverified since a person accepted the table, {when}",
+    "accepted": "unverified since a person accepted the table at {when}",
     "changed": "unverified since the table in force was changed from outside",
     "other": "unverified: check {number} of {when} was measured with another table than the one in force",
     "open": "unverified: push {number} of {when} is not finished",
     "never": "not checked yet",
-    "journal": "unknown: the push journal is not what was written",
+    "journal": "unknown: the push journal was changed after it was written",
 }
 
 

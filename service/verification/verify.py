@@ -119,21 +119,21 @@ def incomparable(before: VerificationFigures, after: VerificationFigures, pushed
         return "a figure is not a number"
     if pushed_crc is not None and after.tables != {pushed_crc}:
         used = ", ".join(sorted("unrecorded" if crc is None else f"{crc:08X}" for crc in after.tables)) or "unrecorded"
-        return f"it was measured with table {used}, brought into force was {pushed_crc:08X}"
+        return f"it was measured with table {used}, but table {pushed_crc:08X} was brought into force"
     if before.air_c is None or after.air_c is None:
-        return "how warm the air was is not known"
+        return "the air temperature is not known"
     low, high = min(before.air_c[0], after.air_c[0]), max(before.air_c[1], after.air_c[1])
     if high - low > SAME_AIR_C:
-        return f"the air had {low:.1f} to {high:.1f} °C over before and after, more than {SAME_AIR_C:g} K apart"
+        return f"the air was at {low:.1f} to {high:.1f} °C before and after, a range of more than {SAME_AIR_C:g} K"
     return ""
 
 
 def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: int | None = None) -> VerificationDecision:
-    """Keep only if the worst diagonal improved by more than its expanded uncertainty and no other figure got worse (reliability.md H11).
+    """Keep a new table only if the worst diagonal improved by more than its expanded uncertainty and no other figure got worse.
 
     "Worse" is more than the expanded uncertainty of the difference plus `WORSE_SHARE`: a diagonal that was good because errors cancelled
-    may come closer to the others, but only by a small share of the worst one. The old table is restored as well if this cannot be decided:
-    the two do not compare (`incomparable`), or a figure is less certain than the gain.
+    may come closer to the others, but only by a small share of the worst one. The table is not kept either if this cannot be decided: the
+    two verifications cannot be compared (`incomparable`), or a figure is less certain than the gain.
     """
     why = incomparable(before, after, pushed_crc)
     if why:

@@ -85,7 +85,7 @@ class Tables(Repository):
     def add(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:
         """Store a table; return its id.
 
-        ``solution_id`` None: a test step or a restored table. ``crc``: CRC-32 of ``image``; ``doc``: kind and prediction, or why it was restored.
+        ``solution_id`` None: a test step or a restored table. ``crc``: CRC-32 of ``image``; ``doc``: kind, and prediction or order.
         """
         values = {"machine_id": machine_id, "solution_id": solution_id, "image": image, "crc": crc, "doc": doc}
         return self._add(comp_tables, **values, created_utc=self._db.now())

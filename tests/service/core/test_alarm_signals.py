@@ -68,7 +68,7 @@ def test_a_jump_among_few_checks_is_more_than_uncertainty_and_worth_a_look() -> 
     assert kinds(result(0, **loose), result(1, 15.0, **loose)) == set()  # U of the difference 5.7
     assert kinds(result(0, 15.0), result(1, 9.0)) == set()  # better
     (signal,) = found_in(records(result(0), result(1, 15.0)), AlarmTerms("quick-check")).signals
-    assert signal.text == "worst body diagonal 15.0 ± 1.0 µm (U, k = 2) is +6.0 ± 1.4 µm from the checks before"
+    assert signal.text == "worst body diagonal 15.0 ± 1.0 µm (U, k = 2) differs by +6.0 ± 1.4 µm from the checks before"
 
 
 def test_what_jumped_does_not_become_the_habit() -> None:

@@ -59,7 +59,7 @@ def test_turning_points_of_an_overrun_are_no_positions(axis):
 def test_without_overrun_the_end_is_said_to_be_read_twice():
     (test,) = linear_tests([run_of(line(Linear("l", "L", "identify", 0, positions=5, at_share=(0.15, 0.15)), lost))], [])
     assert test.readings.position_mm.size == 5
-    assert "no overrun on record" in test.notes[0]
+    assert "no overrun is recorded" in test.notes[0]
 
 
 def test_runs_of_one_set_up_are_one_test_and_other_set_ups_are_others():

@@ -166,7 +166,7 @@ def test_runs_of_one_kind_are_compared_and_others_refused(running: Served) -> No
     lines = "&".join(f"run={n}" for n in runs_of(running, "laser_linear")[:2])
     assert "they ran along different paths" in got(running, f"/compare?{lines}", 409)
     other = next(r.id for r in running.store.runs.all() if r.campaign == "c1" and r.label == "r01")
-    assert "runs of two machines have no difference" in got(running, f"/compare?run={laser}&run={other}", 409)
+    assert "runs of two machines cannot be compared" in got(running, f"/compare?run={laser}&run={other}", 409)
     sealed = next(r.id for r in running.store.runs.all() if r.campaign == "c1" and r.label == "r04")
     assert "it is sealed" in got(running, f"/compare?run={other}&run={sealed}", 409)
     assert "No run 999 in the store" in got(running, f"/compare?run={a}&run=999", 409)
@@ -185,7 +185,7 @@ def test_a_difference_counts_the_mounting_and_names_direction_and_feed(running: 
     columns = replace(run.columns, direction=-run.columns.direction, feed_mm_min=2.0 * run.columns.feed_mm_min)
     other = LoadedRun("b", "m", replace(run, columns=columns), one.data, document.figures)
     told = remarks([one, other])
-    assert ["another direction" in told[0], "depends on feed" in told[1], len(told), remarks([one, one])] == [True, True, 2, []]
+    assert ["another direction" in told[0], "effects of the feed" in told[1], len(told), remarks([one, one])] == [True, True, 2, []]
     found = difference(curve(one), curve(one))
     assert found is not None
     assert found.u_um.min() > np.sqrt(2.0) * U_REPEAT_MM * 1e3
