@@ -223,9 +223,7 @@ def test_what_the_covariance_leaves_out_is_named(bench: Bench) -> None:
     bench.errors = bench.write("e.json", ERRORS | {"covariance": {"parameters": ["C0Y"], "matrix": [[1e-12]]}})
     done = bench()
     assert "U(dX)" in done.out
-    assert (
-        "(1 parameters); not in this covariance, so taken as exact: B0Z, A0Z, EXX, EXX@reverse, EYX, EBX, ECY, EAZ, EZZ" in done.out
-    )
+    assert "(1 parameters); not in this covariance, so taken as exact: B0Z, A0Z, EXX, EXX@reverse, EYX, EBX, ECY, EAZ, EZZ" in done.out
 
 
 def test_parameters_that_the_covariance_leaves_out_are_named_one_by_one(bench: Bench) -> None:
