@@ -19,7 +19,7 @@ def utc_text(time: datetime) -> str:
         The time has no time zone.
     """
     if time.tzinfo is None:
-        raise StoreError(f"time {time.isoformat()} has no time zone", "give one")
+        raise StoreError(f"time {time.isoformat()} has no time zone", "add one, e.g. Z for UTC")
     return time.astimezone(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 

@@ -184,7 +184,7 @@ def _vector_notes(c: Checks) -> list[str]:
             lines.append(f"rounding of {c.file} {q.name}: {q.floor:.0e} {q.unit} or {q.relative:.0e} of the value, {q.rounding}")
     for q in c.forms.values():
         verdict = "ok" if q.ok else "DEVIATES"
-        lines.append(f"form of inputs {c.file} {q.name} ({q.values} numbers, nothing computes them): {verdict}")
+        lines.append(f"inputs {c.file} {q.name} ({q.values} numbers, checked only for their form): {verdict}")
     lines += [f"found by trial, {c.file} does not state it: {text}" for text in c.assumptions]
     lines += [f"REFUSED {c.file}: {c.refused}"] if c.refused else []
     lines += [f"not computable {c.file} {n.name} ({n.numbers} numbers): {n.why}" for n in c.not_computable]

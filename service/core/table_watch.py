@@ -159,7 +159,7 @@ class TableWatch:
             return
         if self._reported is not None and self._reported[0] == in_force.crc:
             return
-        log.error("the table in force is not ours", bank=in_force.bank, crc=f"{in_force.crc:08X}", why=text)
+        log.error("the table in force is not one that Abbe verified", bank=in_force.bank, crc=f"{in_force.crc:08X}", why=text)
         self._show((in_force.crc, f"{CODE}: {text} - {REMEDY}"))
         await self._alarms.alarm({"code": CODE, "what": text, "remedy": REMEDY, "at_utc": self._clock.utc().isoformat()})
 

@@ -179,7 +179,7 @@ class StretchComparison:
             return
         if self._first_us is None:
             if before is None or (before.seq + 1) % 2**32 != sample.seq:
-                raise StretchDiffers("the samples at which the path began were lost", "look at the ball-bar's cable; the path begins again")
+                raise StretchDiffers("the first samples of the path were lost", "look at the ball-bar's cable; the path begins again")
             self._first_us = sample.device_us
         at_mm = ((sample.device_us - self._first_us) * 1e-6 + self._half_s) * self._on.feed_mm_s
         if at_mm > self._on.arc_mm[-1]:

@@ -250,7 +250,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
         elif late_s >= 0.0:
             raise StatusUnknown(
                 f"the controller's status has been unknown for {1e3 * unknown_s:.0f} ms: {why}",
-                "look at its link; nothing moves until it is known",
+                "look at the controller's link; nothing moves until its status is known",
             )
         else:
             await asyncio.sleep(min(RETRY_S, -late_s))

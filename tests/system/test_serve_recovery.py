@@ -106,7 +106,9 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
                 assert "the old table was made active again" in back.expect("is closed", patience_s=60.0)
                 assert asyncio.run(table_in_force(cnc))[1] == before[1]
             asyncio.run(put_in_force(cnc))
-            back.expect("the table in force is not ours", patience_s=15.0)  # of reliability.md 5: foreign writes are an alarm within 15 s
+            back.expect(
+                "the table in force is not one that Abbe verified", patience_s=15.0
+            )  # of reliability.md 5: foreign writes are an alarm within 15 s
             status = f"http://127.0.0.1:{port}/api/v1/status"  # of another process: the log may be ahead of it
             (told,) = wait_for(lambda: httpx.get(status, timeout=30).json()["attention"], 15.0, "the alarm on the page")
             assert told.startswith("CMP-010: the compensation in force was changed from outside")

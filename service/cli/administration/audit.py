@@ -26,7 +26,7 @@ SHOWN = 10
 
 @audit.command("show")
 def show_audit(
-    last: Annotated[int, typer.Option("--last", min=1, help="Number of records, the newest.")] = 50,
+    last: Annotated[int, typer.Option("--last", min=1, help="How many of the newest records.")] = 50,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -66,7 +66,7 @@ def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: Js
         if len(faults) > SHOWN:
             typer.echo(f"{len(faults) - SHOWN} more; --json lists all")
         if not faults:
-            typer.echo(f"{last[0].id if last else 0} records, all there and as written")
+            typer.echo(f"{last[0].id if last else 0} records: none missing, none changed")
             typer.echo(f"head: {head}" if head else "the audit is empty")
     raise typer.Exit(1 if faults else 0)
 

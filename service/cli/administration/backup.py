@@ -36,7 +36,9 @@ def backup(
         print_json(document(made))
     else:
         rows, size = made.rows, sum(one.bytes for one in made.files.values())
-        typer.echo(f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {made.segments} segments, {size / 1e6:.1f} MB, checked")
+        typer.echo(
+            f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {made.segments} files of samples, {size / 1e6:.1f} MB, checked"
+        )
         for text in made.audit.faults[:3]:
             typer.echo(f"audit: {text}")
         if made.audit.records and not made.audit.key:
@@ -68,7 +70,7 @@ def restore(
         return
     rows = done.backup.listed.rows
     typer.echo(f"{done.database}: as of {done.backup.listed.made_utc}, {rows['runs']} runs, {rows['verifications']} checks")
-    typer.echo(f"audit: {done.records} records, all there and as written")
+    typer.echo(f"audit: {done.records} records: none missing, none changed")
     if done.segments:
         typer.echo(f"{done.segments} files of samples: the next command that connects to the machine stores them in the database")
     for path in aside:

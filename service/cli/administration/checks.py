@@ -18,7 +18,7 @@ MachineFile = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machi
 @alarm.command("list")
 def list_alarms(
     machine: MachineFile,
-    every: Annotated[bool, typer.Option("--all", help="Also those that are over and acknowledged.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Also alarms that are over and acknowledged.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
@@ -94,7 +94,7 @@ def trend(
         typer.Option(
             "--after",
             metavar="UTC",
-            help="Only checks after this, e.g. a repair; default: the last kept push.",
+            help="Only checks after this time, e.g. of a repair; default: of the last kept push.",
             show_default=False,
         ),
     ] = None,

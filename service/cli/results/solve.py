@@ -312,7 +312,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     model: Annotated[ModelName, typer.Option("--model", help="As for abbe solve.")] = ModelName.rigid21,
     workers: Annotated[int, typer.Option("--workers", min=1, max=256, help="Processes of this computer.")] = 1,
     dask: Annotated[
-        str | None, typer.Option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster instead.", show_default=False)
+        str | None, typer.Option("--dask", metavar="ADDRESS", help="Use this scheduler of a Dask cluster instead.", show_default=False)
     ] = None,
     store_solutions: Annotated[bool, typer.Option("--keep", help="Store each solution.")] = False,
     db: Annotated[str | None, typer.Option("--store", "--db", metavar="URL", help="Database.", show_default=False)] = None,

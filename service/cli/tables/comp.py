@@ -21,7 +21,9 @@ FormatOption = Annotated[
 ]
 ReferenceOption = Annotated[
     str | None,
-    typer.Option("--reference", metavar="X,Y,Z", help="Where tables are zero, mm. Default: start of every stroke.", show_default=False),
+    typer.Option(
+        "--reference", metavar="X,Y,Z", help="Point at which all tables are zero, mm. Default: start of each stroke.", show_default=False
+    ),
 ]
 
 
@@ -101,7 +103,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
 
 @comp.command("import")
 def import_tables(  # noqa: PLR0913 - one argument for each option
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File, or the folder of several.", show_default=False)],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File, or folder with several files.", show_default=False)],
     form: FormatOption,
     solution: Annotated[
         str | None, typer.Option("--solution", metavar="SOLUTION", help="Compare with the tables of this solution.", show_default=False)

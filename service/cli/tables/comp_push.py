@@ -108,7 +108,7 @@ def rollback(
     elif isinstance(found, str):
         typer.echo(found)
     else:
-        typer.echo(f"in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}")
+        typer.echo(f"the table is in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}")
         typer.echo(f"the machine is unverified now: {measure_now(str(machine))}")
 
 

@@ -115,7 +115,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
         f"{plan.name}: {len(plan.tests)} tests on {machine_name}",
         f"{readings} readings at standstill, feeds {slow:g} to {fast:g} mm/min, limits in mm: {strokes}",
         "positions are machine coordinates in mm: work offsets, tool length and rotation must be zero",
-        "feed override 100 percent, single block off; start the listening first, then the program",
+        "feed override 100 percent, single block off; start abbe listen first, then this program",
     )
     count = 0
     blocks: list[Block] = []

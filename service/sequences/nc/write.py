@@ -298,7 +298,7 @@ def _runtime_comments(took: Runtime, pace: Pace) -> tuple[str, str]:
     return (
         f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells; not counted are"
         " the stops for a person and the way to the first position",
-        f"that is with {pace.acceleration_mm_s2:g} mm/s2 along the path, {pace.stop_s:g} s at each exact stop, feed override 100 percent",
+        f"computed with {pace.acceleration_mm_s2:g} mm/s2 along the path, {pace.stop_s:g} s at each exact stop, feed override 100 percent",
     )
 
 

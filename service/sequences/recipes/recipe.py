@@ -283,8 +283,8 @@ def _setup(recipe: BarRecipe, machine: Machine, **own: Any) -> dict[str, Any]:
 def _check_turns(label: str, turns: float) -> None:
     if not MIN_TURNS <= turns < np.inf:
         raise ConfigError(
-            f"test {label}: {turns:g} turns do not tell cup offset from squareness, a helix needs {MIN_TURNS:g} or more",
-            "set turns to 3 or more; 5 are usual",
+            f"test {label}: cup offset and squareness cannot be told apart with {turns:g} turns: a helix needs {MIN_TURNS:g} or more",
+            f"set turns to {MIN_TURNS:g} or more; 5 are usual",
         )
 
 

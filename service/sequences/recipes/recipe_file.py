@@ -99,7 +99,7 @@ KINDS: dict[str, type[TestRecipe]] = {
 
 def _consistent(recipe: Recipe) -> Recipe:
     if isinstance(recipe, Diagonal) and recipe.order and recipe.overrun_mm:
-        raise ValueError("expected no overrun_mm beside order: a step diagonal turns where it stands")
+        raise ValueError("expected order or overrun_mm, not both: a step diagonal has no overrun")
     return recipe
 
 

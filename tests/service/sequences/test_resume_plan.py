@@ -139,7 +139,7 @@ def test_the_same_stretch_is_the_same_and_a_knock_is_one():
             read(found[2], 1.4 * SAME_MM, seed=seed)
     with pytest.raises(StretchDiffers, match="too few readings"):
         read(found[2], 0.0, status=0b1001)
-    with pytest.raises(StretchDiffers, match="at which the path began were lost"):
+    with pytest.raises(StretchDiffers, match="the first samples of the path were lost"):
         read(found[2], 0.0, lost=True)
 
 
