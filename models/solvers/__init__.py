@@ -1,1 +1,1 @@
-"""From observations to error parameters with uncertainty, and to what the observations cannot tell."""
+"""Solve observations for error parameters with uncertainty, and find what the observations cannot determine."""

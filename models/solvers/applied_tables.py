@@ -1,8 +1,8 @@
-"""Influence of the active table on the readings of a run, less the part that lost motion absorbs.
+"""Influence of the active compensation table on the readings of a run, less the part that lost motion absorbs.
 
 A table moves the drives away from the command. Where its corrections change while an axis is commanded to rest, the drive moves by a
-micrometre or two, reverses where no command does, and stays within the lost motion: the axis does not follow, or only partly. To a solver
-that sees commands alone this is an error of a few micrometres which no smooth error motion explains.
+micrometre or two and reverses although the command does not. Within the lost motion the axis does not follow, or only partly. A solver
+that sees only the commands finds an error of a few micrometres there which no smooth error motion explains.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import travel_sign
 
 LEAD_IN_MM = 1.0
-"""A run is approached in the direction of its first motion, farther than any lost motion."""
+"""Assumed approach to a run, in the direction of its first motion; longer than any lost motion."""
 
 
 @dataclass(frozen=True)
 class AppliedTables:
-    """A table that was active while runs were measured.
+    """A compensation table that was active while runs were measured.
 
     Attributes
     ----------
     correction : callable
-        Commanded positions (n, 3), mm, to added corrections (n, 3), mm.
+        Returns the corrections that the table adds (n, 3), mm, at commanded positions (n, 3), mm.
     lost_mm : array, shape (3,), or None
-        Known lost motion of X, Y, Z. None: unknown; every axis is assumed to have followed.
+        Lost motion of X, Y, Z. None: unknown; every axis is assumed to follow its drive.
     """
 
     correction: Callable[[F2], F2]
     lost_mm: F1 | None = None
 
     def bar_mm(self, axes_mm: F2, centre_mm: F1) -> F1:
-        """Contribution to the readings of a ball-bar at successive commands about a cup set with the spindle, shape (n,), mm.
+        """Contribution to ball-bar readings at successive commands about a cup set with the spindle, shape (n,), mm.
 
-        The side from which the axes approached the cup is part of its offset and does not count.
+        The side from which the axes approached the cup is part of the cup offset and not included here.
         """
         away = axes_mm - centre_mm
         look = away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -51,7 +51,8 @@ class AppliedTables:
     def moved_mm(self, axes_mm: F2) -> F2:
         """Displacement of the axes by the table at successive commands, shape (n, 3), mm.
 
-        The correction less the part that lost motion absorbs, relative to an axis on the side from which it was commanded last.
+        It is the correction less the part that lost motion absorbs. The reference is an axis without a table, which rests on the side of
+        its last commanded motion.
         """
         added = self.correction(axes_mm)
         if self.lost_mm is None:
@@ -62,15 +63,14 @@ class AppliedTables:
         moved = added.copy()
         for a in np.flatnonzero(self.lost_mm > 0.0):
             half = 0.5 * float(self.lost_mm[a])
-            start = (
-                float(before[a]) if sign[0, a] else float(driven[0, a])
-            )  # the approach of an axis that is never commanded to move is unknown
+            # The approach of an axis that is never commanded to move is unknown.
+            start = float(before[a]) if sign[0, a] else float(driven[0, a])
             moved[:, a] -= half * (_play(driven[:, a], start, half) - sign[:, a])
         return moved
 
 
 def _play(drive_mm: F1, before_mm: float, half_mm: float) -> F1:
-    """The play operator: (drive - axis) / half, -1 to 1, for an axis that followed a long move from ``before_mm`` to the first position."""
+    """Play operator: (drive - axis) / half, -1 to 1, after a long move from ``before_mm`` to the first position."""
     axis = float(drive_mm[0]) - half_mm * float(np.sign(drive_mm[0] - before_mm))
     out = []
     for drive in drive_mm.tolist():

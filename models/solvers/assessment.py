@@ -1,8 +1,8 @@
-"""What a campaign determines about a machine and what it does not, before it is measured and after it is solved.
+"""Report of what a campaign determines about a machine and what it does not, before it is measured or after it is solved.
 
-`observability` needs the runs' set-ups only (a planner's question), `observability_of` takes a solution. Both give rank and null space in
-text with a cause and a cure, the status of every parameter and motion, and the uncertainty of the deviation in the volume. Rank is of
-the readings and stated calibrations alone; uncertainties include the documented priors (`abbe.models.solvers.priors`).
+`observability` needs only the runs' set-ups and positions, for planning; `observability_of` takes a solution. Both give the rank, hidden
+combinations as text with cause and cure, the status of every parameter and motion, and the uncertainty of the deviation in the volume. The
+rank comes from readings and stated calibrations alone; uncertainties include the documented priors (`abbe.models.solvers.priors`).
 """
 
 from __future__ import annotations
@@ -44,33 +44,36 @@ __all__ = ["Observability", "motions_of", "observability", "observability_of"]
 
 SIGMA_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
 FLOOR_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
-"""Noise of one reading and smallest uncertainty of an averaged one, mm, where a planner says nothing else (issue: 0.5 and 0.3 um)."""
+"""Default noise of one reading and least uncertainty of an averaged one, mm, for a campaign that is only planned."""
 
 
 @dataclass(frozen=True)
 class Observability:
-    """The whole report.
+    """The whole report of a campaign's observability.
 
     Attributes
     ----------
     machine, terms, model
-        Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution carries higher
-        orders along, for honest uncertainties).
+        Nominal machine; coefficients of its error motions that count for the rank; all coefficients of the model (a solution also has
+        higher orders, so that its uncertainties are not too small).
     observed : ObservedInformation
         Rank, effective rank, condition, null space (unit columns).
     reachable : int
-        Rank that no run with the same tools could exceed: the whole deviation vector everywhere (math.md 4.6, "upper bound").
+        Largest rank that runs with the same tools could have, if they measured the whole deviation vector everywhere.
     known : tuple of str
         Set-up unknowns that count as known for the rank, because a run or the caller states them.
     hidden : tuple of HiddenGroup
-        The null space in words; groups that change nothing with the tools used come last.
+        The null space in words; combinations that move nothing with the tools used come last.
     advice : tuple of Advice
-        Additions to the campaign in the order in which they show most, with the rank after each.
+        Additions to the campaign, each the most useful after the previous ones, with the rank after each.
     parameters, correlations, motions
         Every unknown; pairs with a correlation above 0.9; every error motion as a function.
+    knowing : Knowing
+        Covariances of the coefficients of ``model``.
     volume : Volume
         On a grid of 11 nodes per axis. Other points: `at`.
     number : Number
+        The observability number.
     """
 
     machine: Machine
@@ -98,7 +101,7 @@ class Observability:
         return volume_at(self.machine, self.model, self.knowing, axes_mm)
 
     def plane(self, fixed: int = 2, nodes: int = 15) -> Plane:
-        """As `at`, over the plane in the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture: nodes x nodes points."""
+        """As `at`, on nodes x nodes points of the plane through the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture."""
         return plane_at(self.machine, self.model, self.knowing, fixed, nodes)
 
     def lines(self) -> tuple[str, ...]:
@@ -126,16 +129,16 @@ def observability(
     floor_mm: dict[str, float] | None = None,
     known: Knowledge | None = None,
 ) -> Observability:
-    """What runs can determine, from their positions only; readings are not used.
+    """Report what runs can determine, from their positions only; readings are not used.
 
     Parameters
     ----------
     terms : int or tuple of Term
         The model: highest Legendre order of the 21 error motions, or its coefficients.
-    priors
+    priors : Priors, optional
         As in `abbe.models.solvers.joint.solve_joint`.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
-        Standard uncertainty of one raw reading, and the least one of an averaged value, mm (the larger of the two counts).
+        Standard uncertainty of one raw reading, mm, and the least one of an averaged value.
     known : Knowledge, optional
         What is known of the set-up, for the rank; default `stated_knowledge`: what the runs themselves state.
 
@@ -161,10 +164,9 @@ def observability(
 
 
 def observability_of(solution: JointSolution, known: Knowledge | None = None) -> Observability:
-    """What the runs of a solution determined: as `observability`, with the solution's own estimates, covariance, priors and noise.
+    """Report what the runs of a solution determined: as `observability`, with the solution's estimates, covariance, priors and noise.
 
-    Rank and null space count the terms up to the order that the solution chose; the orders above it, which keep intervals from being too
-    narrow, count in every uncertainty and share.
+    Rank and null space count the terms up to the solution's chosen order; uncertainties and shares include its higher orders too.
     """
     e, s = solution.estimate, solution
     noise = np.concatenate([np.full(r.residual_mm.size, r.expected_mm) for r in s.runs])
@@ -174,7 +176,7 @@ def observability_of(solution: JointSolution, known: Knowledge | None = None) ->
 
 
 def motions_of(solution: JointSolution) -> tuple[MotionStatus, ...]:
-    """Every error motion of a solution judged, as in its whole report, without the report's other parts."""
+    """Status of every error motion of a solution, as in its whole report but without computing the other parts."""
     p = len(solution.terms)
     root = solution.prior_root[:p]
     return motions(solution.machine, solution.terms, solution.term_covariance, root @ root.T, solution.identifiability.involved)
@@ -190,7 +192,7 @@ def posterior_covariance(information: F2, prior_root: F2) -> F2:
 
 @dataclass(frozen=True)
 class _Beliefs:
-    """Estimates (None before solving), covariance, root of the prior covariance, information of the readings, rms noise of one, mm."""
+    """Estimates (None before solving), covariance, root of the prior covariance, information of the readings, rms reading noise, mm."""
 
     theta: F1 | None
     covariance: F2
@@ -241,7 +243,7 @@ def _report(
 
 
 def _knowing(beliefs: _Beliefs, p: int) -> Knowing:
-    """Covariances of the terms; the noise part is that of the estimator in use, priors included."""
+    """Covariances of the terms; the noise part is that of the estimator with its priors."""
     plain = posterior_covariance(beliefs.information, beliefs.prior_root)[:p]
     root = beliefs.prior_root[:p]
     return Knowing(root @ root.T, beliefs.covariance[:p, :p], plain @ beliefs.information @ plain.T / beliefs.noise_mm**2)

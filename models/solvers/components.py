@@ -1,12 +1,12 @@
-"""Variance components and order of the model, from the readings themselves: noise of the instruments, typical size of the errors of each
-class, and the number of Legendre orders that the readings support (chosen by held-out runs).
+"""Variance components and order of the model, estimated from the readings.
 
-A campaign is compressed to normal equations of the unknowns, per fold and instrument (`InformationSums`): all later work is in the space
-of the unknowns (a few hundred), whatever the number of readings.
+The components are the noise of the instruments and the typical size of each class of errors; the order is the number of Legendre orders
+that held-out runs support. A campaign is compressed to normal equations of the unknowns, per fold and instrument (`InformationSums`), so
+later work depends on the number of unknowns (a few hundred) and not of readings.
 
-Marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher scoring on the
-logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". Their own uncertainty widens the prior of the error motions
-(`cautious`). Deterministic: no random numbers, a fixed number of steps at most.
+The method is the marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher
+scoring on the logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". The uncertainty of the components widens the
+prior of the error motions (`cautious`). The result is deterministic.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ I1 = NDArray[np.int64]
 KINDS = ("bar", "laser")
 """Instruments whose noise is estimated separately."""
 NOISE_SD = 2.0
-"""Weak hyperprior of an instrument's log noise variance about that of its repeats: a factor of e in the standard deviation."""
+"""Weak hyperprior of an instrument's log noise variance about the expected one: a factor of e in the standard deviation."""
 LEAST_ETA = -8.0
-"""Least log noise variance over the expected one: a factor of 55 in the standard deviation, under the resolution of every instrument that
-is sold. Readings without any noise would drive it to minus infinity and the normal equations out of the digits of a double."""
+"""Least log ratio of noise variance to expected one, a factor of 55 in the standard deviation and below any instrument's resolution.
+Readings without noise would drive it to minus infinity, and the normal equations beyond double precision."""
 ROUGHER = 0.2
-"""Posterior standard deviations of a motion's roughness by which it is taken rougher than most probable (`cautious`)."""
+"""A motion is taken rougher than most probable by this many posterior standard deviations of its roughness (`cautious`)."""
 STEPS = 25
 TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
@@ -44,7 +44,7 @@ RIGID6 = 0
 
 @dataclass(frozen=True)
 class PlannedReadings:
-    """Whitened, scaled readings of all runs on top of each other.
+    """Whitened, scaled readings of all runs, stacked.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class PlannedReadings:
     y : array, shape (n,)
         Readings minus the prediction at the expansion point, divided by their expected noise.
     run, fold, kind : arrays of int, shape (n,)
-        Which run, which fold (set-ups that are held out together) and which of `KINDS` each row is of.
+        Index of each row's run, fold (set-ups that are held out together) and instrument in `KINDS`.
     """
 
     a: F2
@@ -77,7 +77,7 @@ class InformationSums:
         return InformationSums(self.gram - other.gram, self.rhs - other.rhs, self.square - other.square, self.count - other.count)
 
     def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> InformationSums:
-        """The sums for other unknowns: the old ones are ``root`` @ the new ones; ``root`` is the unit matrix but for its blocks."""
+        """The sums for new unknowns, where old = ``root`` @ new; ``root`` is the unit matrix outside ``blocks``."""
         gram = self.gram.copy()
         for at in blocks:
             gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
@@ -113,7 +113,7 @@ def grams(r: PlannedReadings) -> Grams:
 
 
 def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...]:
-    """Normal equations of every fold for given weights of the readings (1: as it is, 0: not used), shape (n,)."""
+    """Normal equations of every fold for given weights of the readings (1 full, 0 not used), shape (n,)."""
     found = []
     for f in range(g.parts.shape[0]):
         gram, rhs, square, count = g.parts[f].copy(), [], [], []
@@ -143,13 +143,13 @@ def total(parts: tuple[InformationSums, ...]) -> InformationSums:
 
 @dataclass(frozen=True)
 class Components:
-    """Log variances over the documented ones (``psi``, of `SizeModel`) and over the expected noise (``eta``, per instrument)."""
+    """Log ratios of variances: to the documented sizes (``psi`` of `SizeModel`), to the expected noise (``eta``, per instrument)."""
 
     psi: F1
     eta: F1
 
     def half(self, model: SizeModel) -> F1:
-        """Factor of every unknown's prior standard deviation, shape (p,)."""
+        """Factor on every unknown's documented prior standard deviation, shape (p,)."""
         return np.asarray(np.exp(0.5 * model.design @ self.psi))
 
 
@@ -211,7 +211,7 @@ def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPo
 
 
 def _information_shares(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
-    """Information of each instrument times the covariance; all together they are I - S, so the last one costs nothing."""
+    """Information of each instrument times the covariance; their sum is known (``hat``), so the last one is the rest."""
     used = np.flatnonzero(sums.count > 0)
     out = [np.zeros_like(cov) for _ in w]
     rest = hat
@@ -232,7 +232,7 @@ class FittedComponents:
 
 
 def estimate(sums: InformationSums, model: SizeModel, start: Components) -> FittedComponents:
-    """Most probable components from a start; ``sums`` about the independent unknowns of the model (`InformationSums.turned`)."""
+    """Find the most probable components from a start; ``sums`` are those of the independent unknowns (`InformationSums.turned`)."""
     weight = np.concatenate([model.sd, np.full(start.eta.size, NOISE_SD)]) ** -2.0
 
     def objective(c: Components) -> tuple[float, ComponentPosterior]:
@@ -262,7 +262,7 @@ def estimate(sums: InformationSums, model: SizeModel, start: Components) -> Fitt
 
 
 def _positive(info: F2, least: float) -> F2:
-    """The matrix with eigenvalues of at least ``least``; smaller ones come from rounding only (readings without noise)."""
+    """Raise eigenvalues to at least ``least``; smaller ones come only from rounding (readings without noise)."""
     values, vectors = scipy.linalg.eigh(info)
     return info if values[0] >= least else np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
@@ -273,9 +273,9 @@ def _moved(c: Components, step: F1) -> Components:
 
 
 def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
-    """`estimate` together with the correlation length of the error motions, by hill climbing over `LENGTHS` from the model's own.
+    """`estimate` with the correlation length of the error motions too, by hill climbing over `LENGTHS` from the model's own length.
 
-    ``sums`` about the unknowns in units of their typical size.
+    ``sums`` are those of the unknowns in units of their typical size.
     """
     at = LENGTHS.index(model.length)
     found = {at: estimate(sums.turned(model.root, model.blocks), model, start)}
@@ -295,15 +295,15 @@ def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tu
 
 
 def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Components]:
-    """Prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
+    """Return a prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
     It differs in three ways, none of which matters with many readings.
 
     - Every motion is a little rougher (`ROUGHER`) than most probable: near the ends of the stroke, where nothing was measured, it may be
-      rougher than elsewhere without contradicting the readings.
-    - The variance of a motion is its posterior mean (of a log-normal: exp(psi + v/2)), not its most probable value. For two motions that
-      the readings hardly separate, the most probable sizes are too small.
-    - No shape is held closer to zero than `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
+      rougher without contradicting the readings.
+    - The variance of a motion is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions that the
+      readings hardly separate, the most probable sizes are too small.
+    - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("roughness ") for name in model.names])
     bent = np.array([name in ("fade", "cut") for name in model.names])
@@ -323,8 +323,8 @@ def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Comp
 class OrderChoice:
     """Score of every model on held-out readings.
 
-    ``levels``: 0 for `RIGID6`, else the highest Legendre order. ``score``: mean log predictive density per fold, best = 0. ``se``: standard
-    error of that difference over the folds. ``chosen``: the simplest level within one standard error of the best.
+    ``levels``: 0 for `RIGID6`, else the highest Legendre order. ``score``: mean log predictive density per fold minus that of the best
+    level. ``se``: standard error of this difference over the folds. ``chosen``: the simplest level within one standard error of the best.
     """
 
     levels: tuple[int, ...]
@@ -334,7 +334,7 @@ class OrderChoice:
 
 
 def folds(runs: tuple[RunData, ...]) -> I1:
-    """Fold of each run: whole set-ups are held out, spread evenly over both instruments; shape (runs,)."""
+    """Fold of each run, shape (runs,): all runs of a set-up share a fold, and each instrument is spread evenly over the folds."""
     out = np.zeros(len(runs), dtype=np.int64)
     place: dict[str, int] = {}
     for kind in ("bar", "laser"):
@@ -347,13 +347,13 @@ def folds(runs: tuple[RunData, ...]) -> I1:
 
 
 def term_levels(terms: tuple[Term, ...], rest: int) -> I1:
-    """Simplest level whose model holds each unknown, shape (p,); -1 for lost motion and set-up, which every model has."""
+    """Lowest level whose model contains each unknown, shape (p,); -1 for lost motion and set-up, which every model has."""
     own = [RIGID6 if t.order == 0 or (t.order == 1 and t.component == t.axis) else t.order for t in terms]
     return np.array(own + [-1] * rest, dtype=np.int64)
 
 
 def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, level: I1) -> tuple[tuple[int, ...], F1]:
-    """Log evidence of every truncation of the model; constants that all levels share are left out.
+    """Levels, and the log evidence of the model truncated at each; constants that all levels share are left out.
 
     A truncated model has no Legendre coefficients above its level; the others keep their prior covariance.
     """
@@ -390,10 +390,10 @@ def _without_setup(gram: F2, rhs: F1, root: F2, level: I1) -> tuple[F2, F1, floa
 
 
 def choose(parts: tuple[InformationSums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:
-    """Score all levels on held-out folds (their set-up unknowns integrated out), or by evidence where fewer than 3 folds exist.
+    """Score all levels on held-out folds (their set-up unknowns integrated out); with fewer than 3 folds, by evidence.
 
-    log p(held-out | others) = log p(all) - log p(others). Sizes and noise are those of all readings; the unknowns themselves never see
-    the fold they are scored on.
+    log p(held-out | others) = log p(all) - log p(others). Sizes and noise come from all readings; the unknowns themselves are estimated
+    without the fold on which they are scored.
     """
     whole = total(parts)
     levels, everything = truncated_evidence(whole, c, model, level)

@@ -1,7 +1,7 @@
-"""Rows of single experiments in a least-squares problem, for any error functions, and what such a problem can determine.
+"""Least-squares design rows of single experiments, for any error functions, and what such a problem can determine.
 
-A `Field` gives the deviation per unit of every parameter; bar and laser rows are its projections (math.md 4.2, 5.4). Ranks follow the
-convention of math.md 4.6: columns of unit length, then the set-up unknowns projected out.
+A `Field` gives the deviation per unit of every parameter; ball-bar and laser rows are its projections. Ranks are counted with columns of
+unit length and the set-up unknowns projected out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out, singular_values, svd
 
 Field = Callable[[F2], F3]
-"""Commanded workpiece coordinates (n, 3), mm, to the deviation per unit of each parameter (n, 3, p)."""
+"""Function of commanded workpiece coordinates (n, 3), mm, that returns the deviation per unit of each parameter (n, 3, p)."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class DesignRows:
 
 
 def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> DesignRows:
-    """Linearised ball-bar about one cup, eq (8) of Yang: n . (delta - delta0); set-up: cup offset (3) and bar length (1).
+    """Linearised ball-bar readings about one cup, n . (delta - delta0) (Yang and Kim eq 8); set-up: cup offset (3) and bar length (1).
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def bar_rows(field: Field, points_mm: F2, centre_mm: F1) -> DesignRows:
 
 
 def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> DesignRows:
-    """Displacement along a beam since the first record (left out, it is zero by definition); set-up: mirror tilts in two directions.
+    """Displacement along a beam since the first record, which has no row of its own; set-up: mirror tilts in two directions.
 
     Parameters
     ----------
@@ -59,20 +59,20 @@ def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> DesignRows:
 
 
 def vector_rows(field: Field, points_mm: F2) -> DesignRows:
-    """The whole deviation vector at points (upper bound of what any instrument can determine), no set-up unknowns."""
+    """All components of the deviation at points, the upper bound of what any instrument can determine; no set-up unknowns."""
     f = field(points_mm)
     flat = f.reshape(-1, f.shape[2])
     return DesignRows(flat, np.zeros((flat.shape[0], 0)))
 
 
 def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[F2, F2]:
-    """One design from several experiments: machine columns stacked, set-up columns placed as each part states.
+    """Combine several experiments into one design: machine columns and set-up columns.
 
     Parameters
     ----------
     parts : list of (n_k, p) arrays
     setups : list of (array (n_k, q), columns)
-        Set-up columns of each part and which unknowns of the whole problem they are: equal numbers share an unknown.
+        Set-up columns of each part, and the index of each one's unknown in the whole problem; equal indices share an unknown.
     """
     width = 1 + max((c for _, columns in setups for c in columns), default=-1)
     blocks = []
@@ -85,14 +85,14 @@ def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[
 
 
 def unit_columns(a: F2) -> tuple[F2, F1]:
-    """Design with columns of unit length and the factors that made them so; a column of zeros stays."""
+    """Scale the columns of a design to unit length and return the factors too; a column of zeros stays."""
     norm = np.linalg.norm(a, axis=0)
     factor: F1 = 1.0 / np.where(norm > 0, norm, 1.0)
     return np.asarray(a * factor), factor
 
 
 def ranks(a: F2, setup: F2) -> tuple[int, int]:
-    """Rank and effective rank: singular values above 1e-9 and 1e-3 of the largest, unit columns, set-up projected out (math.md 4.6).
+    """Rank and effective rank: singular values above 1e-9 and 1e-3 of the largest, unit columns, set-up projected out.
 
     Parameters
     ----------
@@ -101,21 +101,21 @@ def ranks(a: F2, setup: F2) -> tuple[int, int]:
 
     Returns
     -------
-    two integers of at most p: how many combinations of the machine's parameters the readings show, and how many they show well.
+    two integers, at most p: how many combinations of the machine's parameters the readings determine, and how many of them well.
     """
     s = singular_values(project_out(unit_columns(a)[0], setup))
     return int((s > RANK_TOLERANCE * s[0]).sum()), int((s > EFFECTIVE_TOLERANCE * s[0]).sum())
 
 
 def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]:
-    """The combination of the parameters ``support`` that leaves the least trace in the data.
+    """Find the combination of the parameters with indices ``support`` that leaves the least trace in the data.
 
     Returns
     -------
     weights : array, shape (len(support),)
         In units of the parameters, largest magnitude 1 and positive.
     trace : float
-        Its share of what the parameters would show if their effects did not cancel: 0 for a null vector.
+        Size of its effect on the readings relative to that of its parts without cancellation: 0 for a null vector.
     """
     b = project_out(a[:, support], setup)
     size = np.where(np.linalg.norm(b, axis=0) > 0, np.linalg.norm(b, axis=0), 1.0)
@@ -127,9 +127,9 @@ def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]
 
 
 def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
-    """Standard deviation of every component of the predicted map per unit of reading noise, shape (m, 3) (math.md 4.6 "noise gain").
+    """Noise gain: standard deviation of every component of the predicted map per unit of reading noise, shape (m, 3).
 
-    Combinations that leave no trace in the readings (singular values below 1e-9) count as zero; the frame's gauge is included.
+    Combinations that leave no trace in the readings (singular values below 1e-9) are taken as zero; rigid motion is not removed.
 
     Parameters
     ----------
@@ -144,9 +144,9 @@ def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
 
 
 def shortest_solution(a: F2, y: F1, scale: F1) -> F1:
-    """Least squares without a prior: of all best parameters those with the smallest sum of (parameter / scale)**2.
+    """Least squares without a prior; among equally good solutions, the one with the smallest sum of (parameter / scale)**2.
 
-    Without full rank the result also depends on ``scale``, which no measurement determines (math.md 5.5).
+    Without full rank the result depends on ``scale``, which no measurement determines.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def shortest_solution(a: F2, y: F1, scale: F1) -> F1:
     y : array, shape (n,)
         Readings, mm.
     scale : array, shape (p,)
-        Typical size of each parameter in its own unit; 0 holds one at zero.
+        Typical size of each parameter in its own unit; 0 holds the parameter at zero.
 
     Returns
     -------

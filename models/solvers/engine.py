@@ -34,13 +34,10 @@ from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setu
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
 from abbe.models.solvers.residuals import inflation, leverage, outlier_threshold, outlier_weights, robust_scale
 
-# Noise of an instrument from its repeats, before any model is fitted.
-
-
 DEFAULT_SIGMA_MM = {"bar": 4e-4, "laser": 3e-4}
-"""Standard uncertainty of one reading where nothing was repeated: the makers' figures for good instruments."""
+"""Standard uncertainty of one reading where nothing was repeated: makers' figures for good instruments."""
 RESOLUTION_MM = 5e-5
-"""Smallest standard uncertainty of an averaged value: no display and no encoder shows less."""
+"""Smallest standard uncertainty of an averaged value: the resolution of displays and encoders."""
 FEWEST_REPEATS = 8
 FOURTH: F1 = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 
@@ -48,9 +45,9 @@ FOURTH: F1 = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 def repeat_noise_mm(runs: tuple[RunData, ...], kind: str) -> float | None:
     """Standard deviation of one raw reading of an instrument from repeats, mm; None without repeats.
 
-    Ball-bar: fourth differences of neighbours on a dense path, which smooth motions do not reach. Laser: readings at equal positions of one
-    run, lost motion and drift removed; fourth differences if every position was visited once. Median over the readings, so
-    that outliers do not count.
+    Ball-bar: fourth differences of neighbours on a dense path, to which smooth motions do not contribute. Laser: differences of readings at
+    equal positions of one run, lost motion and drift removed; fourth differences if every position was visited once. The median makes
+    outliers harmless.
     """
     found = [v for run in runs if run.kind == kind for v in (_of_run(run),) if v.size]
     values = np.concatenate(found) if found else np.zeros(0)
@@ -60,7 +57,7 @@ def repeat_noise_mm(runs: tuple[RunData, ...], kind: str) -> float | None:
 
 
 def _of_run(run: RunData) -> F1:
-    """Differences of repeats, each scaled to the standard deviation of one raw reading."""
+    """Differences of repeats, scaled so that their standard deviation is that of one raw reading."""
     y = run.deviation_mm - nominal_reading(run)
     if run.kind == "laser":
         pairs = same_place(run.axes_mm)
@@ -70,7 +67,7 @@ def _of_run(run: RunData) -> F1:
 
 
 def same_place(axes_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Pairs of indices of readings at the same commanded position, each reading with its next visit, shape (m, 2)."""
+    """Index pairs of successive readings at the same commanded position, shape (m, 2)."""
     _, place = np.unique(np.round(axes_mm, 4), axis=0, return_inverse=True)
     order = np.argsort(place, kind="stable")
     equal = np.flatnonzero(np.diff(place[order]) == 0)
@@ -99,7 +96,7 @@ def _fourth(run: RunData, y: F1) -> F1:
 
 ROUNDS = 8
 SETTLED = 0.01
-"""The iteration ends when no reading's prediction moves by more than this part of its noise and no weight changes."""
+"""The iteration ends when no predicted reading moves, and no weight changes, by more than this (readings in units of their noise)."""
 HUBER = 1.5
 GENTLE = 3
 Progress = Callable[[str], None]
@@ -107,7 +104,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class InstrumentNoise:
-    """Expected noise per instrument before the fit: of one raw reading, least of an averaged value, from repeats (None without repeats)."""
+    """Expected noise per instrument, mm: of one raw reading; least noise of an averaged value; from repeats alone (None without them)."""
 
     sigma_mm: dict[str, float]
     floor_mm: dict[str, float]
@@ -138,13 +135,13 @@ class CampaignProblem:
         return np.concatenate([r.deviation_mm for r in self.runs])
 
     def split(self, values: F1) -> tuple[F1, ...]:
-        """Per run."""
+        """Split values of all readings into one array per run."""
         return tuple(np.split(values, np.cumsum([r.deviation_mm.size for r in self.runs])[:-1]))
 
 
 @dataclass(frozen=True)
 class CampaignFit:
-    """The settled solution: unknowns, components, weights of the readings, whitened residuals, normal equations per fold."""
+    """The converged solution: unknowns, components, weights, residuals (``size``: whitened), normal equations per fold."""
 
     theta: F1
     covariance: F2
@@ -160,7 +157,7 @@ class CampaignFit:
 
 
 def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None, floor_mm: dict[str, float] | None) -> InstrumentNoise:
-    """Noise that the caller states, else from repeats, else the makers' figures."""
+    """Noise stated by the caller, else from repeats, else `DEFAULT_SIGMA_MM`."""
     repeats = {kind: repeat_noise_mm(runs, kind) for kind in KINDS}
     sigma = {k: (sigma_mm or {}).get(k) or repeats[k] or DEFAULT_SIGMA_MM[k] for k in KINDS}
     return InstrumentNoise(sigma, {k: max((floor_mm or {}).get(k, 0.0), RESOLUTION_MM) for k in KINDS}, repeats)
@@ -208,7 +205,7 @@ def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
         new = _weights(size / _spread(problem, whole, c, sizes) if dirty and step >= GENTLE else size, limit, gentle=step < GENTLE)
         moved, changed = float(np.abs(r.a @ (x - before)).max()), float(np.abs(new - weight).max())
         weight = new
-        report(f"round {step + 1}: readings move by {moved:.2g} sigma, {int((weight < 1).sum())} readings count less")
+        report(f"round {step + 1}: predictions moved by up to {moved:.2g} sigma, {int((weight < 1).sum())} readings down-weighted")
         if step >= 2 and moved < SETTLED and changed < SETTLED:
             break
     return _finish(replace(problem, sizes=sizes), x, weight, c, gram)
@@ -219,7 +216,7 @@ def _robust_scale(size: F1, kind: I1) -> F1:
 
 
 def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
-    """First gently (Huber, when something is grossly wrong at all), so that a bad start rejects nothing good; then redescending."""
+    """Weights of the readings: redescending; if ``gentle`` and with gross outliers, Huber's, so that a bad start rejects nothing good."""
     hard = outlier_weights(size, limit)
     if gentle and (hard == 0.0).any():
         return np.asarray(np.minimum(1.0, HUBER / np.maximum(np.abs(size), HUBER)))
@@ -227,7 +224,7 @@ def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
 
 
 def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, sizes: SizeModel) -> F1:
-    """Standard deviation of each residual in units of its noise: what the fit took of it is missing."""
+    """Standard deviation of each residual in units of its noise, below 1 by the leverage."""
     information, _, _ = blend(whole.turned(sizes.root, sizes.blocks), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
     low = scipy.linalg.cholesky(information, lower=True)
@@ -236,7 +233,7 @@ def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, siz
 
 
 def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Grams) -> CampaignFit:
-    """Last solution with the exact residuals; neighbours that are alike count as fewer readings."""
+    """Solve a last time with the exact residuals; correlated neighbours count as fewer readings."""
     r, typical = problem.readings, problem.sizes.typical
     residual = problem.measured - problem.predicted(typical * x)
     z = residual / problem.sigma + r.a @ x

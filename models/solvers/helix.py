@@ -1,9 +1,9 @@
-"""Ball-bar helix solution with the six linear parameters and the set-up unknowns (Yang and Kim eq (4)-(9); math.md 4.2 to 4.5).
+"""Ball-bar helix solution with the six linear parameters and the set-up unknowns (Yang and Kim eq (4)-(9)).
 
-The paper fits six parameters and takes the mounting as perfect: 10 um of cup offset then fakes about 100 urad (math.md 4.5). The default
-here is the ten-parameter fit: scales EXX.1 EYY.1 EZZ.1 (mm/mm), squareness C0Y B0Z A0Z (rad), cup offset (mm), bar length error (mm). One
-helix cannot separate a common scale from the bar's length: the bar's stated length uncertainty is the prior that closes the gap, and the
-solution says so. All figures of one helix hold about its own sphere only.
+The paper fits six parameters and takes the mounting as perfect; 10 um of cup offset then looks like about 100 urad. The default here is
+the ten-parameter fit: scales EXX.1 EYY.1 EZZ.1 (mm/mm), squareness C0Y B0Z A0Z (rad), cup offset (mm), bar length error (mm). One helix
+cannot separate a common scale from the bar's length; the stated uncertainty of the bar's length is the prior that does. All figures of one
+helix hold only about its own sphere.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ Unknowns = Literal["six", "nine", "ten"]
 LINEAR = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z")
 SETUP = ("offset_x", "offset_y", "offset_z", "bar_length")
 CONDITION_LIMIT = 45.0
-"""Angle law, nine or ten unknowns, 63 to 1000 points: three turns of a full hemisphere have 28 to 32, two turns 58 to 68, one over 1900.
-
-By the area law two turns stay near 30 and no warning comes: only the recipe's demand for three turns stops those."""
+"""Limit of the condition number. By the angle law a full hemisphere (nine or ten unknowns, 63 to 1000 points) has 28 to 32 with three
+turns, 58 to 68 with two, over 1900 with one. By the area law two turns stay near 30, without a warning; only the recipe's minimum of three
+turns excludes them."""
 LOST = ("backlash_X", "backlash_Y", "backlash_Z")
 
 
 @dataclass(frozen=True)
 class HelixSolution:
-    """Estimate, its data, and the rank of the data without priors.
+    """Estimate of a helix fit, with the rank of its readings without priors.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class HelixSolution:
     identifiability : Identifiability
         Of the readings without any prior, columns of unit length.
     unknowns : "six" | "nine" | "ten"
-        What was fitted beside the machine.
+        Six parameters of the machine; cup offset in addition; bar length in addition.
     """
 
     estimate: ParameterEstimate
@@ -48,17 +48,17 @@ class HelixSolution:
 
     @property
     def condition(self) -> float:
-        """Largest over smallest singular value that counts; inf where the readings show nothing."""
+        """Condition number: largest over smallest singular value counted in the rank; inf if the rank is zero."""
         return self.identifiability.condition
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line if the condition exceeds `CONDITION_LIMIT`: small noise then makes large parameters (math.md 4.5, "require N >= 3")."""
+        """One line if the condition number exceeds `CONDITION_LIMIT`, where small noise makes large errors of the parameters."""
         if self.condition <= CONDITION_LIMIT:
             return ()
         return (
-            f"the fit is badly conditioned: {self.condition:.0f}, the limit is {CONDITION_LIMIT:.0f}. Set-up, scales and squareness can "
-            "hardly be distinguished: the path has fewer than 3 turns or too small a part of the hemisphere (math.md 4.5)",
+            f"the fit is badly conditioned: condition number {self.condition:.0f}, the limit is {CONDITION_LIMIT:.0f}. Set-up, scales and "
+            "squareness can hardly be distinguished; measure a helix of 3 or more turns over the whole hemisphere",
         )
 
 
@@ -74,7 +74,7 @@ def linear_field(points_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.float
 
 
 def helix_design(points_mm: F2, centre_mm: F1, unknowns: Unknowns = "ten") -> F2:
-    """Linearised change of the bar length per unit of each unknown, shape (n, 6 | 9 | 10)."""
+    """Linearised change of the bar's reading per unit of each unknown, shape (n, 6 | 9 | 10)."""
     d = points_mm - centre_mm
     n = d / np.linalg.norm(d, axis=1, keepdims=True)
     columns = [np.einsum("ni,nik->nk", n, linear_field(d))]
@@ -95,12 +95,12 @@ def fit_helix(
     unknowns: Unknowns = "ten",
     u_length_mm: float = 0.0015,
 ) -> HelixSolution:
-    """Six scale and squareness parameters from helices about one centre, in the papers' form (no lost motion; `fit_run` has it).
+    """Fit six scale and squareness parameters to helices about one centre, in the paper's form without lost motion (else `fit_run`).
 
     Parameters
     ----------
     points_mm : array, shape (n, 3)
-        Commanded workpiece coordinates (Yang's machine reads Z of its cross slide: z = -z(slide), math.md 4.1).
+        Commanded workpiece coordinates (Yang's machine reads Z of its cross slide: z = -z(slide)).
     deviation_mm : array, shape (n,)
         Bar length minus radius.
     centre_mm, radius_mm : array (3,), float
@@ -137,9 +137,9 @@ def fit_helix(
 def fit_run(run: RunData, *, sigma_mm: float, priors: Priors | None = None) -> HelixSolution:
     """Ten-parameter solution of one ball-bar run with the run's own bar length uncertainty, and lost motion as nuisance.
 
-    Scales and squareness describe the machine ABOUT THIS SPHERE ONLY (local least-squares slopes), not over its volume. A lost motion of
-    X other than that of Y looks like squareness to a helix run in one direction (2 um at 165 mm: about 10 urad of C0Y), so the three lost
-    motions are unknown within their prior; what the smooth part of the machine leaves widens everything (`_demanded_variance`).
+    Scales and squareness describe the machine ABOUT THIS SPHERE ONLY (local least-squares slopes), not over its volume. In a helix run in
+    one direction, different lost motions of X and Y look like squareness (2 um at 165 mm: about 10 urad of C0Y), so the three lost motions
+    are unknowns within their prior. Errors that the model cannot follow widen all uncertainties (`_demanded_variance`).
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def fit_run(run: RunData, *, sigma_mm: float, priors: Priors | None = None) -> H
 
 @dataclass(frozen=True)
 class _HelixTask:
-    """Unknowns of a fit: names, points relative to the nominal cup, bar length, design and prior standard deviations."""
+    """A helix fit: names of the unknowns, points relative to the nominal cup, bar length, design and prior standard deviations."""
 
     names: tuple[str, ...]
     d_mm: F2
@@ -178,10 +178,10 @@ class _HelixTask:
 
 
 def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
-    """Gauss-Newton on the exact bar length; the covariance is then widened by the misfit."""
+    """Fit the exact bar length by Gauss-Newton and widen the covariance by the misfit."""
     if len(deviation_mm) < len(task.names):
-        raise ValueError(f"helix: {len(deviation_mm)} readings cannot carry {len(task.names)} unknowns")
-    linear = task.names == LINEAR  # the paper's fit is linear; a cup offset bends the sphere
+        raise ValueError(f"helix: {len(deviation_mm)} readings are too few for {len(task.names)} unknowns")
+    linear = task.names == LINEAR  # the paper's fit is linear; with a cup offset the reading is not
     theta, y = np.zeros(len(task.names)), deviation_mm
     estimate: ParameterEstimate | None = None
     for _ in range(1 if linear else 4):
@@ -196,12 +196,11 @@ def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
 
 
 def _demanded_variance(estimate: ParameterEstimate) -> float:
-    """Factor on the stated variance that the misfit demands: errors that six linear parameters cannot follow are not white noise.
+    """Factor on the stated variance that the misfit demands, because errors that the linear model cannot follow are not white noise.
 
-    Neighbouring residuals of a real machine are alike, so n readings are worth n (1 - r) / (1 + r), r their correlation at lag one (the
-    integrated autocorrelation was tried and covers less: the fit has taken the slow part out of the residual). A curvature that cup offset
-    and slopes absorb together leaves no residual and is not covered: A0Z and B0Z of a hemisphere about Z are the ones to doubt
-    (tests/models/solvers/test_helix.py has the figures).
+    Neighbouring residuals of a real machine are correlated (r at lag one), so n readings are worth n (1 - r) / (1 + r). The integrated
+    autocorrelation covers less, because the fit has removed the slow part from the residuals. A curvature that cup offset and slopes absorb
+    together leaves no residual and is not covered; on a hemisphere about Z this concerns A0Z and B0Z (tests/models/solvers/test_helix.py).
     """
     left = estimate.residual - estimate.residual.mean()
     power = float(left @ left)
@@ -210,7 +209,7 @@ def _demanded_variance(estimate: ParameterEstimate) -> float:
 
 
 def _exact(task: _HelixTask, theta: F1) -> F1:
-    """Bar length minus radius for given parameters; lost motion, small and of either sign, stays linear."""
+    """Bar reading for given parameters, mm, exact except for the lost motion, which stays linear."""
     offset = theta[6:9] if theta.size > 6 else np.zeros(3)
     length = theta[9] if theta.size > 9 else 0.0
     tip = task.d_mm + linear_field(task.d_mm) @ theta[:6] - offset

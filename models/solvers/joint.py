@@ -1,8 +1,8 @@
 """One joint solution of ball-bar and laser runs: 21 error motions, lost motion, and every set-up error as an unknown.
 
-Published methods solve the data sets one by one and take the set-ups as perfect (math.md 4.5, 5.4). Here cup offsets, bar lengths, mirror
-tilts, laser zeros and drifts are unknowns with documented priors (`abbe.models.solvers.priors`); what the data cannot separate is listed.
-The noise of the instruments and the size of the errors of each class are estimated with them (docs/decisions/0011-sizes-from-the-data.md).
+Published methods solve the data sets one by one and take the set-ups as perfect. Here cup offsets, bar lengths, mirror tilts, laser zeros
+and drifts are unknowns with documented priors (`abbe.models.solvers.priors`), and the solution lists what the data cannot separate. The
+noise of the instruments and the size of each class of errors are estimated as well (docs/decisions/0011-sizes-from-the-data.md).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
 HIGHEST_ORDER = 12
-"""Error motions of this order are still solved for, whatever order the runs support: the ones above as nuisance, held by their prior."""
+"""Error motions up to this order are always solved for; those above the order that the runs support are nuisance, held by their prior."""
 Model = Literal["rigid6", "rigid21", "auto"]
 
 
@@ -46,38 +46,39 @@ class RunFit:
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Error motions of the machine from all runs together. Never changed, so what follows from it is kept with it (`kept`).
+    """Error motions of the machine from all runs together. Immutable, so derived results are cached with it (`kept`).
 
     Attributes
     ----------
     estimate : ParameterEstimate
-        Smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. Its covariance holds the noise as it was
-        estimated and the uncertainty of the estimated sizes.
+        Smooth terms first (in the order of ``terms``), then backlash, then the set-up unknowns. Its covariance includes the estimated noise
+        and the uncertainty of the estimated sizes.
     tool_count : int
-        Number of different tools in the runs; with one tool, what only another tool would show stays hidden (math.md 4.6).
-    data, setup : the runs as they were used; their set-up unknowns.
+        Number of different tools in the runs; with one tool, errors that only another tool would show stay hidden.
+    data, setup : the runs as used, and their set-up unknowns.
     prior_sd : array, shape (p,)
         Prior standard deviation of every unknown of ``estimate``, with the sizes estimated from these data.
     information : array, shape (p, p)
         Information of the readings alone (A^T W A, no prior), in the unknowns' own units.
     identifiability : Identifiability
-        Of the terms up to ``order`` only, by the rule of the whole report (`abbe.models.solvers.observability.rank.stated_knowledge`); its
-        ``involved`` also names lost motion and free set-up unknowns that the readings leave open.
+        Rank analysis of the terms up to ``order``, with the set-up knowledge of the observability report
+        (`abbe.models.solvers.observability.rank.stated_knowledge`); ``involved`` also names lost motion and free set-up unknowns that the
+        readings leave open.
     prior_root : array, shape (p, p)
-        Factor of the prior covariance of the unknowns, root root^T: orders of one motion are alike, so ``prior_sd`` alone is not all of it.
+        Factor of the prior covariance of the unknowns, root root^T; it holds the correlations of a motion's orders, ``prior_sd`` does not.
     weight_per_mm2 : array, shape (n,)
-        Weight of every reading in ``information``, run by run: robust weight over noise variance, alike neighbours counting as fewer.
+        Weight of every reading in ``information``, run by run: robust weight over noise variance, reduced for correlated neighbours.
     order : int
-        Highest Legendre order that held-out runs support (or the caller's). ``terms`` may go higher: the rest is nuisance, so that no
-        interval is too narrow because the basis was cut.
+        Highest Legendre order that held-out runs support (or the caller's). Terms above it are nuisance, so that the truncation of the
+        basis makes no interval too narrow.
     noise_mm, noise_repeats_mm : dict by kind
-        Standard deviation of one raw reading, estimated with the solution and from repeats alone (None: nothing was repeated).
-    outliers : readings that count less, largest first.
+        Standard deviation of one raw reading, estimated with the solution, and from repeats alone (None without repeats).
+    outliers : down-weighted readings, largest first.
     residual_tests : tests of the whitened residuals per run.
     model : "rigid6" or "rigid21"
     order_choice : scores of all orders on held-out runs; None when the caller chose.
     size_factors : dict
-        Per class of unknowns: estimated over documented typical size.
+        Ratio of estimated to documented typical size for each class of unknowns; ``length``: correlation length, strokes.
     """
 
     machine: Machine
@@ -113,7 +114,7 @@ class JointSolution:
         return self.estimate.covariance[:n, :n]
 
     def deviation_mm(self, axes_mm: F2, tool_mm: F1 | None = None) -> F2:
-        """Predicted deviation (without lost motion) at commanded positions, shape (n, 3); ``tool_mm``: another tool than the machine's."""
+        """Predicted deviation without lost motion at commanded positions, shape (n, 3), mm; ``tool_mm`` None: the machine's own tool."""
         return np.asarray(design(with_tool(self.machine, tool_mm), self.terms, axes_mm) @ self.coefficients)
 
     def backlash_mm(self) -> dict[str, tuple[float, float]]:
@@ -126,9 +127,9 @@ T = TypeVar("T")
 
 
 def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatenate[JointSolution, Q], T]:
-    """A function of a solution and of hashable values that is worked out once for each of them, as long as the solution lives.
+    """Cache the results of a function of a solution and hashable values as long as the solution exists.
 
-    What it returns must not hold the solution, which would then live for ever.
+    The results must not refer to the solution, or it would never be freed.
     """
     answers: WeakKeyDictionary[JointSolution, dict[tuple[object, ...], T]] = WeakKeyDictionary()
 
@@ -145,7 +146,7 @@ def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatena
 def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:
     """Set-up unknowns of more than ``limit`` prior standard deviations: (name, number of standard deviations), largest first.
 
-    A bar length that far off means that ball-bar and laser do not measure in the same millimetres.
+    Such a bar length means that ball-bar and laser disagree about the length scale.
     """
     e = solution.estimate
     found = [(n, abs(e.value(n)) / prior_sd[n]) for n in e.names if n in prior_sd and abs(e.value(n)) > limit * prior_sd[n]]
@@ -168,13 +169,13 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     Parameters
     ----------
     order : int, optional
-        Highest Legendre order of the error motions. Default: chosen by held-out runs, with the orders above up to 12 as nuisance. Given: no
-        term above it exists, so stated uncertainties hold for machines of that order only.
+        Highest Legendre order of the error motions. Default: chosen by held-out runs, with higher orders up to 12 as nuisance. If given,
+        there are no terms above it, so the uncertainties hold only for a machine of that order.
     model : "rigid6", "rigid21" or "auto"
-        Three scales and three squareness errors; 21 error motions; or the six where held-out runs do not ask for more.
+        Three scales and three squareness errors; 21 error motions; or the six where held-out runs do not support more.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
-        Standard uncertainty of one raw reading and smallest one of an averaged value, where the estimation of the noise starts. Default:
-        from repeats, and the resolution.
+        Start values of the estimated noise: standard uncertainty of one raw reading, and least one of an averaged value. Default: from
+        repeats, and the resolution.
     progress : callable, optional
         Called with one line of text per stage.
 
@@ -194,7 +195,7 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         return _solution(problem, fit, "rigid6", 1, None)
     choice = choose(fit.parts, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
     if model == "auto" and choice.chosen == RIGID6:
-        report("held-out runs ask for no more than scales and squareness")
+        report("held-out runs support only scales and squareness")
         six = build(machine, _six(), runs, priors or Priors(), noise)
         return _solution(six, settle(six, report), "rigid6", 1, choice)
     chosen = order or max(choice.chosen, 1)
@@ -239,7 +240,7 @@ def _solution(problem: CampaignProblem, fit: CampaignFit, model: str, order: int
 
 
 def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:
-    """The solution as an `ParameterEstimate`; its noise was estimated, so no factor is left to widen it by."""
+    """The fit as a `ParameterEstimate`; its variance factor is 1, because the noise itself is estimated."""
     effective = float(len(problem.names) - np.trace(fit.posterior.cov))
     noise = np.exp(0.5 * fit.components.eta)[problem.readings.kind] * problem.sigma
     chi2 = float(fit.weight @ (fit.residual_mm / noise) ** 2)
@@ -249,9 +250,9 @@ def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:
 
 
 def _rank(problem: CampaignProblem, order: int) -> Identifiability:
-    """Rank analysis of the terms up to ``order``, by the rule of the report: lost motion and unstated set-up unknowns are free.
+    """Rank analysis of the terms up to ``order``, with lost motion and unstated set-up unknowns free; higher orders are left out.
 
-    The orders above are held by their prior. Combinations are in units of typical sizes.
+    The weights of hidden combinations are in units of typical sizes.
     """
     inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
     terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)

@@ -1,8 +1,7 @@
-"""Weighted linear least squares with an explicit prior, full covariance, and what the data determine.
+"""Weighted linear least squares with an explicit prior, full covariance, and an analysis of what the data determine.
 
-The prior is part of the statement, never hidden: `ParameterEstimate.data_share` states for every parameter the share of its information
-that comes from the data. Parameters that only the prior determines are named with the hidden combinations: rank with a stated tolerance,
-and the null space in words (`Identifiability`).
+`ParameterEstimate.data_share` gives for every parameter the fraction of its information that comes from the data. `Identifiability` gives
+the rank, and names the combinations of parameters that only the prior determines.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from abbe.models.arrays import F1, F2
 RANK_TOLERANCE = 1e-9
 EFFECTIVE_TOLERANCE = 1e-3
 HIDDEN = 1e-6
-"""A parameter takes part in what is hidden if its unit column has this component in the null space."""
+"""A parameter takes part in a hidden combination if its component in the null space (unit columns) exceeds this."""
 LEAST_SHARE = 1e-3
-"""Words name members of a combination from this share of its largest on."""
+"""Texts name a member of a combination only if its weight is above this fraction of the largest."""
 
 
 def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
     """Singular value decomposition a = u @ diag(s) @ vt.
 
-    Divide and conquer (gesdd) is several times faster and fails on some matrices of exactly dependent columns, whose rounding decides; then
-    QR iteration (gesvd) does it, whose convergence does not depend on rounding.
+    Divide and conquer (gesdd) is several times faster, but fails on some matrices with exactly dependent columns; those are left to QR
+    iteration (gesvd).
 
     Raises
     ------
@@ -63,7 +62,7 @@ class ParameterEstimate:
     chi2, dof : float
         Sum of squared whitened residuals; observations minus effective number of parameters.
     variance_factor : float
-        max(1, chi2 / dof): a fit worse than the stated noise widens every uncertainty, a better one does not shrink it.
+        max(1, chi2 / dof): residuals above the stated noise widen every uncertainty; smaller residuals do not reduce it.
     data_share : array, shape (p,)
         1 - posterior variance / prior variance (before scaling), between 0 (prior only) and 1 (data only).
     """
@@ -88,7 +87,7 @@ class ParameterEstimate:
 
 
 def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> ParameterEstimate:
-    """Most probable parameters of ``y = a @ theta + noise`` with independent zero-mean normal priors.
+    """Find the most probable parameters of ``y = a @ theta + noise`` with independent zero-mean normal priors.
 
     Parameters
     ----------
@@ -148,8 +147,8 @@ def _column_scale(a: F2) -> F1:
 class Combination:
     """A direction of parameter space that leaves no trace in the observations.
 
-    ``weights``: name and component of each parameter in the direction, in units of the parameter's typical size, largest first. Small ones
-    belong to it: without them the direction would leave a trace. ``text``: a sentence about the members above `LEAST_SHARE`.
+    ``weights``: name and component of each parameter, in units of its typical size, largest first. Small components are included, because
+    without them the direction would leave a trace. ``text``: a sentence about the members above `LEAST_SHARE`.
     """
 
     weights: tuple[tuple[str, float], ...]
@@ -168,13 +167,13 @@ class Identifiability:
     Attributes
     ----------
     n_parameters, rank, effective_rank : int
-        Singular values above 1e-9 and 1e-3 of the largest (math.md 4.6).
+        Number of parameters; number of singular values above 1e-9 and above 1e-3 of the largest.
     condition : float
         Largest over smallest singular value counted in ``rank``.
     hidden : tuple of Combination
-        The null space (beyond ``rank``) as sparse combinations.
+        The null space as sparse combinations.
     involved : frozenset of str
-        Parameters that take part in the null space at all (`taking_part`): none of them has a value of its own.
+        Parameters that take part in the null space (`taking_part`); the data alone give none of them a value.
     """
 
     n_parameters: int
@@ -214,7 +213,7 @@ def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, toleran
     a : array, shape (n, p)
         Whitened design, set-up unknowns projected out.
     typical : array, shape (p,), optional
-        Typical size of each parameter; default: unit-norm columns (the convention of math.md 4.4 to 4.6).
+        Typical size of each parameter; default: columns scaled to unit length.
     """
     norm = np.linalg.norm(a, axis=0)
     nonzero = norm > tolerance * (norm.max() if norm.size else 1.0)
@@ -230,7 +229,7 @@ def analyse(names: tuple[str, ...], a: F2, typical: F1 | None = None, *, toleran
 
 
 def sparse_rows(null: F2) -> F2:
-    """A basis of the same space with as many zeros as elimination gives: reduced row echelon form by largest pivot."""
+    """A sparse basis of the row space: reduced row echelon form with the largest pivot first."""
     m = np.array(null, dtype=np.float64)
     row = 0
     free = np.ones(m.shape[1], dtype=bool)

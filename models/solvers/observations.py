@@ -13,12 +13,12 @@ Kind = Literal["bar", "laser"]
 Test = Literal["", "helix", "circle", "diagonal", "linear"]
 
 REJECT_SIGMA = 5.0
-"""A reading farther from the middle of its block than this many robust standard deviations is not part of the block's mean."""
+"""A reading farther from its block's median than this many robust standard deviations is left out of the block's mean."""
 LEAST_SPREAD_MM = 1e-4
-"""Resolution of a usual ball-bar: readings that differ by rounding alone are not outliers of each other."""
+"""Resolution of a usual ball-bar: the least robust standard deviation, so that rounding makes no outliers."""
 
 LEAST_BAR_MM = 1.0
-"""No ball-bar is shorter; nearer to the cup than this a position is a mistake, and the direction of the bar means nothing."""
+"""No ball-bar is shorter; a position nearer to the cup is a mistake."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,18 @@ class RunData:
         Campaign clock.
     weight_n : array, shape (n,)
         Number of raw readings in each mean.
-    centre_mm, radius_mm : bar set-up. beam : laser set-up, nominal unit vector.
+    centre_mm, radius_mm : array (3,), float, for a ball-bar
+        Nominal cup centre and bar length.
+    beam : array, shape (3,), for a laser
+        Unit vector of the nominal beam.
     u_length_mm : float, optional
         Stated standard uncertainty of the bar's calibrated length.
     length_calibrated : bool, optional
         Whether the bar's length was calibrated at all; None: the run does not say (`abbe.models.solvers.priors.bar_length_sd`).
     tool_mm : array, shape (3,), optional
-        Spindle reference to functional point in this run; None: the machine's own.
+        Vector from the spindle reference to the functional point in this run; None: the machine's own tool.
     test : "helix" | "circle" | "diagonal" | "linear" | ""
-        Test, for people and for comparing runs; the reading depends on ``kind`` and the positions only.
+        Kind of test, for display and to compare runs; the reading depends only on ``kind`` and the positions.
     rejected : int
         Number of raw readings that `block_average` left out.
     """
@@ -84,7 +87,7 @@ class RunData:
 
 
 def _check_columns(run: RunData) -> None:
-    """Every column as long as the readings, and nothing in it that is not a number."""
+    """Check that every column is finite and as long as the readings."""
     n = run.deviation_mm.size
     shapes = {"deviation_mm": (n,), "axes_mm": (n, 3), "sign": (n, 3), "t_s": (n,), "weight_n": (n,)}
     if n == 0:
@@ -101,7 +104,7 @@ def _check_columns(run: RunData) -> None:
 
 
 def _check_bar(run: RunData) -> None:
-    """A cup somewhere, a bar of some length, and no reading where the bar would have none."""
+    """Check cup and bar length, and that no position lies at the cup's centre."""
     if run.centre_mm is None or run.radius_mm is None:
         raise ValueError(f"run {run.label}: a ball-bar run needs centre_mm and radius_mm")
     if run.centre_mm.shape != (3,) or not np.isfinite(run.centre_mm).all():
@@ -119,17 +122,16 @@ def _check_beam(run: RunData) -> None:
 
 
 def block_average(run: RunData, blocks: int) -> RunData:
-    """The run with about ``blocks`` values, each the mean of up to ceil(n / blocks) consecutive readings moving in one direction.
+    """Average the run to about ``blocks`` values, each the mean of up to ceil(n / blocks) consecutive readings moving in one direction.
 
-    Blocks never span a reversal, because lost motion would be averaged away there: every reversal may add one value to ``blocks``. What is
-    averaged is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside it. A
-    run of at most ``blocks`` readings is returned as it is.
+    Blocks never span a reversal, where averaging would hide lost motion; every reversal may add one value to ``blocks``. The mean is taken
+    of the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside it. A run of at
+    most ``blocks`` readings is returned unchanged.
 
-    Single outliers are left out of the mean. A reading is left out that lies farther from the median of its block than `REJECT_SIGMA` times
-    the largest of three: the noise of the whole run (second differences), the block's own spread (median of the distances from its median,
-    as a standard deviation), so that what moves steadily through a block stays, and `LEAST_SPREAD_MM`. ``rejected`` counts what was left
-    out and ``weight_n`` what was averaged.
-    A block of one or two readings cannot tell which is wrong: nothing is left out there.
+    The mean leaves out a reading that is farther from its block's median than `REJECT_SIGMA` times the largest of three standard
+    deviations: the noise of the whole run (second differences), the block's own spread (median absolute deviation), so that a steady change
+    within a block stays, and `LEAST_SPREAD_MM`. ``rejected`` counts the readings left out, ``weight_n`` those averaged. A block of one or
+    two readings loses none, because it does not show which one is wrong.
     """
     n = run.deviation_mm.size
     size = max(1, int(np.ceil(n / blocks)))
@@ -168,7 +170,7 @@ def reading_noise_mm(values_mm: F1) -> float:
 
 
 def _belongs(values_mm: F1, key: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which readings belong to their block; ``key`` counts the blocks and does not fall."""
+    """Which readings are no outliers of their block; ``key``: block number of each reading, never decreasing."""
     away = np.abs(values_mm - _block_median(values_mm, key)[key])
     spread = np.maximum(1.4826 * _block_median(away, key), max(reading_noise_mm(values_mm), LEAST_SPREAD_MM))
     return np.asarray(away <= REJECT_SIGMA * spread[key])
@@ -183,7 +185,7 @@ def _block_median(values: F1, key: np.ndarray[tuple[int, ...], np.dtype[np.intp]
 
 
 def nominal_reading(run: RunData) -> F1:
-    """Reading of a perfect machine with a perfect set-up: the sagitta of a polyline path for the ball-bar, zero for the laser."""
+    """Reading (mm) of a perfect machine and set-up: for the ball-bar, distance to the cup minus radius; for the laser, zero."""
     if run.centre_mm is None or run.radius_mm is None:
         return np.zeros(run.deviation_mm.size)
     return np.asarray(np.linalg.norm(run.axes_mm - run.centre_mm, axis=1) - run.radius_mm)

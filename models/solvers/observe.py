@@ -1,23 +1,24 @@
 """Exact readings of a run from machine and set-up, and their derivatives (docs/explanation/conventions.md, "Readings").
 
-Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns. The readings are those of math.md 4.2
-and 5.4 without any linearisation: finite rotations in the chain, the length of the bar as a length, the mirror as a tilted plane that a
-misaligned beam meets. A helix, a circle in any plane and a partial arc are one and the same reading of a ball-bar; step diagonal, plain
-diagonal and single-axis line one of a laser: only the commanded positions differ.
+Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns. Nothing is linearised: rotations are
+finite, the bar's reading is a length, the mirror a tilted plane that a misaligned beam meets. Helix, circle in any plane and partial arc
+are the same ball-bar reading; step diagonal, plain diagonal and single-axis line are the same laser reading. Only the commanded positions
+differ.
 
-Published methods take the set-ups as perfect (math.md 4.5, 5.4). Here each is an unknown with a documented prior
+Published methods (Yang and Kim; Wang) take the set-ups as perfect. Here each set-up error is an unknown with a documented prior
 (`abbe.models.solvers.priors`):
 
-- ``cup_<setup>_x/y/z``, mm: position of the cup minus the actual position of the machine when the spindle set the cup down: the error of
-  the mounting only.
-- ``bar_length_<radius>``, mm: excess of the reading (docs/explanation/conventions.md), so the bar is SHORTER than stated by this much;
-  one per nominal radius, because one bar serves all runs of its length. Radii that are the same to 0.01 mm are one bar (`bar_length_name`).
-- ``bar_drift_<setup>_x/y/z``, mm/s: slow growth of the tool against the cup since the set-up's first reading.
+- ``cup_<setup>_x/y/z``, mm: position of the cup minus the machine's actual position when the spindle set it down, so the error of the
+  mounting alone.
+- ``bar_length_<radius>``, mm: excess of the reading, so the bar is SHORTER than stated by this much. Runs whose nominal radius agrees to
+  0.01 mm use one bar (`bar_length_name`).
+- ``bar_drift_<setup>_x/y/z``, mm/s: slow drift of the tool against the cup since the set-up's first reading.
 - ``tilt_<setup>_1/2``, rad: tilt of the mirror's normal towards the two directions of `perpendicular`.
-- ``cosine_<setup>``: 1 / (m.l) - 1 of mirror m and beam l. The direction of the beam enters by this one number only, of second order in
-  the angles (math.md 5.4), so it is the unknown and not the angles, whose derivative is zero at zero.
+- ``cosine_<setup>``: 1 / (m.l) - 1 of mirror m and beam l. The direction of the beam enters only through this number. It is of second order
+  in the angles, so the angles themselves, with zero derivative at zero, cannot be the unknowns.
 - ``laser_scale``: relative error of the laser's wavelength, common to all laser runs of the campaign.
-- ``zero_<run>``, mm, and ``drift_<run>``, mm/s: error of a laser run's first record, which is its zero; slow drift."""
+- ``zero_<run>``, mm, and ``drift_<run>``, mm/s: error of a laser run's first record, which sets its zero; slow drift of the run.
+"""
 
 from __future__ import annotations
 
@@ -34,23 +35,23 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors, bar_length_sd
 
 LEAST_DRIFT_MM = 2e-5
-"""A drift that cannot reach this (0.02 um) while a set-up stands is not worth three unknowns."""
+"""A set-up in which the typical drift stays below this (0.02 um) has no drift unknowns."""
 SAME_PLACE_MM = 1e-3
 SAME_BEAM = 1e-4
-"""Two beams of one set-up may differ by this much (components of unit vectors): rounding, not another beam."""
+"""Beams of one set-up may differ by this much (components of unit vectors), as rounding."""
 
 STRAIGHT_MM = 0.01
-"""A path that stays this near its own best line is a straight one: commanded positions are rounded to 1 um and less, and a mirror tilted
-by 0.5 mrad makes 5 nm of it. Steps of a step diagonal are millimetres."""
+"""A path within this distance of its best line counts as straight. Commanded positions are rounded to 1 um or less, and a mirror tilted by
+0.5 mrad turns 0.01 mm into 5 nm; the steps of a step diagonal are millimetres."""
 NEAR_BEAM = 1e-3
-"""A nominal beam may differ from a straight path by this much (components of unit vectors): it was written down with three digits or
-more. What a tilted mirror makes of it is a scale of the run and counts in its cosine error."""
+"""A nominal beam may differ from a straight path by this much (components of unit vectors), because it is stated with few digits. With a
+tilted mirror this acts as a scale of the run and counts in its cosine error."""
 BAR_DIGITS = 2
 
 
 @dataclass(frozen=True)
 class SetupUnknowns:
-    """Names and prior standard deviations of the set-up unknowns of a campaign; when each ball-bar set-up was first read, s."""
+    """Names and prior standard deviations of a campaign's set-up unknowns; ``start_s``: first reading of each ball-bar set-up."""
 
     names: tuple[str, ...]
     prior_sd: F1
@@ -71,7 +72,7 @@ def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine |
     Raises
     ------
     ValueError
-        Two runs of one set-up with different cups, beams, tools or instruments: something was re-mounted, which is another set-up.
+        Two runs of one set-up have different cups, beams, tools or instruments; a new mounting must be another set-up.
     """
     _check_setups(runs, None if machine is None else machine.tool_mm)
     spans = _bar_spans(runs)
@@ -95,7 +96,7 @@ def _bar_unknowns(run: RunData, known: Mapping[str, float], priors: Priors, span
 
 
 def _laser_unknowns(run: RunData, priors: Priors) -> dict[str, float]:
-    """Tilts where they show; along a straight path the mirror's tilt times what the beam is off the path is one more cosine error."""
+    """Unknowns of a laser run; on a straight path the tilts only add to the cosine error, by tilt times angle between beam and path."""
     out = {f"tilt_{run.setup}_{k}": priors.tilt_rad for k in "12"} if _bent(run) else {}
     away = 0.0 if out else _off_path(run)
     out[f"cosine_{run.setup}"] = float(np.hypot(priors.cosine, priors.tilt_rad * away))
@@ -115,7 +116,7 @@ def _bar_spans(runs: tuple[RunData, ...]) -> dict[str, tuple[float, float]]:
 
 
 def _check_setups(runs: tuple[RunData, ...], tool_mm: F1 | None) -> None:
-    """Refuse what cannot be one mounting; ``tool_mm``: of a run that states none."""
+    """Refuse runs of one set-up that cannot share a mounting; ``tool_mm``: tool of runs that state none."""
     firsts: dict[str, RunData] = {}
     for given in runs:
         run = given if given.tool_mm is not None else replace(given, tool_mm=tool_mm)
@@ -132,35 +133,34 @@ def _check_setups(runs: tuple[RunData, ...], tool_mm: F1 | None) -> None:
             what = "tool"
         else:
             continue
-        raise ValueError(f"run {run.label}: set-up {run.setup} has another {what} than in run {first.label}; re-mounted is a new set-up")
+        raise ValueError(f"run {run.label}: set-up {run.setup} has another {what} than in run {first.label}; give it its own set-up name")
 
 
 def _same_tool(a: F1 | None, b: F1 | None) -> bool:
-    """Whether two runs use one tool: with another, the same axis positions meet another cup, and the mirror was taken off in between."""
+    """Whether two runs can use the same tool; with another one, cup or mirror must have been mounted anew."""
     return a is None or b is None or float(np.abs(a - b).max()) <= SAME_PLACE_MM
 
 
 def _bent(run: RunData) -> bool:
-    """Whether a tilted mirror shows: the path is not a straight one, or one that the beam is not meant to follow.
+    """Whether the tilts of the mirror are unknowns of their own: the path is not straight, or not along the beam.
 
-    Judged by the path and not by the beam: one with six digits leaves any diagonal by a micrometre, and a tilt that reads as a scale of
-    the run would hide that scale.
+    A beam that leaves a straight path only by rounding does not count: its tilt would act as a scale of the run and hide that scale.
     """
     return straight_line_of(run.axes_mm) is None or _off_path(run) > NEAR_BEAM
 
 
 def _off_path(run: RunData) -> float:
-    """Sine of the angle between a straight path and the beam; 0 of a run that stands still."""
+    """Sine of the angle between a straight path and the beam; 0 for another path or one that stands still."""
     assert run.beam is not None
     line = straight_line_of(run.axes_mm)
     return 0.0 if line is None or not line[1].any() else float(np.linalg.norm(np.cross(line[1], run.beam)))
 
 
 def straight_line_of(axes_mm: F2) -> tuple[F1, F1] | None:
-    """Middle and unit vector of the line that positions (n, 3) lie on within `STRAIGHT_MM`, else None.
+    """Midpoint and unit vector of the line on which positions (n, 3), mm, lie within `STRAIGHT_MM`; None if they do not.
 
-    The vector points from the first position to the one farthest from it; zeros if the path stands still. Axes that move by less than the
-    same limit do not move: their component is exactly zero.
+    The vector points from the first position towards the farthest from it; it is zero if the path stands still. The component of an axis
+    that moves by less than `STRAIGHT_MM` is exactly zero.
     """
     middle = axes_mm.mean(axis=0)
     d = axes_mm - middle
@@ -176,9 +176,9 @@ def straight_line_of(axes_mm: F2) -> tuple[F1, F1] | None:
 
 
 def bar_length_name(radius_mm: float) -> str:
-    """Name of the unknown length of a bar: by its nominal radius rounded to 0.01 mm.
+    """Name of the unknown length of a bar, from its nominal radius rounded to 0.01 mm.
 
-    The stored radius of one bar differs from run to run by its calibrated length and by rounding, two bars by millimetres.
+    The stored radius of one bar varies from run to run by calibration and rounding; two bars differ by millimetres.
     """
     return f"bar_length_{round(radius_mm, BAR_DIGITS):.10g}"
 
@@ -192,17 +192,17 @@ def perpendicular(beam: F1) -> F2:
 
 
 LOST = 3
-"""Lost motion of X, Y, Z follows the smooth terms in the vector of unknowns."""
+"""Number of lost motions (X, Y, Z), which follow the smooth terms in the vector of unknowns."""
 
 
 @dataclass(frozen=True)
 class AxisPlaces:
-    """Commanded positions of one machine and tool, with all values that depend on no unknown.
+    """Commanded positions of one machine and tool, with the values of the terms' functions there.
 
     Attributes
     ----------
     machine : Machine
-        With the tool that is in use.
+        With the tool in use.
     axes_mm : array, shape (n, 3)
     sign : array, shape (n, 3)
         Direction in which each axis last moved; zeros: lost motion left out.
@@ -224,7 +224,7 @@ class AxisPlaces:
         return cls(machine, axes_mm, sign, term_values(terms, axes_mm, machine.stroke_mm), layout_of(terms).motion)
 
     def motions(self, theta: F1) -> F3:
-        """Error motions, squareness and lost motion included, shape (n, 3 axes, 6), for unknowns that begin with terms and lost motion."""
+        """Error motions with squareness and lost motion, shape (n, 3 axes, 6), mm and rad; ``theta`` begins with terms and lost motion."""
         terms = self.values.shape[1]
         pick = np.zeros((terms, 18))
         pick[np.arange(terms), self.column] = theta[:terms]
@@ -240,7 +240,7 @@ class AxisPlaces:
         return exact_deviation_mm(self.machine, self.axes_mm, motions)
 
     def slope(self, motions: F3) -> F4:
-        """Derivative of the exact deviation with respect to the error motions, shape (n, 3, 3 axes, 6); rule G where there are none."""
+        """Derivative of the exact deviation with respect to the error motions, shape (n, 3, 3 axes, 6)."""
         if not motions.any():
             return motion_jacobian(self.machine, self.axes_mm)
         return exact_jacobian(self.machine, self.axes_mm, motions)
@@ -274,7 +274,7 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
     run : RunData
         Commanded positions; its readings are not used.
     setup : SetupUnknowns
-        Set-up unknowns of the campaign (`setup_unknowns`); one that has no name there is taken as zero.
+        Set-up unknowns of the campaign (`setup_unknowns`); an unknown that it does not name is zero.
     theta : array, shape (terms + 3 + set-up,)
         Coefficients (mm, rad), lost motion (mm), set-up unknowns.
     """
@@ -299,7 +299,7 @@ def linearise(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Se
 
 @dataclass(frozen=True)
 class _SetupValues:
-    """Set-up part of the unknowns by name; what is not an unknown of this campaign is zero and has no column."""
+    """Set-up part of the unknowns by name; a name that is not an unknown of this campaign is zero and has no column."""
 
     at: dict[str, int]
     values: F1
@@ -309,7 +309,7 @@ class _SetupValues:
         return np.array([self.values[self.at[n]] if n in self.at else 0.0 for n in names])
 
     def columns(self, parts: dict[str, F1], n: int) -> F2:
-        """Derivatives by name, put where the unknowns stand, shape (n, set-up)."""
+        """Put derivatives by name into the columns of their unknowns, shape (n, set-up)."""
         out = np.zeros((n, self.values.size))
         for name, column in parts.items():
             if name in self.at:
@@ -333,10 +333,10 @@ def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnk
 
 @dataclass(frozen=True)
 class _Bar:
-    """|p - c + D(p) - D(c) - offset + drift t| - R + length error: nominal bar R, nominal cup c, D the machine's deviation.
+    """Ball-bar reading |p - c + D(p) - D(c) - offset + drift t| - R + length error: nominal bar R, nominal cup c, deviation D.
 
-    The spindle puts the cup down, so the cup carries the machine's deviation D(c) there, with the tool of the set-up; from which side the
-    axes came then is not known and belongs to the mounting offset.
+    The spindle sets the cup down, so the cup carries the machine's deviation D(c), with the tool of the set-up. The side from which the
+    axes came is unknown and belongs to the mounting offset.
     """
 
     run: RunData
@@ -379,7 +379,7 @@ class _Bar:
 
 @dataclass(frozen=True)
 class _Laser:
-    """(1 + scale) m.(P - P0) / (m.l) - nominal + zero + drift t: P where the mirror really is (P0 at the first record), l the beam.
+    """Laser reading (1 + scale) m.(P - P0) / (m.l) - nominal + zero + drift t: P actual mirror position, P0 the first, l the beam.
 
     Normal of the mirror m = n + t1 e1 + t2 e2 with the nominal beam n and tilts as tangents, so that m.n = 1 and 1 / (m.l) = 1 + cosine.
     """
@@ -401,7 +401,7 @@ class _Laser:
         return self.known.get(*tilt) @ across, across, 1.0 + self.known.get("laser_scale", cosine)
 
     def _moved(self) -> tuple[F2, F2]:
-        """Nominal displacement and what the machine adds to it since the first record, shape (n, 3) each, mm."""
+        """Nominal displacement since the first record and the change of the machine's deviation, shape (n, 3) each, mm."""
         deviation = self.places.deviation_mm(self.motions)
         return self.run.axes_mm - self.run.axes_mm[0], deviation - deviation[0]
 
@@ -412,7 +412,7 @@ class _Laser:
         _, _, zero, drift = self._names()
         values = self.known.get(zero, drift)
         factor = factors.prod()
-        apparent_mm = nominal @ lean + added @ (self.run.beam + lean)  # apart, so that no digits of the metre are lost
+        apparent_mm = nominal @ lean + added @ (self.run.beam + lean)  # without the nominal metre, to keep all digits
         return np.asarray((factor - 1.0) * (nominal @ self.run.beam) + factor * apparent_mm + values[0] + values[1] * self._since_s())
 
     def jacobian(self) -> F2:

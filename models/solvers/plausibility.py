@@ -1,9 +1,8 @@
 """Runs of a campaign that contradict the others: wrong unit, wrong sign, swapped axes, another machine.
 
 All runs form one linear model with wide priors. For every run and every possible mistake, the evidence of the whole campaign is computed
-with that mistake undone, and with that run unrelated to the others. The best hypothesis counts only if it is better by `STRONG`.
-Source: marginal likelihood of a linear model with normal priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong", the limit here
-is far above it).
+with this mistake corrected, and with this run unrelated to the others. The best hypothesis counts only if its log evidence is higher by
+`STRONG`. Source: marginal likelihood of a linear model with normal priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong").
 """
 
 from __future__ import annotations
@@ -24,12 +23,15 @@ from abbe.models.solvers.priors import Priors, term_prior_sd
 
 SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
 OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
-"""A reading that the rest of its run misses by this many standard deviations does not count here; at most this share of a run."""
+"""A reading this many standard deviations from the prediction of the rest of its run is left out; at most this fraction of a run."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One run without its outliers: design in units of the prior and readings, both over the noise; what the units add to the evidence."""
+    """One run without its outliers: whitened design, in units of the prior, and readings.
+
+    ``log_sigma``: log of the scaling of the readings, subtracted from the log evidence.
+    """
 
     a: F2
     y: F1
@@ -43,7 +45,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Posterior from some parts: Cholesky factor of the information with the prior, and log evidence."""
+    """Posterior from some runs: Cholesky factor of the information with the prior, unknowns, and log evidence."""
 
     factor: F2
     theta: F1
@@ -63,7 +65,7 @@ def together(parts: Sequence[Part]) -> Posterior:
 
 
 def conditional(others: Posterior, variants: dict[str, Part]) -> dict[str, float]:
-    """Log evidence of each variant of a run given the other runs; variants with one design share its factorisation."""
+    """Log evidence of each variant of a run given the other runs."""
     out: dict[str, float] = {}
     known: list[tuple[F2, F2, F2]] = []
     for name, part in variants.items():
@@ -78,9 +80,9 @@ def conditional(others: Posterior, variants: dict[str, Part]) -> dict[str, float
 
 
 def scatter(a: F2, y: F1) -> tuple[float, NDArray[np.bool_]]:
-    """Noise that the model leaves in one run, mm, and which of its readings are outliers, bool, shape (n,).
+    """Most probable noise of one run, mm, and which of its readings are outliers, bool, shape (n,).
 
-    The noise is the most probable of `SIGMA_GRID_MM`; each reading is compared with what all others of the run predict.
+    The noise is one of `SIGMA_GRID_MM`; each reading is compared with the prediction of all others of the run.
     """
     drop = np.zeros(y.size, dtype=bool)
     while True:
@@ -118,23 +120,23 @@ WIDE = Priors(
     tilt_rad=1e-3,
     zero_mm=0.1,
 )
-"""Wider than those of the solution: a bad machine or a clumsy set-up is no reason to suspect a file."""
+"""Priors wider than the solution's: a bad machine or set-up is no reason to suspect a run."""
 ORDER = 10
 BLOCKS = 120
 STRONG, NAMED = 25.0, 5.0
-"""Smallest gain of natural log evidence for a run to be suspected, and for a named cause to be preferred to none."""
+"""Least gain of natural log evidence: to suspect a run; to prefer a named cause to "other"."""
 FACTORS = {"um": 1e-3, "inch": 25.4, "sign": -1.0, "mm_as_um": 1e3, "mm_as_inch": 1.0 / 25.4}
 """Factors that correct deviations written in another unit or with the other sign."""
 SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}
 ON_SPHERE_MM = 1.5
 GROSS, GROSS_MM = 4.0, 2e-3
-"""A run that fits with no mistake undone is named if it misses the others' prediction by this multiple of the expected rms, and by this."""
+"""A run with cause "other" is reported only if its misfit exceeds both this multiple of the expected rms and this length."""
 SURE_SIGMA = 5.0
-"""A reading that all other readings of the campaign miss by this many standard deviations is an outlier, not a sign of a bad run."""
+"""A reading this many standard deviations from the prediction of all others of the campaign is an outlier, not a sign of a bad run."""
 OUTLIER_MM = 0.1
 """Width of the range in which an outlier may lie."""
 LARGE_MM = 0.3
-"""Only readings below this can be a machine's; among larger ones outliers are not looked for."""
+"""Outliers are searched only in runs whose readings are all below this; larger deviations are no machine's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,11 +147,11 @@ class SuspectRun:
     ----------
     run : str
     cause : str
-        Key of `FACTORS` or `SWAPS`: with that mistake corrected the run fits. "other": no correction makes it fit.
+        Key of `FACTORS` or `SWAPS`: the run fits after this mistake is corrected. "other": no correction makes it fit.
     gain : float
-        By how much the log evidence of the campaign grows.
+        By how much the log evidence of the campaign grows with this hypothesis.
     misfit_mm, expected_mm : float
-        Rms by which the other runs' prediction misses the run (its own set-up refitted), and what it should be.
+        Rms difference between the run and the prediction of the other runs (its own set-up refitted), and its expected value.
     tied : tuple of str
         Other runs that explain the contradiction equally well: of two runs, either may be wrong.
     """
@@ -166,7 +168,7 @@ class SuspectRun:
 class _Run:
     """A run as it is and with each possible mistake undone.
 
-    ``first_setup``: where the unknowns of the set-ups begin; ``cleaned``: outliers were taken out of it against the other runs.
+    ``first_setup``: index of the first set-up unknown; ``cleaned``: outliers against the other runs are already removed.
     """
 
     label: str
@@ -179,7 +181,7 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Model:
-    """What all runs share: unknowns in units of their prior."""
+    """Model of all runs, with unknowns in units of their prior standard deviation (``scale``)."""
 
     machine: Machine
     terms: tuple[Term, ...]
@@ -191,12 +193,12 @@ class _Model:
 
 
 def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG) -> tuple[SuspectRun, ...]:
-    """Runs that contradict the others, worst first; each is set aside before the next is looked for.
+    """Find runs that contradict the others, worst first; each is set aside before the search for the next.
 
     Parameters
     ----------
     runs : sequence of RunData
-        A single run contradicts none.
+        With fewer than two, the result is empty.
     limit : float
         Least gain of log evidence.
     """
@@ -218,7 +220,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
 
 
 def _cleaned(run: _Run, others: Posterior) -> _Run | None:
-    """The run without readings that the other runs show to be outliers; None: there are none."""
+    """The run without readings that the other runs show to be outliers; None if there are none or too many."""
     part = run.as_is
     spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)
@@ -237,12 +239,12 @@ def _cleaned(run: _Run, others: Posterior) -> _Run | None:
 
 
 def _without(undone: dict[str, Part], drop: NDArray[np.bool_]) -> dict[str, Part]:
-    """The same readings left out of every variant that has them all."""
+    """Leave the same readings out of every variant that still has all readings."""
     return {n: Part(p.a[~drop], p.y[~drop], p.log_sigma) if p.y.size == drop.size else p for n, p in undone.items()}
 
 
 def _prepared(machine: Machine, runs: Sequence[RunData]) -> list[_Run]:
-    """Every run over the noise that is usual for its instrument in this campaign, without its outliers."""
+    """Every run without its outliers, whitened by the median noise of its instrument in this campaign."""
     model = _model(machine, runs)
     designs = [model.design(r) for r in runs]
     found = [scatter(a, _readings(r)) for a, r in zip(designs, runs, strict=True)]
@@ -271,13 +273,13 @@ def _shortened(run: RunData) -> RunData:
 
 
 def _readings(run: RunData, factor: float = 1.0) -> F1:
-    """Readings less the nominal ones, after the deviations were multiplied: the nominal reading is never in another unit."""
+    """Readings minus nominal ones, with the deviations multiplied first; a wrong unit does not affect the nominal reading."""
     short = _shortened(replace(run, deviation_mm=factor * run.deviation_mm))
     return np.asarray(short.deviation_mm - nominal_reading(short))
 
 
 def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1.0) -> Part:
-    """A run over its noise. Readings that were multiplied answer for it in their density; an outlier may lie anywhere (`OUTLIER_MM`)."""
+    """A whitened run; ``log_sigma`` accounts for the factor on the readings and spreads outliers evenly over `OUTLIER_MM`."""
     if np.abs(y).max() < LARGE_MM and abs(factor) != 1.0:
         drop = scatter(a, y)[1]
     log_sigma = float(np.log(np.where(drop, OUTLIER_MM, sigma)).sum() - y.size * np.log(abs(factor)))
@@ -306,7 +308,7 @@ def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
 
 
 def _swapped(run: RunData) -> dict[str, RunData]:
-    """The run with two axes exchanged, wherever it would still lie on its sphere (elsewhere geometry alone tells)."""
+    """Variants of a ball-bar run with two axes exchanged whose positions still lie on the sphere; others are impossible anyway."""
     if run.centre_mm is None or run.radius_mm is None:
         return {}
     out = {}
@@ -321,7 +323,7 @@ def _swapped(run: RunData) -> dict[str, RunData]:
 
 
 def _misfit(others: Posterior, run: _Run) -> tuple[float, float]:
-    """Rms of what the others' prediction leaves once the run's own set-up is refitted, and its expected rms, mm."""
+    """Rms difference between a run, its own set-up refitted, and the prediction of the others, and its expected rms, mm."""
     part, first = run.as_is, run.first_setup
     r = part.y - part.a[:, :first] @ others.theta[:first]
     own = part.a[:, first:]

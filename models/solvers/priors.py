@@ -1,7 +1,8 @@
 """Typical sizes of error motions and set-up errors: the documented priors.
 
-They are wide (a first machine is expected well inside them) and only decide what the data leave open: `Estimate.data_share` tells.
-Sources: effects.md 2 (typical magnitudes of geometry), published machine data (Yang Table 2: 100 urad scales; Pahk: up to 110 urad).
+They are wide (a usual machine lies well inside them) and matter only where the data leave something open
+(`abbe.models.solvers.least_squares.ParameterEstimate.data_share`). Sources: published machine data (Yang and Kim, Table 2: scales of
+100 urad; Pahk: up to 110 urad).
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from abbe.models.geometry.bases import Term
 from abbe.models.machine import Machine
 
 U_WAVELENGTH = 0.3e-6
-"""Relative standard uncertainty of the laser's wavelength after air compensation (about 0.3 K or 1 hPa): no scale is known better."""
+"""Relative standard uncertainty of the laser's wavelength after air compensation (about 0.3 K or 1 hPa)."""
 
 
 SMALLEST_LENGTH_MM = 1e-5
-"""A stated length uncertainty of zero is taken as this: no calibration certificate knows 10 nm better."""
+"""Least standard uncertainty of a bar's length, also where the run states less: no calibration is better than 10 nm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +35,16 @@ class Priors:
     scale_rad, squareness_rad : linear positioning error per length; squareness.
     positioning_mm, straightness_mm : one Legendre coefficient of order 2 and more.
     angle_rad, angle_slope_rad : one coefficient of order 2 and more; of order 1.
-    decay_order : orders above fade as 1 / (1 + (order / decay)^2): machine errors are smooth.
-    backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; first laser record; drift of a laser run.
-    bar_length_mm, bar_unknown_mm : length of a bar that is called calibrated without a figure; of a bar that is not calibrated (what a
-        careful hand sets with a rule block or caliper: on a 150 mm bar it leaves every scale to the scales' own prior).
+    decay_order : coefficients fall with the order as 1 / (1 + (order / decay_order)^2), because machine errors are smooth.
+    backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; error of a laser run's first record; drift of
+        a laser run.
+    bar_length_mm, bar_unknown_mm : length of a bar that is called calibrated without a figure; of a bar that is not calibrated (set with a
+        gauge block or caliper; on a 150 mm bar this is too vague to determine a scale).
     laser_scale : relative error of the wavelength, common to all laser runs of a campaign.
-    cosine : relative 1 / (m.l) - 1 of one laser set-up (math.md 5.4), u^2/2 - t.u for a beam aligned to 0.3 mrad in each direction (0.3 mm
-        in 1 m) and a mirror tilted by ``tilt_rad``: rms 0.25e-6. On 1 m that is 0.25 um, as much as the noise of the reading.
-    bar_drift_mm_s : growth of tool against cup in each direction while a ball-bar set-up stands: 0.18 um/min or 11 um/h, an assumption
-        for a machine that is neither cold nor settled, until drifts are measured.
+    cosine : 1 / (m.l) - 1 of one laser set-up with mirror normal m and beam l, about u^2/2 - t.u for a beam off by u (0.3 mrad in each
+        direction, 0.3 mm in 1 m) and a mirror tilted by t (``tilt_rad``): rms 0.25e-6, on 1 m as much as the noise of the reading.
+    bar_drift_mm_s : drift of the tool against the cup in each direction during a ball-bar set-up: 0.18 um/min or 11 um/h, an assumption
+        for a machine that is neither cold nor settled.
     """
 
     scale_rad: float = 100e-6
@@ -65,10 +67,10 @@ class Priors:
 
 
 def bar_length_sd(u_length_mm: float | None, calibrated: bool | None, priors: Priors) -> float:
-    """Prior standard deviation of a bar's length, mm, from what its run states (run-format.md 3).
+    """Prior standard deviation of a bar's length, mm, from what its run states (docs/reference/formats.md).
 
-    The stated ``u_length_mm`` counts, unless the length is said to be uncalibrated or nothing is said at all: then a ball-bar must not
-    lend the machine an unmeasured scale.
+    The stated ``u_length_mm`` counts, except for a bar that is stated as uncalibrated. Such a bar, or one about which the run states
+    nothing, gets at least ``bar_unknown_mm``, so that its length does not fix the machine's scales.
     """
     if calibrated is False or (calibrated is None and u_length_mm is None):
         return max(priors.bar_unknown_mm, u_length_mm or 0.0)
@@ -96,39 +98,39 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
 SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
 MOTION_FACTOR = 2.0
-"""Hyperprior of one error motion against the others of its class."""
+"""Hyperprior of the size of one error motion relative to its class: known within this factor."""
 ROUGHNESS_SD = 0.7
-"""Hyperprior of one motion's own fading against the common one: some guideways are rougher than others of the same machine."""
+"""Hyperprior of how the sizes of one motion fall with the order, relative to all motions: some guideways are rougher than others."""
 SPECTRUM_SD = 1.0
-"""Hyperprior of the two numbers that bend how sizes fade with the order."""
+"""Hyperprior of ``fade`` and ``cut``, the two numbers that change how the sizes of all motions fall with the order."""
 LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
-"""Set-up unknowns that hands and temperatures make, so that their size may be learned. Stated calibrations never are."""
+"""Set-up unknowns from mounting and temperature, whose typical size is estimated from the data; that of calibrations is not."""
 LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4))
 """Correlation lengths of the error motions that are tried, in strokes: 0.1 to 1.35."""
 FIRST_LENGTH = LENGTHS[7]
 LENGTH_SPREAD = 0.4
-"""How much the lengths of the motions of one machine differ, standard deviation of the logarithm: a factor of 1.5."""
+"""How much the correlation lengths of one machine's motions differ: standard deviation of the logarithm, a factor of 1.5."""
 SMALLEST_BEND = 0.003
-"""Smallest prior standard deviation of any shape of an error motion over the documented size: 15 nm, 0.045 urad."""
+"""Least prior standard deviation of a shape of an error motion, as a fraction of the documented size: 15 nm or 0.045 urad."""
 SMALLEST_SHARE = 1e-7
-"""Variance that every shape keeps of the largest one's, so that none is ruled out."""
+"""Least variance of a shape as a fraction of the largest, so that no shape is ruled out."""
 
 
 @cache
 def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
     """Shapes of an error motion and their variances: the prior covariance of its Legendre coefficients of order 2 to ``order``.
 
-    An error motion is equally large and equally smooth everywhere on its stroke, its line taken away. Independent Legendre coefficients
-    would not: all polynomials are largest at the ends of the stroke. So the coefficients are those of a stationary process with a
-    squared exponential correlation of about ``length`` strokes (log-normal, `LENGTH_SPREAD`: a single length would pretend to know how a
-    motion continues where nothing was measured), whose independent shapes are the eigenvectors of their covariance.
+    An error motion without its straight line is assumed equally large and smooth everywhere on the stroke. Independent Legendre
+    coefficients do not give that, because all polynomials are largest at the ends. So the coefficients are those of a stationary process
+    with a squared exponential correlation of about ``length`` strokes, log-normal with `LENGTH_SPREAD`: a single length would claim to know
+    how a motion continues where nothing was measured. The shapes are the eigenvectors of the coefficients' covariance.
 
     Returns
     -------
     shapes : array, shape (order - 1, order - 1)
         Coefficients of every shape (columns), smoothest first, orthonormal.
     variance : array, shape (order - 1,)
-        Of every shape, for a process of variance 1 (before its line is taken away).
+        Of every shape, for a process of variance 1 (before its straight line is removed).
     """
     u, weight = legendre.leggauss(96)
     gap = (u[:, None] - u) / 2.0
@@ -146,22 +148,22 @@ def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
 
 @dataclass(frozen=True)
 class SizeModel:
-    """How prior variances depend on a few numbers that the data may correct: log variance = log reference + ``design @ psi``.
+    """How prior variances depend on a few numbers psi that the data determine: log variance = log reference + ``design @ psi``.
 
     Attributes
     ----------
     typical : array, shape (p,)
-        Documented size of every unknown, its unit in all arrays.
+        Documented size of every unknown, mm or rad; the unit of this unknown in all other arrays.
     root : array, shape (p, p)
-        Unknowns (in units of ``typical``) = ``root`` @ independent ones of reference variance 1: one block per error motion
-        (`smooth_shapes`), else the unit matrix.
+        Unknowns (in units of ``typical``) = ``root`` @ independent unknowns of reference variance 1; a block per error motion
+        (`smooth_shapes`), elsewhere the unit matrix.
     blocks : tuple of arrays of int
         Unknowns of each error motion of order 2 and more.
     length : float
         Correlation length of the error motions, strokes.
     names : tuple of str
-        What each number of psi is: a class of unknowns (its log variance over the documented one), one error motion against its class,
-        ``fade`` and ``cut`` of the shapes, roughness of one motion against the others.
+        Meaning of each number of psi: log variance of a class of unknowns relative to the documented one, of one error motion relative to
+        its class, ``fade`` and ``cut`` of the shapes, roughness of one motion relative to the others.
     design : array, shape (p, h)
     sd : array, shape (h,)
         Standard deviation of the normal hyperprior of each number, around 0 (the documented size).
@@ -177,13 +179,13 @@ class SizeModel:
 
 
 def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...], rest_sd: F1, priors: Priors) -> SizeModel:
-    """Classes of the smooth ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
+    """Build the size model of the smooth ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
 
-    Positioning errors of order 2 and more share one size, all straightness errors, all angles, all lost motions, cups and so on: what the
-    data show of some tells how large the others may be; each error motion may differ from its class. How sizes fade with the number of a
-    shape is the same for all motions. Scales, squareness errors and slopes of angles keep their documented size: there are three of each
-    scale and squareness, and what is common to them (temperature) cannot be learned from how they differ; and that most guideways of a
-    machine are straight says nothing of the one whose twist no reading shows.
+    Each class shares one size: positioning errors of order 2 and more, straightness errors, angles, lost motions, cups and so on. The data
+    on some members thus tell how large the others may be, and each error motion may differ from its class. How sizes fall with the order
+    is common to all motions, except for each motion's roughness. Scales, squareness errors and slopes of angles keep their documented
+    size: an error common to all scales (temperature) does not show in their differences, and straight guideways tell nothing about the one
+    whose twist no reading shows.
     """
     kinds = [_class(t) for t in terms] + [_setup_class(n) for n in rest]
     motions = [t.motion if t.order >= 2 else "" for t in terms] + [""] * len(rest)
@@ -211,7 +213,7 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
 
 
 def with_length(model: SizeModel, length: float) -> SizeModel:
-    """The size model for error motions of another correlation length, strokes."""
+    """Return the size model with another correlation length of the error motions, strokes."""
     root = np.eye(model.typical.size)
     for at in model.blocks:
         shapes, variance = smooth_shapes(at.size + 1, length)
@@ -220,12 +222,12 @@ def with_length(model: SizeModel, length: float) -> SizeModel:
 
 
 def _reference(machine: Machine, terms: tuple[Term, ...], p: Priors) -> F1:
-    """Scales, squareness and slopes of angles: their prior; of a motion that bends: the size of the process."""
+    """Reference size of every term: for scales, squareness and slopes their prior; above order 1 the size of the whole motion."""
     return np.array([_sd(machine, t, p) if t.order < 2 else _bend_size(t, p) for t in terms])
 
 
 def _bend_size(term: Term, p: Priors) -> float:
-    """Standard deviation of an error motion on its stroke."""
+    """Prior standard deviation of an error motion at a point of its stroke, mm or rad."""
     if term.component >= 3:
         return p.angle_rad
     return p.positioning_mm if term.component == term.axis else p.straightness_mm

@@ -1,6 +1,7 @@
 """Residuals of a fit: outliers are down-weighted or rejected and listed; tests per run tell whether the rest is noise.
 
-The tests are of whitened residuals: size, signs in sequence, likeness of neighbours, both directions."""
+The tests of the whitened residuals concern their size, sequence of signs, correlation of neighbours, and direction of travel.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +14,19 @@ from abbe.models.arrays import F1, F2
 from abbe.models.solvers.observations import RunData
 
 LEVEL = 0.01
-"""A test is flagged when chance explains it with less than this, after correction for the number of tests (Holm)."""
+"""Significance level: a test is flagged if its p-value, corrected for the number of tests (Holm), is below this."""
 FEWEST = 10
 
 STILL = 1e-3
-"""Positions or times closer together than this, in mm or s, are one place."""
+"""Positions (mm) or times (s) closer together than this count as the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualTest:
     """One test of one run's whitened residuals.
 
-    ``name``: "size", "signs", "time", "position X".., "direction X"..; ``statistic``: that of the test; ``p``: its p-value, ``p_adjusted``
-    corrected for the number of tests; ``text``: what was found, in words, empty where nothing was.
+    ``name``: "size", "signs", "time", "position X".., "direction X"..; ``p``: p-value; ``p_adjusted``: corrected for the number of tests;
+    ``text``: the finding as a sentence, empty unless ``flagged``.
     """
 
     run: str
@@ -38,9 +39,12 @@ class ResidualTest:
 
 
 def residual_tests(runs: tuple[RunData, ...], whitened: tuple[F1, ...], weight: tuple[F1, ...]) -> tuple[ResidualTest, ...]:
-    """Test the residuals of all runs (divided by their standard deviation and corrected for leverage; outliers left out).
+    """Test the whitened residuals of all runs.
 
-    Flagged lines name what to check, e.g. "r07: residuals along X are alike over 12 mm: more than the model follows".
+    Parameters
+    ----------
+    whitened, weight : tuple of arrays, shape (n,) per run
+        Residuals divided by their standard deviation, leverage included; robust weights. Readings of weight 0.5 or less are left out.
     """
     found = [t for run, z, w in zip(runs, whitened, weight, strict=True) for t in _of_run(run, z, w > 0.5)]
     return _holm(found)
@@ -86,7 +90,7 @@ def autocorrelation(z: F1, lags: int) -> F1:
 
 
 def _alike(label: str, name: str, z: F1, at: F1, unit: str) -> ResidualTest:
-    """Ljung and Box: whether neighbours are alike along time or a position."""
+    """Ljung-Box test: whether neighbouring residuals are correlated along time or a position."""
     lags = max(1, min(10, z.size // 5))
     r = autocorrelation(z, lags)
     k = np.arange(1, lags + 1)
@@ -112,7 +116,7 @@ def _direction(label: str, axis: str, z: F1, sign: F1) -> list[ResidualTest]:
     gap = float(plus.mean() - minus.mean())
     score = gap / float(np.sqrt(1.0 / plus.size + 1.0 / minus.size))
     p = float(2.0 * scipy.special.ndtr(-abs(score)))
-    text = f"{label}: forward and backward travel of {axis} differ by {abs(gap):.1f} standard deviations more than one lost motion explains"
+    text = f"{label}: forward and backward travel of {axis} differ by {abs(gap):.1f} standard deviations after correction of lost motion"
     return [ResidualTest(label, f"direction {axis}", float(score), p, p, False, text)]
 
 
@@ -130,9 +134,10 @@ def _holm(tests: list[ResidualTest]) -> tuple[ResidualTest, ...]:
 
 
 def inflation(z: tuple[F1, ...]) -> float:
-    """Ratio of all readings to independent ones: 1 + 2 sum of the autocorrelation, at least 1.
+    """Ratio of the number of readings to that of independent ones: 1 + 2 sum of the autocorrelation, at least 1.
 
-    Summed over all runs of an instrument up to the first lag that noise explains. ``z``: residuals over their noise, an array per run.
+    The sum ends before the first lag whose autocorrelation is within the noise. ``z``: whitened residuals of one instrument, an array per
+    run.
     """
     sizes = [v.size for v in z if v.size >= FEWEST]
     if not sizes:
@@ -156,14 +161,14 @@ def inflation(z: tuple[F1, ...]) -> float:
 
 
 FALSE_ALARM = 0.05
-"""Chance that a campaign without any outlier has a reading that counts less."""
+"""Probability that a campaign without outliers has a down-weighted reading."""
 REJECT = 1.5
-"""From this multiple of the threshold on a reading counts nothing."""
+"""From this multiple of the threshold on, a reading has weight 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outlier:
-    """A reading that counts less: its run, its index in the run's values, its size in standard deviations, its weight 0 to 1."""
+    """A down-weighted reading: its run, index among the run's values, size in standard deviations, and weight, 0 to 1."""
 
     run: str
     index: int
@@ -172,7 +177,7 @@ class Outlier:
 
 
 def leverage(a: F2, root: F2) -> F1:
-    """Share of each reading's variance that the fit absorbs, shape (n,): squared length of the rows of ``a @ root.T``.
+    """Leverage, the fraction of each reading's variance that the fit absorbs, shape (n,): squared length of the rows of ``a @ root.T``.
 
     Parameters
     ----------
@@ -186,14 +191,14 @@ def leverage(a: F2, root: F2) -> F1:
 
 
 def outlier_threshold(n: int) -> float:
-    """Size in standard deviations that ``n`` normal readings exceed with the chance `FALSE_ALARM` only; never below 3.5."""
+    """Size in standard deviations that any of ``n`` normal readings exceeds with probability `FALSE_ALARM`; at least 3.5."""
     return max(3.5, float(-scipy.special.ndtri(0.5 * FALSE_ALARM / max(n, 1))))
 
 
 def outlier_weights(size: F1, limit: float) -> F1:
     """Redescending weights: 1 below the limit, falling to 0 at `REJECT` times the limit (Hampel's third part), shape (n,).
 
-    Clean readings all keep weight 1, so nothing is lost on them and the estimated noise is not biased.
+    Clean readings keep weight 1, so they lose no information and do not bias the estimated noise.
     """
     s: F1 = np.abs(size)
     inside = np.maximum(s, 1e-300)
@@ -201,5 +206,5 @@ def outlier_weights(size: F1, limit: float) -> F1:
 
 
 def robust_scale(size: F1) -> float:
-    """Robust standard deviation (median absolute value), so that outliers do not hide themselves by widening the noise."""
+    """Robust standard deviation (median absolute value over 0.6745), so that outliers do not hide in a larger estimate of noise."""
     return float(np.median(np.abs(size)) / 0.6744897501960817) if size.size else 1.0

@@ -1,7 +1,7 @@
-"""Sequential step diagonals in the paper's form (Wang eq (6)-(13); math.md 5.1 to 5.4).
+"""Sequential step diagonals in the form of Wang's paper, eq (4) to (13).
 
-`wang_eq7` is the published three-of-four formula, `wang_four` the least-squares form that uses all four diagonals. Both take the mirrors
-as perfectly square to the beams; `abbe.models.solvers.joint` treats the tilts as unknowns.
+`wang_eq7` is the published formula, which uses two diagonals per direction; `wang_four` is the least-squares form with all four. Both take
+the mirrors as perfectly square to the beams; `abbe.models.solvers.joint` treats the tilts as unknowns.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ORDER = ("ppp", "npp", "pnp", "ppn")
 
 
 def checked_increments(inc_mm: F1, what: str = "increments") -> F1:
-    """The three increments (or travels), mm, as floats.
+    """Return the three increments (or travels), mm, as an array after a check.
 
     Raises
     ------
@@ -32,9 +32,9 @@ def checked_increments(inc_mm: F1, what: str = "increments") -> F1:
 
 
 def increments(readings_mm: dict[str, F1], order: str = "XYZ") -> dict[str, F2]:
-    """Normalised step readings q_s(a, j): sign of the axis times reading step, intervals counted from the axis' small end (math.md 5.1).
+    """Normalised step readings q_s(a, j): sign of the axis times reading step, intervals counted from the axis' small end.
 
-    The paper omits this normalisation: where a diagonal runs an axis down, sign and sequence of its intervals are reversed.
+    The paper omits this normalisation: where a diagonal runs along an axis downwards, sign and sequence of its intervals are reversed.
 
     Parameters
     ----------
@@ -96,9 +96,9 @@ def project_eq6(e_mm: F3, inc_mm: F1) -> dict[str, F2]:
 
 
 def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
-    """Displacement errors by the printed formulas (7) and (8), three of four diagonals (Wang; math.md 5.1).
+    """Displacement errors by Wang's printed formulas (7) and (8).
 
-    The coefficients of (4) to (8) are lost in the print and rebuilt in math.md 5.1. Angular errors and mirror tilt enter as false errors
+    The print has lost the coefficients of (4) to (8); they are derived anew here. Angular errors and mirror tilt enter as false errors
     (`abbe.models.papers.wang.squareness`, `abbe.models.papers.wang.model.tilt_bias_eq7`).
 
     Parameters
@@ -127,9 +127,9 @@ def wang_eq7(q: dict[str, F2], inc_mm: F1) -> F3:
 
 
 def wang_four(q: dict[str, F2], inc_mm: F1) -> F3:
-    """`wang_eq7` by least squares over all four diagonals: half the variance of (7) (math.md 5.1, not in the paper).
+    """`wang_eq7` by least squares over all four diagonals, with half the variance of (7); not in the paper.
 
-    Parameters, result (shape (3, 3, n + 1), mm), errors: as `wang_eq7`. Uncertainty from noise: `u_wang_four`.
+    Parameters, result (shape (3, 3, n + 1), mm) and errors are those of `wang_eq7`. Uncertainty from noise: `u_wang_four`.
     """
     inc_mm = checked_increments(inc_mm)
     _all_four(q)
@@ -142,9 +142,9 @@ def wang_four(q: dict[str, F2], inc_mm: F1) -> F3:
 def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -> F3:
     """Standard uncertainty of `wang_four` from reading noise and wavelength alone, shape (3, 3, n + 1), mm.
 
-    One interval: R / (2 X) sigma_q with sigma_q = sqrt(2) sigma of a reading (math.md 5.1); the intervals of an axis share no reading, so
-    k of them cumulate to sqrt(k). ``u_scale``, the relative uncertainty of the laser's wavelength, lengthens only E[a, a]. Mirror tilts
-    (5.4), angular errors (5.2) and drift are biases of the method and NOT in it.
+    One interval has R / (2 X) sigma_q with sigma_q = sqrt(2) sigma of a reading. The intervals of an axis share no reading, so k of them
+    have sqrt(k) times as much. ``u_scale``, the relative uncertainty of the laser's wavelength, adds to E[a, a] only. Mirror tilts, angular
+    errors and drift are biases of the method and NOT included.
 
     Raises
     ------
@@ -163,18 +163,18 @@ def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -
 
 
 def demeaned(q: dict[str, F2]) -> dict[str, F2]:
-    """Step readings without the mean of every series (axis and diagonal): the paper's remedy for mirror tilt (IV.C; math.md 5.4).
+    """Step readings less the mean of each series (axis and diagonal): Wang's remedy for mirror tilt (IV.C).
 
-    It removes the tilt and with it all twelve slopes: what `wang_eq7` then returns has no scale and no squareness left, which the paper
-    does not say. ``q`` and the result: dict of arrays (3 axes, n), mm, normalised by `increments`.
+    It removes the tilt and with it all twelve slopes: the result of `wang_eq7` then has no scale and no squareness, which the paper does
+    not say. ``q`` and the result: dict of arrays (3 axes, n), mm, normalised by `increments`.
     """
     return {name: np.asarray(values - values.mean(axis=1, keepdims=True)) for name, values in q.items()}
 
 
 def closure_mm(q: dict[str, F2]) -> F2:
-    """ppp - npp - pnp - ppn per axis and interval: closure by the redundant fourth diagonal (math.md 5.1, 5.2, 5.4; not in the paper).
+    """Closure ppp - npp - pnp - ppn per axis and interval, from the redundant fourth diagonal; not in the paper.
 
-    Zero for pure translations, visible for mirror tilt; angular errors show with one step's size only.
+    It is zero for pure translations and shows mirror tilt; of angular errors it shows only the effect of one step.
 
     Parameters
     ----------
@@ -196,14 +196,14 @@ def closure_mm(q: dict[str, F2]) -> F2:
 
 def _all_four(values: Mapping[str, F2 | float]) -> None:
     if missing := [name for name in ORDER if name not in values]:
-        raise ValueError(f"step diagonal: {', '.join(missing)} missing, all four diagonals are needed")
+        raise ValueError(f"step diagonal: {', '.join(missing)} missing; all four diagonals are needed")
     if len(shapes := {np.shape(values[name]) for name in ORDER}) > 1:
-        raise ValueError(f"step diagonal: the four diagonals have unlike shapes {sorted(shapes)}")
+        raise ValueError(f"step diagonal: the four diagonals have different shapes {sorted(shapes)}; measure all with the same steps")
 
 
 @dataclass(frozen=True, slots=True)
 class SquarenessContrast:
-    """Obtuse-positive squareness from the diagonals' end values, free of scale errors, not of angular ones (math.md 5.3), rad.
+    """Squareness errors, rad, obtuse positive, from the diagonals' end values; free of scale errors, but not of angular errors.
 
     ``u_xy``, ``u_xz``, ``u_yz``: standard uncertainties from the noise of the readings alone, rad.
     """
@@ -217,11 +217,10 @@ class SquarenessContrast:
 
 
 def squareness_contrast(totals_mm: dict[str, float], length_mm: F1, u_total_mm: float = 0.0) -> SquarenessContrast:
-    """Minimum-variance contrasts of the diagonals' ends instead of the printed (13), whose values carry the scale errors (math.md 5.3).
+    """Squareness from minimum-variance contrasts of the diagonals' end values, instead of Wang's (13).
 
-    Free of the SCALE errors only. Angular errors are read as squareness: a yaw of X that grows by 50 µrad over its travel moves theta_xy by
-    half of it, 25 µrad. The uncertainties hold the readings' noise alone and do not grow with any of that. Erratum: (13) is valid without
-    scale errors only.
+    The result is free of SCALE errors only. Angular errors act as squareness: a yaw of X that grows by 50 µrad over its travel changes
+    theta_xy by half of it, 25 µrad. The uncertainties include only the readings' noise. Erratum: (13) is valid only without scale errors.
 
     Parameters
     ----------
@@ -235,7 +234,7 @@ def squareness_contrast(totals_mm: dict[str, float], length_mm: F1, u_total_mm: 
     Returns
     -------
     SquarenessContrast
-        Obtuse positive as (9) and (11); (12) and (13) are acute positive, i.e. the negative.
+        Obtuse positive as in (9) and (11); (12) and (13) are acute positive, i.e. the negative.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""What a set of readings can tell, and what it cannot, and what would cure it."""
+"""What a set of readings determines, what it leaves hidden, and which additional measurements would show it."""

@@ -1,6 +1,6 @@
-"""Cures for hidden combinations: every usual addition to a campaign is tried.
+"""Cures for hidden combinations: measurements or certificates that would show them.
 
-Nothing is looked up: the rank with each addition is computed on the campaign at hand, so the advice fits this machine and these runs.
+Every usual addition is tried: the rank with it is computed for the campaign at hand, so the advice fits this machine and these runs.
 """
 
 from __future__ import annotations
@@ -30,23 +30,20 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SAME_PLACE_MM, SetupUnknowns, setup_unknowns, straight_line_of
 from abbe.models.solvers.priors import Priors
 
-# Contents of a campaign: a cause states a fact about its runs, and a cure proposes something that it lacks.
-
-
 ALONG = 1e-3
-"""A line is along an axis, a diagonal across all of them, if no component (all components) of its direction is larger than this."""
+"""Components of a direction above this count: a line along an axis has one, a body diagonal has three."""
 STEP_ORDERS = ("XYZ", "ZYX", *("".join(p) for p in permutations("XYZ") if p not in (("X", "Y", "Z"), ("Z", "Y", "X"))))
 LONGER_MM = 100.0
 ASIDE_MM = (100.0, 50.0)
-"""Virtual tools: additional length, and distance from the spindle's axis (math.md 4.6)."""
+"""Virtual tools for a trial: additional length (`LONGER_MM`), and two offsets from the tool's line."""
 READINGS, RUNS = 130, 10
-"""Readings of a virtual run, and runs repeated with another tool, at most: they cost time, and a rank needs few."""
+"""Most readings of a virtual run, and most runs repeated with another tool; a rank needs few."""
 SHORTEST_BAR_MM = 10.0
 """No ball-bar is shorter."""
 MARGIN = 0.1
-"""Share of the stroke that virtual runs keep off its ends."""
+"""Fraction of the stroke between virtual runs and its ends."""
 SHOWN = 1e-7
-"""Trace (unit columns) from which a hidden combination counts as shown by an addition; hidden means below 1e-9."""
+"""Least effect on an addition's readings (unit columns) for a hidden combination to count as shown; hidden means below 1e-9."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +52,12 @@ class Present:
 
     Attributes
     ----------
-    lines : per axis, the places (mm) of the laser lines along it.
+    lines : midpoints (mm) of the laser lines along each axis.
     stepped : step diagonals as (signs of the body diagonal, order of the steps).
     plain : int
-        Diagonals that were run straight.
+        Number of diagonals that were run straight.
     cups : int
-        Places where the ball-bar stood.
+        Number of different ball-bar centres.
     """
 
     lines: tuple[tuple[F1, ...], tuple[F1, ...], tuple[F1, ...]]
@@ -75,7 +72,7 @@ class Present:
 
     @property
     def next_order(self) -> str:
-        """The first usual order that no diagonal has; the last one if all are used."""
+        """The first step order that no diagonal has; the last one if all are used."""
         return next((o for o in STEP_ORDERS if o not in self.orders), STEP_ORDERS[-1])
 
     @property
@@ -85,7 +82,7 @@ class Present:
 
 
 def present(runs: tuple[RunData, ...]) -> Present:
-    """Sort the runs of a campaign."""
+    """Sort the runs of a campaign by kind."""
     lines: tuple[list[F1], list[F1], list[F1]] = ([], [], [])
     stepped, plain, cups = [], 0, set()
     for run in runs:
@@ -103,7 +100,7 @@ def present(runs: tuple[RunData, ...]) -> Present:
 
 
 def _stepped(run: RunData) -> list[tuple[str, str]]:
-    """A run in steps of one axis each across the volume: its body diagonal (direction does not matter) and its order."""
+    """Body diagonal (either direction) and step order of a run in single-axis steps; empty if an axis never steps alone."""
     steps = np.diff(run.axes_mm, axis=0)
     big = np.abs(steps) > ALONG * np.abs(steps).max()
     moves = [(int(np.argmax(b)), float(s[np.argmax(b)])) for b, s in zip(big, steps, strict=True) if b.sum() == 1]
@@ -115,12 +112,15 @@ def _stepped(run: RunData) -> list[tuple[str, str]]:
 
 
 def place_text(axis: int, place_mm: F1) -> str:
-    """Place of a line along an axis: "Y = 40 mm, Z = 30 mm"."""
+    """Text for the position of a line along an axis: "Y = 40 mm, Z = 30 mm"."""
     return ", ".join(f"{AXES[k]} = {place_mm[k]:.0f} mm" for k in range(3) if k != axis)
 
 
 def free_corner(machine: Machine, axis: int, inner: np.ndarray[tuple[int, ...], np.dtype[np.float64]], places: tuple[F1, ...]) -> F1:
-    """The corner of the inner volume (3, 2) across an axis that is farthest from the lines along it; without lines the lowest."""
+    """The edge of the inner volume (3, 2) along an axis that is farthest from the lines at ``places``; the lowest without lines.
+
+    It is returned as the edge's lower end, mm.
+    """
     others = [k for k in range(3) if k != axis]
     corners = []
     for sides in product((0, 1), repeat=2):
@@ -135,16 +135,17 @@ def free_corner(machine: Machine, axis: int, inner: np.ndarray[tuple[int, ...], 
 
 
 def on_opposite_edges(machine: Machine, axis: int, places: tuple[F1, ...]) -> bool:
-    """Whether two lines along an axis stand at least half the stroke apart in both other axes."""
+    """Whether two lines along an axis are at least half the stroke apart in both other axes."""
     others = [k for k in range(3) if k != axis]
     return any((np.abs(a - b)[others] >= 0.5 * machine.length_mm[others]).all() for a in places for b in places)
 
 
 @dataclass(frozen=True)
 class Addition:
-    """One possible addition: the cause that it removes, the cure as text, and its virtual runs or knowledge.
+    """One possible addition to a campaign: the cause that it removes, the cure as text, and its virtual runs.
 
-    ``ending``: the rest of the sentence after "cannot be distinguished" if it is left out.
+    ``knows``: set-up unknowns that a certificate makes known; ``ending``: text after "cannot be distinguished" in the report, e.g. " with
+    one tool length".
     """
 
     key: str
@@ -156,12 +157,12 @@ class Addition:
 
 
 def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
-    """Possible additions to these runs, cheapest first; every cause is a fact about them.
+    """Possible additions to these runs, cheapest first; every cause states a fact about the runs.
 
     Parameters
     ----------
     known, names : Knowledge, tuple of str
-        What is known of the set-up, and all its unknowns.
+        What is known of the set-up; names of all its unknowns.
     order : int
         Highest order of the error motions: lines and diagonals get enough positions for it.
     """
@@ -184,7 +185,7 @@ def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
 
 
 def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
-    """One laser line along each axis: where none is yet, or far from those that are."""
+    """One laser line along each axis, far from those that the campaign has."""
     out = []
     for k, a in enumerate(AXES):
         places = there.lines[k]
@@ -201,14 +202,14 @@ def _lines(machine: Machine, there: Present, order: int) -> list[Addition]:
 
 
 def _edges(machine: Machine, there: Present, order: int) -> Addition:
-    """Lines along all axes on two opposite edges; where these are there, on the two others."""
+    """Lines along all axes on two opposite edges; if the campaign has these, on two other edges."""
     inner, cure = _inner(machine), "laser lines along X, Y and Z on two opposite edges"
     sides = np.array([[0, 0, 0], [1, 1, 1]])
     if not any(there.lines):
         cause = "there are no laser lines here"
     elif all(on_opposite_edges(machine, k, there.lines[k]) for k in range(3)):
         cause, cure = "the laser lines here stand on too few edges", "laser lines along X, Y and Z on two more edges"
-        sides = np.array([[0, 0, 1], [0, 1, 0]])  # turned with the axis: low in one of the other two, high in the other
+        sides = np.array([[0, 0, 1], [0, 1, 0]])  # rolled by the axis: low in one of the other two axes, high in the other
     else:
         cause = "the laser lines here do not stand on opposite edges in all three axes"
     runs = tuple(_line(machine, k, inner[range(3), np.roll(side, k)], order, i) for k in range(3) for i, side in enumerate(sides))
@@ -216,7 +217,7 @@ def _edges(machine: Machine, there: Present, order: int) -> Addition:
 
 
 def _diagonals(machine: Machine, there: Present, order: int) -> Addition:
-    """Step diagonals, in an order of steps that was not used yet."""
+    """Step diagonals in a step order that the campaign does not have."""
     sequence, done = there.next_order, " and ".join(there.orders)
     if there.stepped and there.diagonals < len(DIAGONALS):
         cause = f"only {there.diagonals} of the four body diagonals {'was' if there.diagonals == 1 else 'were'} stepped ({done})"
@@ -255,7 +256,7 @@ def _laser(label: str, path_mm: F2) -> RunData:
 
 
 def _line(machine: Machine, axis: int, through_mm: F1, order: int, number: int = 0) -> RunData:
-    """Along an axis through a place, MARGIN inside the stroke."""
+    """A virtual laser line along an axis through a point, `MARGIN` inside the stroke."""
     start, end = through_mm.copy(), through_mm.copy()
     start[axis], end[axis] = _inner(machine)[axis]
     return _laser(f"virtual {AXES[axis]}{number}", straight_line(start, end, 2 * order + 3, back=False))
@@ -271,7 +272,7 @@ def _inner(machine: Machine) -> F2:
 
 
 def _helices(machine: Machine, runs: tuple[RunData, ...]) -> tuple[RunData, ...]:
-    """About the middle and four places around it, with the campaign's own bar where it has one; none where no bar has room."""
+    """Virtual helices about the middle and four centres around it, with the campaign's bar if it has one; none if no bar fits."""
     own = next((r for r in runs if r.radius_mm is not None), None)
     radius = 0.2 * float(machine.length_mm.min()) if own is None or own.radius_mm is None else own.radius_mm
     if own is None and radius < SHORTEST_BAR_MM:
@@ -292,7 +293,7 @@ def _helices(machine: Machine, runs: tuple[RunData, ...]) -> tuple[RunData, ...]
 
 
 def _other_tools(machine: Machine, runs: tuple[RunData, ...]) -> tuple[F1, F1]:
-    """A tool longer than those of the runs, and one whose end stands aside."""
+    """A tool longer than those of the runs, and one whose end is off to the side, vectors in mm."""
     tools = [with_tool(machine, r.tool_mm).tool_mm for r in runs]
     tool = max(tools, key=lambda t: float(np.linalg.norm(t)))
     along = tool / np.linalg.norm(tool) if tool.any() else np.array([0.0, 0.0, -1.0])
@@ -302,7 +303,7 @@ def _other_tools(machine: Machine, runs: tuple[RunData, ...]) -> tuple[F1, F1]:
 
 
 def _with(runs: tuple[RunData, ...], tool_mm: F1, key: str) -> tuple[RunData, ...]:
-    """The ball-bar runs (without any, the laser runs) once more with another tool and newly mounted."""
+    """The ball-bar runs (the laser runs if there are none) repeated with another tool and new set-ups."""
     out = []
     for run in (tuple(r for r in runs if r.kind == "bar") or runs)[:RUNS]:
         n = run.deviation_mm.size
@@ -325,7 +326,7 @@ class CampaignLayout:
 
 @dataclass(frozen=True)
 class CureTrial:
-    """An addition and what it would show: ``observed``, shape (rows, k), per unit of each hidden combination, set-up unknowns out."""
+    """An addition and its readings per unit of each hidden combination, set-up unknowns projected out: ``observed``, shape (rows, k)."""
 
     addition: Addition
     observed: F2
@@ -336,13 +337,13 @@ class CureTrial:
 
 
 def count_observed(observed: F2) -> int:
-    """Number of hidden combinations that a design, shape (rows, k), shows; hidden ones show less than 1e-9 (unit columns)."""
+    """Number of hidden combinations that a design, shape (rows, k), shows (`SHOWN`)."""
     s = singular_values(observed) if observed.size else np.zeros(0)
     return int((s > SHOWN).sum())
 
 
 def trials(campaign: CampaignLayout, observed: ObservedInformation) -> list[CureTrial]:
-    """Try every usual addition on what is hidden; none if nothing is hidden."""
+    """Try every usual addition on the hidden combinations; return an empty list if there are none."""
     if not observed.null_space.shape[1]:
         return []
     order = max(t.order for t in campaign.terms)
@@ -352,7 +353,7 @@ def trials(campaign: CampaignLayout, observed: ObservedInformation) -> list[Cure
 
 
 def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, int]]:
-    """Additions in the order in which each shows most of what is still hidden, and how many combinations are visible after each."""
+    """Choose additions one by one, each showing most of what is still hidden; with the number of combinations shown after each."""
     out: list[tuple[Addition, int]] = []
     stack, left, shown = np.zeros((0, hidden)), list(found), 0
     while left and shown < hidden:
@@ -367,7 +368,7 @@ def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, i
 
 
 def _shown(campaign: CampaignLayout, addition: Addition, hidden: Play) -> F2:
-    """What an addition shows per unit of each hidden combination (unit columns), shape (at most k, k); its own set-up unknowns out."""
+    """Readings of an addition per unit of each hidden combination, its set-up unknowns projected out, compressed to (at most k, k)."""
     if not addition.runs:
         at = [i for i, group in enumerate(hidden.groups) if set(group) & set(addition.knows)]
         size = np.linalg.norm(campaign.columns.setup[:, [campaign.columns.setup_names.index(hidden.groups[i][0]) for i in at]], axis=0)
@@ -388,7 +389,7 @@ def _shown(campaign: CampaignLayout, addition: Addition, hidden: Play) -> F2:
 
 
 def _known_with(campaign: CampaignLayout, runs: tuple[RunData, ...], setup: SetupUnknowns, new: CampaignColumns) -> Knowledge:
-    """Knowledge with the addition's new unknowns, by the same rules as the old ones, which do not change."""
+    """Knowledge with the addition's set-up unknowns, by the rules of `stated_knowledge`; that of the campaign stays."""
     known, before = campaign.known, set(campaign.columns.setup_names)
     stated = stated_knowledge(campaign.terms, runs, setup.names).fixed
     fixed = {n: v for n, v in stated.items() if n not in before} | {n: v for n, v in known.fixed.items() if n in new.setup_names}

@@ -1,4 +1,4 @@
-"""The null space of a campaign in a metrologist's terms: combinations, causes, effect on a workpiece, and cures."""
+"""Hidden combinations of a campaign (its null space) in a metrologist's terms: motions, causes, effect in the volume, and cures."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from abbe.models.solvers.observability.rank import ObservedInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
 
 LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
-"""Largest sets of motions that are all tried for hidden combinations: among all orders, and among orders up to LOW (a slope of an angle
-times the travel of its own axis is of order 2), which come first. The remaining combinations are mixtures."""
+"""Largest sets of motions that are searched for hidden combinations: with all orders, and with orders up to LOW, which are tried first (the
+slope of an angle times the travel of its own axis is of order 2). All other hidden combinations are reported as mixtures."""
 INSIDE = 1e-9
-"""A set of motions holds a hidden combination if its share of the null space misses 1 by less than this (squared leak)."""
+"""A set of motions contains a hidden combination if an eigenvalue of its block of the null space's projector is within this of 1."""
 ENTRY = 1e-6
 """Entries of a unit vector below this are rounding."""
 NEW = 1e-4
-"""A unit vector is independent of what is reported if more than this of it lies beside."""
+"""A unit vector is independent of the reported combinations if its component outside them is longer than this."""
 LISTED = 6
 _TURNS = {"AX": "roll", "BX": "pitch", "CX": "yaw", "AY": "pitch", "BY": "roll", "CY": "yaw", "CZ": "roll"}
 _PAIRS = {"C0Y": "X and Y", "B0Z": "X and Z", "A0Z": "Y and Z"}
@@ -35,8 +35,8 @@ _PAIRS = {"C0Y": "X and Y", "B0Z": "X and Z", "A0Z": "Y and Z"}
 class Family:
     """Hidden combinations of the same motions.
 
-    ``motions``: ISO names, in the order of the terms; ``vectors``: shape (p, count), one combination per column, coefficients in unit
-    columns; ``exact``: few motions, no mixture.
+    ``motions``: ISO names, in the order of the terms; ``vectors``: shape (p, count), one combination per column, coefficients in their own
+    units; ``exact``: found as a set of few motions, not a mixture.
     """
 
     motions: tuple[str, ...]
@@ -86,7 +86,7 @@ def _orders(terms: tuple[Term, ...], family: Family, motion: str) -> list[int]:
 
 
 def _proportion(terms: tuple[Term, ...], family: Family) -> str:
-    """Of one combination of two terms: the size of the second that looks like one unit of the first, both over the whole stroke."""
+    """Text with the ratio of the two terms, if the family is one combination of two terms up to order 1; else empty."""
     used = np.flatnonzero(family.vectors[:, 0])
     if family.vectors.shape[1] != 1 or len(used) != 2 or any(terms[i].order > 1 for i in used):
         return ""
@@ -97,7 +97,7 @@ def _proportion(terms: tuple[Term, ...], family: Family) -> str:
 
 
 def _unit(term: Term) -> tuple[float, str, str]:
-    """Display of a coefficient: factor, unit, and the length it refers to; order 1 of a Legendre series as its change over the stroke."""
+    """Display of a coefficient: factor, unit and reference; order 1 is shown as the change over the stroke."""
     size, unit = (1e3, "µm") if term.order > 0 and term.component < 3 else (1e6, "µrad")
     return (2.0 * size, unit, " over the stroke") if term.order else (size, unit, "")
 
@@ -107,21 +107,21 @@ def _upper(text: str) -> str:
 
 
 def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None = None) -> list[Family]:
-    """Split a hidden space into combinations of as few motions as possible.
+    """Split a null space into combinations of as few motions as possible.
 
     Parameters
     ----------
     terms : tuple of Term
     null : array, shape (p, k)
-        Orthonormal basis of what is hidden, unit columns.
+        Orthonormal basis of the null space, unit columns.
     factor : array, shape (p,)
-        Coefficient = factor times unit-column value: the families' vectors are in the coefficients' own units.
+        Coefficient in its own unit = factor times its value in unit columns.
     found : array, shape (p, m), optional
         Orthonormal combinations already reported; only combinations independent of them are returned.
 
     Returns
     -------
-    list of Family, exact ones first; all vectors together with ``found`` span ``null``.
+    list of Family, exact families first; all their vectors together with ``found`` span ``null``.
     """
     reported = np.zeros((len(terms), 0)) if found is None else found
     shadow = null @ null.T
@@ -138,7 +138,7 @@ def families(terms: tuple[Term, ...], null: F2, factor: F1, *, found: F2 | None 
 
 
 def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, reported: F2, count: int) -> tuple[list[tuple[tuple[str, ...], F2]], F2]:
-    """New hidden combinations of sets of up to ``largest`` motions, smallest sets first, and all reported combinations then."""
+    """New hidden combinations of sets of up to ``largest`` motions, smallest sets first; and the basis of all reported so far."""
     active = {m: at for m, at in rows.items() if np.trace(shadow[np.ix_(at, at)]) > INSIDE}
     out: list[tuple[tuple[str, ...], F2]] = []
     for size in range(1, largest + 1):
@@ -157,7 +157,7 @@ def _of_few(shadow: F2, rows: dict[str, list[int]], largest: int, reported: F2, 
 
 
 def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], factor: F1) -> list[Family]:
-    """One family per set of motions, joining hidden combinations of their slopes and of their shapes."""
+    """One family per set of motions, with the combinations of their slopes and of their shapes together."""
     by_motions: dict[tuple[str, ...], list[F2]] = {}
     for motions, vectors in found:
         by_motions.setdefault(motions, []).append(vectors)
@@ -166,13 +166,13 @@ def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], fa
 
 
 def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tuple[str, ...], int]]:
-    """Sets of motions that hold hidden combinations of their own, and how many: eigenvalues 1 of their block of the projector."""
+    """Sets of ``size`` motions that contain hidden combinations, and how many: eigenvalues 1 of their block of the projector."""
     sets = list(combinations(rows, size))
     if not sets:
         return []
     indices = [[i for m in chosen for i in rows[m]] for chosen in sets]
     width = max(len(i) for i in indices)
-    at = np.array([i + [-1] * (width - len(i)) for i in indices])  # -1: a row and a column of zeros
+    at = np.array([i + [-1] * (width - len(i)) for i in indices])  # -1: the padded row and column of zeros
     padded = np.pad(shadow, (0, 1))
     blocks = padded[at[:, :, None], at[:, None, :]]
     count = (np.linalg.eigvalsh(blocks) > 1.0 - INSIDE).sum(axis=1)
@@ -180,7 +180,7 @@ def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tu
 
 
 def _inside(shadow: F2, at: list[int]) -> F2:
-    """Hidden combinations that only these terms make, orthonormal, shape (p, count)."""
+    """Hidden combinations of these terms alone, orthonormal, shape (p, count)."""
     values, vectors = np.linalg.eigh(shadow[np.ix_(at, at)])
     own = vectors[:, values > 1.0 - INSIDE]
     out = np.zeros((shadow.shape[0], own.shape[1]))
@@ -189,7 +189,7 @@ def _inside(shadow: F2, at: list[int]) -> F2:
 
 
 def _sparse(own: F2, at: list[int]) -> F2:
-    """The same space as sparse as elimination gives, unit length."""
+    """A sparse basis of the same space, vectors of unit length."""
     out = np.zeros_like(own)
     out[at] = sparse_rows(own[at].T).T
     return _unit_length(out)
@@ -200,7 +200,7 @@ def _unit_length(vectors: F2) -> F2:
 
 
 def _independent(vectors: F2, reported: F2) -> tuple[F2, F2]:
-    """The vectors independent of those already reported, and all reported so far, orthonormal."""
+    """The vectors that are independent of those already reported; and an orthonormal basis of all reported so far."""
     new = []
     for v in vectors.T:
         rest = _beside(v[:, None], reported)
@@ -238,15 +238,15 @@ class HiddenGroup:
     count : int
         Number of independent combinations.
     weights : tuple of (name, value)
-        The first combination at the size that a typical machine may have: coefficients in mm and rad.
+        The first combination at the size of a typical machine: coefficients in mm and rad.
     vectors : array, shape (p, count)
-        All of them, coefficients' own units.
+        All combinations, coefficients in their own units.
     harmless : bool
-        Whether it moves the tool nowhere in the volume with the tools used (with another tool it does).
+        Whether the combinations move none of the tools used anywhere in the volume (another tool they would).
     effect_mm : float
-        Otherwise: what a typical machine may hide there, rms length at the worst point, rigid motion removed, mm.
+        Rms deviation that a typical machine may hide here, at the worst point, rigid motion removed, mm; 0 if harmless.
     cause, cures, text
-        Cause; additions each of which would show all of it; one or two sentences for people.
+        Cause; additions each of which would show all combinations; sentences for the report.
     """
 
     motions: tuple[str, ...]
@@ -262,7 +262,7 @@ class HiddenGroup:
 
 @dataclass(frozen=True)
 class Advice:
-    """The best next addition, and the ``rank`` it leads to, out of ``of`` coefficients."""
+    """The best next addition, and the ``rank`` after it, out of ``of`` coefficients."""
 
     cure: str
     rank: int
@@ -270,13 +270,13 @@ class Advice:
 
     @property
     def text(self) -> str:
-        """Sentence for people."""
+        """Sentence for the report."""
         return f"{self.cure[:1].upper()}{self.cure[1:]} would raise the rank to {self.rank} of {self.of}."
 
 
 @dataclass(frozen=True)
 class HiddenDirection:
-    """Hidden groups, advice, and the rank no run with the same tools could exceed."""
+    """Hidden groups, advice, and the largest rank that runs with the same tools could have."""
 
     groups: tuple[HiddenGroup, ...]
     advice: tuple[Advice, ...]
@@ -284,7 +284,7 @@ class HiddenDirection:
 
 
 def picture(campaign: CampaignLayout, observed: ObservedInformation, prior_sd: F1) -> HiddenDirection:
-    """Everything about the null space; ``prior_sd``: typical size of every coefficient, shape (p,)."""
+    """Describe the null space of a campaign; ``prior_sd``: typical size of every coefficient, shape (p,), mm or rad."""
     terms = campaign.terms
     field = _fields(campaign, observed.factor)
     silent = _silent(observed.null_space, field)
@@ -310,7 +310,7 @@ def _fields(campaign: CampaignLayout, factor: F1) -> F2:
 def _lines(machine: Machine, nodes: int) -> F2:
     """Points on nine lines along each axis of the inner volume.
 
-    They tell as much as a whole grid: an error motion depends on one axis, and its lever on the others linearly (rule G).
+    They determine as much as a whole grid: an error motion depends on one axis, and its lever linearly on the others.
     """
     box = inner_box(machine)
     three = np.stack([box[:, 0], box.mean(axis=1), box[:, 1]], axis=1)
@@ -322,7 +322,7 @@ def _lines(machine: Machine, nodes: int) -> F2:
 
 
 def _silent(null_space: F2, field: F2) -> F2:
-    """Hidden combinations that move the tool nowhere in the volume, orthonormal in unit columns, shape (p, m)."""
+    """Hidden combinations that move none of the tools anywhere in the volume, orthonormal in unit columns, shape (p, m)."""
     if not null_space.shape[1]:
         return null_space
     _, s, vt = svd(field @ null_space, full_matrices=True)
@@ -337,7 +337,7 @@ def _reachable(field: F2) -> int:
 
 
 def _effect(family: Family, field: F2, factor: F1, prior_sd: F1) -> float:
-    """Largest rms deviation over the grid that typical sizes of these combinations make, mm."""
+    """Largest rms deviation in the volume from these combinations at typical size, mm."""
     root = _typical(family, prior_sd)
     moved = (field / factor) @ root
     return float(np.sqrt((moved**2).sum(axis=1).reshape(-1, 3).sum(axis=1).max()))
@@ -372,13 +372,13 @@ def _group(
 
 def _effect_text(group: HiddenGroup) -> str:
     if group.harmless:
-        return "With the tools in use it moves nothing, with another tool it does."
-    return f"It may hide {group.effect_mm * 1e3:.2g} µm somewhere in the inner 80 % of the volume."
+        return "With the tools in use this moves nothing, with another tool it does."
+    return f"This may hide {group.effect_mm * 1e3:.2g} µm somewhere in the inner 80 % of the volume."
 
 
 def _cure_text(group: HiddenGroup, partly: tuple[Addition, int] | None) -> str:
     if group.cures:
         return f"Why: {group.cause}. It would be seen with {' or '.join(group.cures)}."
     if partly is None or not partly[1]:
-        return "None of the usual additions alone shows it; two of them together were not tried."
-    return f"No single usual measurement shows all of it; {partly[0].cure} would show {partly[1]} of {group.count}."
+        return "None of the usual additional measurements alone would show it; combinations of two were not tried."
+    return f"No single usual measurement shows all of it; {partly[0].cure} would show {partly[1]} of {group.count} combinations."

@@ -1,15 +1,14 @@
-"""Observed information of a campaign: rank and hidden combinations of the coefficients, and knowledge of every parameter and error motion.
+"""Observed information of a campaign: rank and hidden combinations of the coefficients, and status of every parameter and error motion.
 
-Convention of math.md 4.6: columns of unit length, everything unknown about the set-up projected out, singular values counted down to 1e-9
-(rank) and 1e-3 (effective rank) of the largest. Priors do not count: typical sizes are not measured. Measured or certified knowledge of
-the set-up (`Knowledge`) counts like readings: a calibrated bar, a laser whose drift the maker states.
+Convention: columns of unit length, unknown set-up errors projected out, singular values counted down to 1e-9 (rank) and 1e-3 (effective
+rank) of the largest. Priors do not count, because typical sizes are not measured. Measured or certified knowledge of the set-up
+(`Knowledge`) counts like readings: a calibrated bar, a laser whose drift the maker states.
 
-The rank does not depend on the functions in which error motions are written, the effective rank does: Legendre polynomials are nearly
-independent of each other on the readings and keep more of it than powers of the position, of which math.md states its figures
-(`abbe.models.solvers.designs.ranks` of the papers' problems has those).
+The rank does not depend on the functions that describe the error motions. The effective rank does: it is higher with Legendre polynomials,
+which are nearly independent of each other on the readings, than with powers of the position.
 
-A parameter in a hidden combination has no value of its own, however small its uncertainty: only the prior determines it. An error motion
-may be written into a table of its own only if it is observed.
+The value of a parameter in a hidden combination comes from the prior, however small its uncertainty. An error motion may be written into a
+table of its own only if it is observed.
 """
 
 from __future__ import annotations
@@ -30,32 +29,33 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, bar_length_name, run_design, straight_line_of
 
 BAR_TRAVEL_MM = 1.0
-"""Measuring range of a usual ball-bar to either side: all intended positions lie within it of the nominal length."""
+"""Measuring range of a usual ball-bar to either side of its nominal length."""
 HAND_SET = ("cup", "tilt", "zero")
-"""Set-up unknowns that no run states; with uncalibrated bar lengths they are free, in the solver's rank as in the report's.
+"""Set-up unknowns that no run states; together with uncalibrated bar lengths they are free in every rank analysis.
 All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`abbe.models.solvers.priors`). They are known for the
-rank, and count in every uncertainty: else a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time, as
-the height is in a helix) a squareness."""
+rank and count in every uncertainty. Otherwise a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time,
+like the height of a helix) a squareness."""
 ROUNDING = 1e-6
-"""Columns shorter than this share of the longest one are zero. The longest are levers, about 1000 mm of reading per rad, so such a column
-is a lever of 1 um, or a direction cosine of 0.001: rounding of positions, tools and pivots. A motion of typical size (20 urad, 5 um) moves
-no reading by more than 5 nm through it. Columns of motions that are seen are longer than 1e-4 of the longest."""
+"""Columns shorter than this fraction of the longest one count as zero. The longest columns are levers of about 1000 mm, so such a column is
+a lever of 1 um or a direction cosine of 0.001, from rounded positions, tools and pivots. Through it a motion of typical size (20 urad,
+5 um) moves no reading by more than 5 nm. Columns of observed motions are longer than 1e-4 of the longest."""
 NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""
 Status = Literal["observed", "weak", "not observable"]
 OBSERVED, WEAKLY_OBSERVED = 0.9, 0.1
-"""Share of information from data: from 0.9 on (u at most 0.32 of the prior's) a parameter is observed, below 0.1 (u at least 0.95 of it)
-not observable; weak between."""
+"""Share of information from data: from 0.9 on (u at most 0.32 of the prior standard deviation) a parameter is observed, below 0.1 (u at
+least 0.95 of it) not observable, in between weak."""
 CORRELATED = 0.9
 NODES = 41
 
 
 def as_meant(run: RunData) -> RunData:
-    """The run with straight paths exactly straight and along their beam, and axes that hardly move exactly at rest.
+    """Remove rounding from the positions of a run, so that it does not count in the rank.
 
-    No straight path moves by more than `STRAIGHT_MM`, no beam by more than `NEAR_BEAM`; step diagonals stay as they are. A ball-bar runs on
-    the sphere of its nominal length: rounded positions, chords and means of blocks lie beside it by `BAR_TRAVEL_MM` at most. Off the
-    sphere a common scale of the machine would differ from the length of the bar in the eighth digit, and the rank would count it.
+    A nearly straight path (`STRAIGHT_MM`) becomes straight and lies along its beam (`NEAR_BEAM`); an axis that hardly moves is at rest;
+    step diagonals stay as they are. Positions of a ball-bar run move onto the sphere of the nominal length, from which rounding, chords and
+    block means differ by at most `BAR_TRAVEL_MM`. Off the sphere, a common scale would differ from the bar's length in the eighth digit,
+    and the rank would count it.
     """
     if run.kind == "bar":
         return replace(run, axes_mm=_resting(_on_the_sphere(run)))
@@ -69,7 +69,7 @@ def as_meant(run: RunData) -> RunData:
 
 
 def _on_the_sphere(run: RunData) -> F2:
-    """Positions of a ball-bar run with the nominal distance from the cup, if all of them are within the bar's range of it."""
+    """Positions of a ball-bar run moved to the nominal distance from the cup, if all are within the bar's range of it."""
     assert run.centre_mm is not None
     assert run.radius_mm is not None
     bar = _resting(run.axes_mm) - run.centre_mm
@@ -80,7 +80,7 @@ def _on_the_sphere(run: RunData) -> F2:
 
 
 def _resting(axes_mm: F2) -> F2:
-    """Positions with every axis that moves by less than `STRAIGHT_MM` at one place."""
+    """Positions in which every axis that moves by less than `STRAIGHT_MM` rests at its mean."""
     middle = axes_mm.mean(axis=0)
     return np.where(np.abs(axes_mm - middle).max(axis=0) < STRAIGHT_MM, middle, axes_mm)
 
@@ -92,10 +92,10 @@ class Knowledge:
     Attributes
     ----------
     fixed : mapping of set-up unknown to array, shape (number of terms,)
-        Unknowns that are known: zero, or this combination of the machine's own errors (a mirror that was squared to the machine's Z line
-        leans as that line does).
+        Known set-up errors: zero, or this combination of the machine's own errors (a mirror that was squared to the machine's Z line has
+        the tilt of that line).
     shared : tuple of tuples of names
-        Unknowns that are one and the same, e.g. the lengths of one sensor with two calibrated extension bars.
+        Groups of unknowns that are the same, e.g. the lengths of one sensor with two calibrated extension bars.
     lost_motion : bool
         Whether the machine may have lost motion. The papers' models have none.
     """
@@ -107,7 +107,7 @@ class Knowledge:
 
 @dataclass(frozen=True)
 class CampaignColumns:
-    """Readings of a campaign per unit of everything: ``machine`` (n, p), ``lost`` (n, 3) lost motion, ``setup`` (n, k), with its names."""
+    """Readings of a campaign per unit of the terms (``machine``, (n, p)), the lost motion (``lost``, (n, 3)) and the set-up (n, k)."""
 
     machine: F2
     lost: F2
@@ -126,11 +126,11 @@ class ObservedInformation:
     condition : float
         Largest over smallest singular value counted in ``rank``.
     factor : array, shape (p,)
-        Coefficient = factor times its value in unit columns.
+        Coefficient in its own unit = factor times its value in unit columns.
     singular : array, shape (p,)
         Singular values of the design with unit columns, set-up projected out.
     row_space, null_space : array, shape (p, rank) and (p, p - rank)
-        Orthonormal combinations (unit columns) that the readings show, and that leave no trace.
+        Orthonormal combinations (unit columns) that the readings show; that leave no trace.
     """
 
     rank: int
@@ -143,14 +143,14 @@ class ObservedInformation:
 
 
 def campaign_columns(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], setup: SetupUnknowns) -> CampaignColumns:
-    """Linearised readings of all runs as they were meant (`as_meant`), unweighted: what a reading shows does not depend on its noise."""
+    """Linearised readings of all runs without rounding (`as_meant`), unweighted, because the rank does not depend on the noise."""
     a = np.concatenate([run_design(machine, terms, as_meant(run), setup) for run in runs])
     p = len(terms)
     return CampaignColumns(a[:, :p], a[:, p : p + len(DIRECTIONS)], a[:, p + len(DIRECTIONS) :], setup.names)
 
 
 def compressed(columns: CampaignColumns) -> CampaignColumns:
-    """The same information in as few rows as there are columns (QR): everything after it is cheap, whatever the number of readings."""
+    """The same information in no more rows than columns (QR), so that later work does not depend on the number of readings."""
     whole = np.concatenate([columns.machine, columns.lost, columns.setup], axis=1)
     unit, factor = unit_columns(whole)
     if whole.shape[0] > whole.shape[1]:
@@ -161,11 +161,11 @@ def compressed(columns: CampaignColumns) -> CampaignColumns:
 
 
 def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup_names: tuple[str, ...]) -> Knowledge:
-    """What is stated about the set-up: lengths of calibrated bars, and whatever no hand sets (`HAND_SET`).
+    """Set-up unknowns that count as known: lengths of calibrated bars, and all others except those of `HAND_SET`.
 
     A bar counts as calibrated if every run with it says so or states its uncertainty, and none says the opposite
     (`abbe.models.solvers.priors.bar_length_sd`); how well it was calibrated enters the uncertainties, not the rank. Cup offsets, mirror
-    tilts, laser zeros and uncalibrated lengths are free, however narrow their priors.
+    tilts, laser zeros and uncalibrated lengths are free, however narrow their priors are.
     """
     vague = {bar_length_name(r.radius_mm) for r in runs if r.radius_mm is not None and not _calibrated(r)}
     return Knowledge({n: np.zeros(len(terms)) for n in setup_names if n.partition("_")[0] not in HAND_SET and n not in vague})
@@ -176,13 +176,13 @@ def _calibrated(run: RunData) -> bool:
 
 
 def perfect_setup(known: Knowledge, terms: tuple[Term, ...], setup: SetupUnknowns, kinds: tuple[str, ...] = HAND_SET) -> Knowledge:
-    """Known besides: all set-up unknowns of these kinds (``"cup"``, ``"tilt"``, ``"bar_length"``), as the papers assume."""
+    """Add to the knowledge that all set-up unknowns of these kinds (``"cup"``, ``"tilt"``, ``"bar_length"``) are zero, as papers assume."""
     more = {n: np.zeros(len(terms)) for n in setup.names if n.startswith(tuple(f"{k}_" for k in kinds))}
     return replace(known, fixed={**known.fixed, **more}, shared=tuple(g for g in known.shared if not set(g) & set(more)))
 
 
 def with_knowledge(columns: CampaignColumns, known: Knowledge) -> tuple[F2, F2, tuple[tuple[str, ...], ...]]:
-    """Machine columns, columns of what stays free (set-up unknowns and lost motion), and the names behind each of these."""
+    """Machine columns, columns of the free unknowns (set-up and lost motion), and the names of the unknowns behind each free column."""
     machine, at = columns.machine, {n: i for i, n in enumerate(columns.setup_names)}
     for name, combination in known.fixed.items():
         if combination.any():
@@ -198,12 +198,12 @@ def with_knowledge(columns: CampaignColumns, known: Knowledge) -> tuple[F2, F2, 
 
 
 def observed_information(columns: CampaignColumns, known: Knowledge) -> ObservedInformation:
-    """Rank and null space of the machine's coefficients, whatever the free set-up unknowns and the lost motion are.
+    """Rank and null space of the machine's coefficients, with free set-up unknowns and lost motion projected out.
 
     Raises
     ------
     ValueError
-        ``known`` names a set-up unknown that the campaign has not.
+        ``known`` names a set-up unknown that the campaign does not have.
     """
     strangers = set(known.fixed) | {n for group in known.shared for n in group}
     if strangers - set(columns.setup_names):
@@ -220,7 +220,7 @@ def observed_information(columns: CampaignColumns, known: Knowledge) -> Observed
 
 
 def _without_rounding(a: F2) -> F2:
-    """The design with columns that are nothing but rounding set to zero: brought to unit length they would count as seen."""
+    """The design with columns of mere rounding (`ROUNDING`) set to zero; scaled to unit length they would count as observed."""
     norm = np.linalg.norm(a, axis=0)
     return np.where(norm > ROUNDING * norm.max(initial=0.0), a, 0.0)
 
@@ -234,11 +234,11 @@ class Play:
     groups : tuple of tuples of names
         Names behind each free unknown.
     machine, free : arrays, shape (p, k) and (q, k)
-        Coefficients of each hidden combination and the free unknowns that go with it, own units.
+        Coefficients of each hidden combination, and the changes of the free unknowns that cancel it, own units.
     loose : array, shape (q, m)
         Changes of free unknowns alone that leave no trace, own units.
     size : array, shape (q, 1)
-        Value of each free unknown that is one in unit columns.
+        Value of each free unknown that equals one in unit columns.
     """
 
     groups: tuple[tuple[str, ...], ...]
@@ -249,7 +249,7 @@ class Play:
 
 
 def play(columns: CampaignColumns, known: Knowledge, observed: ObservedInformation) -> Play:
-    """Null space of machine and free unknowns together, from that of the machine alone (`observed_information`)."""
+    """Joint null space of machine and free unknowns, from the machine's null space (`observed_information`)."""
     machine, free, groups = with_knowledge(columns, known)
     unit, factor = unit_columns(free)
     u, s, vt = svd(unit, full_matrices=True)
@@ -261,9 +261,9 @@ def play(columns: CampaignColumns, known: Knowledge, observed: ObservedInformati
 
 
 def hidden_free(columns: CampaignColumns, known: Knowledge, observed: ObservedInformation) -> frozenset[str]:
-    """Free unknowns that take part in what is hidden, by name.
+    """Names of free unknowns that take part in hidden combinations.
 
-    Among them lost motion of axes that never reverse, like the pole axis of one helix. What is known (`Knowledge.fixed`) is not free.
+    Among them is the lost motion of axes that never reverse, like the pole axis of one helix.
     """
     found = play(columns, known, observed)
     share = np.linalg.norm(np.concatenate([found.free, found.loose], axis=1) / found.size, axis=1)
@@ -274,8 +274,8 @@ def hidden_free(columns: CampaignColumns, known: Knowledge, observed: ObservedIn
 class ParameterStatus:
     """One unknown: estimate (None before solving), standard uncertainty, prior standard deviation, in mm, rad or mm/s.
 
-    ``share``: 1 - (u / prior)^2, how much of the information comes from the readings; ``status``: by `OBSERVED` and `WEAKLY_OBSERVED`, and
-    never better than ``"not observable"`` for a parameter that takes part in a hidden combination.
+    ``share``: fraction of the information that comes from the readings, 1 - (u / prior)^2; ``status``: by `OBSERVED` and `WEAKLY_OBSERVED`,
+    but always ``"not observable"`` for a parameter that takes part in a hidden combination.
     """
 
     name: str
@@ -299,8 +299,9 @@ class Correlation:
 class MotionStatus:
     """One error motion as a function over its stroke, or one squareness.
 
-    ``share``: as of a parameter, for the function's mean variance over the stroke; ``hidden``: its coefficients that take part in hidden
-    combinations; ``status`` as of a parameter; ``reason``: why it may not be written into a table, empty if it may.
+    ``share``: as for a parameter (`ParameterStatus`), with the mean variance over the stroke; ``u``: rms standard uncertainty over the
+    stroke, mm or rad; ``hidden``: coefficients that take part in hidden combinations; ``status``: as for a parameter; ``reason``: why the
+    motion may not be written into a table, empty if it may.
     """
 
     name: str
@@ -375,14 +376,14 @@ def _reason(hidden: tuple[str, ...], share: float, status: Status) -> str:
         return f"{', '.join(hidden)} cannot be distinguished from other errors by these readings"
     if status == "observed":
         return ""
-    return f"only {100.0 * share:.0f} % of what is known of it comes from the readings, the rest is an assumption"
+    return f"only {100.0 * share:.0f} % of its information comes from the readings, the rest is an assumption"
 
 
 def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -> tuple[str, ...]:
-    """Error motions that may be written into tables of their own: numbers that rest on readings.
+    """Names of the error motions that may be written into tables of their own, because they rest on readings.
 
-    Rule for each: none of the motion's coefficients is in a hidden combination, and at least 90 % of what is known of it comes from the
-    readings (with ``weak``: 10 %). A hidden combination then changes neither readings nor tables. Other motions may still be corrected
-    where only their sum counts: in a grid of the volume for the tool that was measured with.
+    None of such a motion's coefficients is in a hidden combination, and at least 90 % of its information comes from the readings (with
+    ``weak``: 10 %). Other motions may still be corrected where only the sum of all motions counts: in a grid of the volume for the measured
+    tool.
     """
     return tuple(m.name for m in found if m.status == "observed" or (weak and m.status == "weak"))

@@ -1,8 +1,8 @@
-"""Uncertainty of the deviation at every point of the volume, and one number for the whole.
+"""Uncertainty of the deviation at every point of the volume, and one number for the whole campaign.
 
-All figures are of the deviation without the best-fit rigid motion over the inner 80 % of the strokes: where the workpiece lies is no
-property of the machine. Three standard deviations belong to a point: what a typical machine has (prior), what remains after the runs
-(posterior), and what one micrometre of reading noise makes of it (noise gain).
+All figures concern the deviation without its best-fit rigid motion over the inner 80 % of the strokes, because the workpiece's position is
+no property of the machine. Every point has three standard deviations: of a typical machine (prior), after the runs (posterior), and per
+micrometre of reading noise (noise gain).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from abbe.models.machine import Machine
 
 INNER = 0.8
 NODES = 11
-"""Nodes per axis over the strokes; those at 0.1 .. 0.9 make the inner 80 %."""
+"""Nodes per axis over the strokes; those at 0.1 to 0.9 of a stroke form the inner 80 %."""
 USABLE, GOOD = 3.0, 10.0
 """Bounds of the observability number (`observability_number`)."""
 
@@ -29,8 +29,8 @@ USABLE, GOOD = 3.0, 10.0
 class Knowing:
     """Covariances of the error motions' coefficients in their own units, shape (p, p).
 
-    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that reading noise makes, per mm
-    squared of reading noise (root mean square over the readings).
+    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that comes from reading noise, per
+    mm^2 of its mean square over the readings.
     """
 
     prior: F2
@@ -46,8 +46,8 @@ class Volume:
     ----------
     axes_mm : array, shape (n, 3)
     prior_mm, u_mm : array, shape (n,)
-        Root mean square length of the deviation of a typical machine; of the difference between truth and prediction (standard
-        uncertainty of the three components taken together, root of the sum of squares).
+        Rms length of a typical machine's deviation; of the difference between truth and prediction (root sum of squares of the components'
+        standard uncertainties).
     worst_mm : array, shape (n,)
         Standard uncertainty in the direction in which it is largest.
     gain : array, shape (n,)
@@ -71,9 +71,9 @@ class Volume:
 
 @dataclass(frozen=True)
 class Plane:
-    """Figures over one plane of the volume: values of ``volume`` in rows of ``second_mm``, i.e. ``u_mm.reshape(len(second), len(first))``.
+    """Figures on one plane of the volume; arrays of ``volume`` reshape to (second_mm.size, first_mm.size).
 
-    ``first``, ``second``, ``fixed``: axis indices across, up and through the plane, which lies at ``fixed_mm``.
+    ``first``, ``second``, ``fixed``: index of the axis across, up and normal to the plane, which lies at ``fixed_mm``.
     """
 
     first: int
@@ -87,11 +87,11 @@ class Plane:
 
 @dataclass(frozen=True)
 class Number:
-    """The observability number: how many times smaller the volumetric error of a typical machine can become by these runs.
+    """The observability number: the factor by which these runs can reduce the volumetric error of a typical machine.
 
-    ``value``: at the worst place of the inner 80 %, before over after; ``median``: median place before over median place after;
-    ``before_mm``, ``after_mm``: the sizes behind ``value``; ``worst_place_mm``: the worst place afterwards; ``verdict``: ``"good"``,
-    ``"usable with care"`` or ``"mostly assumption"``; ``text``: in words.
+    ``value``: largest rms deviation in the inner 80 % before correction (``before_mm``) over the largest after it (``after_mm``, at
+    ``worst_place_mm``); ``median``: the same with medians; ``verdict``: ``"good"``, ``"usable with care"`` or ``"mostly assumption"``;
+    ``text``: a sentence.
     """
 
     value: float
@@ -104,7 +104,7 @@ class Number:
 
 
 def inner_box(machine: Machine) -> F2:
-    """The inner 80 % of every stroke, shape (3, 2)."""
+    """The inner 80 % of every stroke, shape (3, 2), mm."""
     edge = 0.5 * (1.0 - INNER) * machine.length_mm[:, None] * np.array([1.0, -1.0])
     return np.asarray(machine.stroke_mm + edge)
 
@@ -119,7 +119,7 @@ def frame_free_design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2, re
 
 
 def _rigid_about(points_mm: F2, centre_mm: F1) -> F3:
-    """As `abbe.models.geometry.volume.rigid_design`, about a given centre instead of the points' own."""
+    """As `abbe.models.geometry.volume.rigid_design`, about a given centre instead of the mean of the points."""
     out = np.zeros((points_mm.shape[0], 3, 6))
     out[:, :, :3] = np.eye(3)
     for k in range(3):
@@ -169,15 +169,13 @@ def _length(covariance: F3) -> F1:
 
 
 def observability_number(volume: Volume) -> Number:
-    """The factor by which a correction from these runs can at best reduce the error of a typical machine, at the worst inner place.
+    """Factor by which a correction from these runs can at best reduce the largest error of a typical machine.
 
-    Largest prior size over largest remaining uncertainty, both without rigid motion, over the inner 80 %. (Point by point the ratio would
-    blame the middle of the volume, where a machine whose frame was fitted has little error to begin with.) Controls that calibrate
-    kinematics print a "valuation number" for the measuring positions, in parameters' units. This one has no units, is about the deviation
-    that is corrected, and can be read on the shop floor: at 10, a machine with 30 um of volumetric error can be brought to 3 um, no
-    better. Without runs it is 1. Thresholds: below 3, more than a tenth of the variance (1/3^2) that a typical machine has stays unknown:
-    what would be written there is mostly what was assumed about machines, and not worth the risk. From 10 on it is at most a hundredth,
-    and repeatability and temperature decide. Not in it: what functions of the model's order cannot follow, and what changes with time.
+    It is the largest prior size over the largest remaining uncertainty in the inner 80 %, both without rigid motion. (A ratio at each point
+    would be lowest in the middle of the volume, where the fitted rigid motion leaves little error.) At 10, a machine with 30 um of
+    volumetric error can be brought to 3 um at best; without runs the number is 1. Below 3, more than a tenth of a typical machine's
+    variance (1/3^2) stays unknown: a correction would be mostly assumption. From 10 on, at most a hundredth does, and repeatability and
+    temperature dominate. The number does not include errors above the model's order and changes with time.
     """
     prior, u = volume.prior_mm[volume.inner], np.maximum(volume.u_mm[volume.inner], 1e-12)
     k = int(np.argmax(u))

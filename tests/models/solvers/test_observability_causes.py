@@ -30,7 +30,7 @@ def test_a_campaign_of_a_line_along_x_is_not_told_to_measure_x():
     assert "X alone was measured along one line only (Y = 0 mm, Z = 0 mm)" in text
     assert "another laser line along X at Y = 450 mm, Z = 360 mm" in text
     assert "nothing here measures Y alone against a known length" in text
-    assert "None of the usual additions alone shows it" in text
+    assert "None of the usual additional measurements alone would show it" in text
 
 
 def test_another_line_stands_where_none_is_yet():
