@@ -45,7 +45,7 @@ UPRIGHT = 2
 
 @dataclass(frozen=True, slots=True)
 class SignCommissioning:
-    """What commissioning found, and its id in the store."""
+    """Result of a commissioning, and its id in the store."""
 
     proof: SignProof
     solution_id: int
@@ -61,7 +61,7 @@ class CommissioningContext:
     bar: BarPlaces
 
     async def read_with_table(self, what: str, tables: NineTables, base: Base, lsb_nm: int) -> PlaceReadings:
-        """Read all places with test tables in force; afterwards the old ones are in force again, whatever happens."""
+        """Read all places with test tables in force; afterwards the old tables are in force again, whatever happens."""
         now = await read_base(self.session.controller)
         if now.crc != base.crc:
             raise TableMismatch("the active table was changed during commissioning", "start commissioning again")

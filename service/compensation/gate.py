@@ -77,7 +77,7 @@ class PushPrecheck:
         return found
 
     def renewed(self, store: Store, now_s: float) -> PushPrecheck:
-        """The same with the present decisions and time; the controller stays as it was read."""
+        """Return a copy with the present decisions and time; the controller is not read again."""
         approvals, rejections = tuple(store.proposals.approvals(self.number)), tuple(store.proposals.rejections(self.number))
         return replace(self, approvals=approvals, rejections=rejections, context=replace(self.context, now_s=now_s))
 

@@ -167,7 +167,7 @@ def load(store: Store, number: int) -> Proposed:
     Raises
     ------
     StoreError
-        There is none of this number, or its row was changed.
+        There is no such proposal, or its row was changed.
     """
     record = store.proposals.get(number)
     try:

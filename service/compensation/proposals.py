@@ -125,7 +125,7 @@ async def candidate_context(
 
 
 def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
-    """The tables in force `MONTH` ago by the journal: the base of the first kept push if it came later, the present ones without a push."""
+    """The tables in force `MONTH` ago by the journal: the first push's base if none was kept by then, ``base`` if none ever was."""
     kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
     if not kept:
         return base.tables
@@ -250,7 +250,7 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int) -> Proposal:
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:
-    """Solve the campaign of a stored proposal again, to compare it with a newer run. ``table``: the one in force when measured."""
+    """Solve a stored proposal's campaign again, to compare the solution with a newer run. ``table``: in force during the campaign."""
     known = await asyncio.to_thread(_campaign_without_known_effects, store, campaign, table)
     return await asyncio.to_thread(solve_runs, site, known.campaign.runs)
 

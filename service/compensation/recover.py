@@ -143,7 +143,9 @@ async def accept(controller: TableController, store: Store, site: Site, by: str 
         if ended.settled and journal[-1].state is not PushState.OPERATOR:
             changed = before.active_bank != now.active_bank
             what = (
-                "the table from before it was made active again: look at the controller once more" if changed else "its table is as it was"
+                "the table from before it was made active again: look at the controller once more"
+                if changed
+                else "its active table is unchanged"
             )
             return f"push {journal[-1].push} was interrupted and is finished now ({journal[-1].state}); {what}; nothing was accepted"
     return await _accepted(controller, store, site, by)
@@ -337,7 +339,7 @@ async def finish_when_safe(
 
 
 def _blocked_by(look: Outcome) -> str:
-    """What blocks the rollback, by one look; empty if nothing does."""
+    """Return what blocks the rollback, as one look at the controller shows it; empty if nothing does."""
     if isinstance(look, Done):
         return look.value.unsafe if isinstance(look.value, Truth) else "no answer"
     # The message of the link counts down: its text would differ, and notify, at every look.

@@ -177,7 +177,9 @@ def table_before_last_kept(journal: JournalView, base: Base) -> KnownTable:
     last = journal.last_kept()
     f, number = facts(last), last[-1].push
     if f.image != base.image:
-        raise TableRefused(f"the table in force is not the one of push {number}", "say which with --to PUSH; nothing was written")
+        raise TableRefused(
+            f"the table in force is not the one of push {number}", "name the push to go back to with --to PUSH; nothing was written"
+        )
     return _base(last, f"the table that was in force before push {number}")
 
 
@@ -226,7 +228,7 @@ async def _attempt(controller: TableController, store: Store, site: Site, order:
 
 
 def check_unchanged(store: Store, machine: str, order: RollbackOrder, control: str = "") -> None:
-    """Refuse an order that was given for another table than the one that the journal has in force now.
+    """Refuse an order for another table than the journal has in force now.
 
     Raises
     ------

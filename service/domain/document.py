@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What the database adds to a record when it stores it: a number, and the time (UTC). 0 and empty before that."""
+    """Fields that the database adds when it stores a record: number and time (UTC); 0 and empty before that."""
 
     id: int = 0
     created_utc: str = ""

@@ -76,7 +76,7 @@ class Columns:
 
     @property
     def readings_mm(self) -> F1:
-        """The readings as they are, also invalid ones, shape (n,).
+        """All readings, valid or not, shape (n,).
 
         Raises
         ------

@@ -158,7 +158,7 @@ class ReportedBanks:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushFacts(OperationOrder):
-    """Everything that a push's journal states; later entries override earlier ones. By the state whose entry brings it:
+    """Everything that a push's journal states; later entries override earlier ones. Facts by the state whose entry brings them:
 
     SNAPSHOT: the order; boot id, generation and register map of the controller; bank, CRC, bytes and semantic digest of the table in
     force; the bank ``target`` for the new table. REJECTED: reasons. APPROVED: digest, approver, expiry. STAGED, ACTIVATING, PROBATION:
@@ -200,7 +200,7 @@ class PushFacts(OperationOrder):
     by: str = ""
 
     def binding(self, expiry: str) -> str:
-        """What an approval until ``expiry`` has to bind (`approval_digest`)."""
+        """The digest that an approval until ``expiry`` has to bind (`approval_digest`)."""
         return approval_digest(self.image, base_image=self.base_image, machine=self.machine, limits=self.limits, expiry=expiry)
 
 

@@ -199,7 +199,7 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
     if not context.now_s - limits.age_h * 3600.0 <= e.ended_s <= newest_s <= context.now_s:
         yield f"STALE: measured {(context.now_s - e.ended_s) / 3600.0:.1f} h ago, allowed are 0 to {limits.age_h:g} h"
     if e.machine_mark != context.machine_mark:
-        yield "CHANGED: the control was restarted since the measurement, or in the course of it: measure again"
+        yield "CHANGED: the control was restarted during or since the measurement: measure again"
     if not low <= e.temperature_c[0] <= e.temperature_c[1] <= high:
         yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, allowed are {low:g} to {high:g} °C"
     if e.run_count < limits.runs:

@@ -194,9 +194,9 @@ class Runs(Repository):
         Raises
         ------
         NotStored
-            There is none.
+            There is no such run.
         StoreError
-            There is more than one.
+            Several runs match.
         """
         text = str(id_or_label)
         named = (runs.c.label == text) | (campaigns.c.name + "/" + runs.c.label == text)

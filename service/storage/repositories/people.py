@@ -72,7 +72,7 @@ class People(Repository):
         return self._db.commit(work)
 
     def session(self, digest: str) -> tuple[SessionRecord, UserRecord] | None:
-        """Find a session, ended ones too, and its user."""
+        """Find a session, even an ended one, and its user."""
         query = SESSION.select().add_columns(*USER.columns).join(users, users.c.id == sessions.c.user_id)
         row = self._db.read(lambda connection: connection.execute(query.where(sessions.c.digest == digest)).first())
         return None if row is None else (SESSION.read(row), USER.read(row))
@@ -104,7 +104,7 @@ class People(Repository):
         return self._db.commit(work)
 
     def token(self, prefix: str) -> tuple[TokenRecord, UserRecord] | None:
-        """Find a token by its prefix, revoked ones too, and its user."""
+        """Find a token by its prefix, even a revoked one, and its user."""
         found = self._tokens(api_tokens.c.prefix == prefix)
         return found[0] if found else None
 
