@@ -24,5 +24,5 @@ def visible(text: str) -> str:
 
 
 def visible_json(text: str) -> str:
-    """Escape the same characters in a JSON document as ``\\uXXXX``: it keeps its line breaks and its value."""
+    """Escape the characters of `visible` in a JSON document as ``\\uXXXX``, except line breaks: the document keeps its value."""
     return _OBEYED.sub(lambda found: found[0] if found[0] == "\n" else f"\\u{ord(found[0]):04x}", text)

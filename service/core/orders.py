@@ -222,7 +222,7 @@ class Orders(RetryingStore):
         return _TableOrderJob(ROLLBACK, f"{ROLLBACK} of push {asked.push}", self._trail(begun), act, look, self._read)
 
     async def push(self, asked: PushNow) -> Answer:
-        """Begin to push an approved proposal, once for each key; the job first measures its verification before the push."""
+        """Begin to push an approved proposal, once for each key; the job first measures a verification with the present table."""
         requested = JobRequest(asked.request, asked.who, asked.key, f"{PUSH} of proposal {asked.proposal}")
         refused = await self._refused(requested, "order a push", self._actions.push is None and BY_ITSELF)
         if refused is not None:
@@ -250,7 +250,7 @@ class Orders(RetryingStore):
         assert push is not None
 
         async def in_audit() -> None:
-            """Do nothing: the audit has the begin already."""
+            """Do nothing: the audit already has a record of the beginning."""
 
         async def act(progress: ProgressSink, control: Control) -> JobOutcome:
             return await push(PushOrder(asked.proposal, in_audit, progress, control))

@@ -253,7 +253,7 @@ async def narrate(simulator: SimulatorProcess, machine: str, store: Store, servi
 
 
 def _checks(store: Store, machine: str) -> list[str]:
-    """Results of the scheduled checks of a machine, oldest first."""
+    """Return the results of the scheduled checks of a machine, oldest first."""
     number = next((m.id for m in store.machines.all() if m.name == machine), None)
     rows = [] if number is None else store.verifications.latest(number)
     return [str(v.doc.get("text", "")) for v in sorted(rows, key=lambda v: v.id) if v.doc.get("schedule")]

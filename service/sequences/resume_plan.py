@@ -87,7 +87,7 @@ class PathProgress:
         self.start_us, self.good_us = status.path_start_us, status.ctrl_us
 
     def _lag(self, gone_mm: float, position_mm: Point) -> float | None:
-        """Lag of the position behind constant feed, mm; None if the position is not on the path near there."""
+        """Return the lag of the position behind constant feed, mm; None if the position is not on the path near there."""
         first, last = np.searchsorted(self._arc, (gone_mm - AROUND_MM, gone_mm + AROUND_MM))
         points, arc = self._points[max(first - 1, 0) : last + 1], self._arc[max(first - 1, 0) : last + 1]
         if len(points) < 2:
@@ -328,7 +328,7 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
 
 
 def _all_axes_from(trail: tuple[Point, ...]) -> int:
-    """Number of the point from which every moving axis makes its last motion to the trail's end."""
+    """Return the number of the point from which every moving axis makes its last motion to the trail's end."""
     moved = np.abs(np.diff(np.array(trail), axis=0)) > 0.0
     return min((int(np.flatnonzero(moved[:, a])[-1]) for a in range(3) if moved[:, a].any()), default=len(trail) - 1)
 
@@ -369,7 +369,7 @@ def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
 
 
 def _from_centre(test: TestPlan) -> tuple[Step, ...]:
-    """Steps of a test whose bar is hung in anew at the centre: over the pole instead of from the end of the previous test."""
+    """Return the steps of a test whose bar is hung in anew at the centre: over the pole instead of from the end of the previous test."""
     first = next(k for k, step in enumerate(test.steps) if isinstance(step, RecordPath | ReadBar))
     near = [s for s in test.steps[:first] if isinstance(s, MoveTo)][-2:]  # beside the path's start, and that start
     start = near[-1]

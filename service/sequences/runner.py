@@ -179,7 +179,7 @@ class Runner:
             raise RunInterrupted("the axes were moved during the pause", "the test resumes from its last checkpoint")
 
     async def _spared(self) -> bool:
-        """Whether nothing of ours can move and another program controls the machine: a stop would end that program."""
+        """Return whether nothing of ours can move and another program controls the machine: a stop would end that program."""
         if not self._still:
             return False
         status = await self._s.controller.status()

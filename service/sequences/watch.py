@@ -82,14 +82,14 @@ class Watch:
             await self._rest(left_s)
 
     def _just_heard(self) -> ControllerStatus | None:
-        """Status that another task read less than a period ago, or None."""
+        """Return the status that another task read less than a period ago, or None."""
         status = latest_status(self._s.controller)
         if status is None or status.host_s <= max(self._since_s, time.monotonic() - self._w.period_s):
             return None
         return status
 
     async def laser(self, laser: DisplacementMeter) -> None:
-        """Poll the laser until the test ends: its beam while that matters, the air always.
+        """Poll the laser until the test ends: the beam while `beam` is true, the air if its temperature is watched.
 
         Raises
         ------

@@ -31,7 +31,7 @@ def push(
     ] = 600.0,
     accept_table: AcceptTable = False,
 ) -> None:
-    """Push a proposal, prove it, measure again; roll back to the old table if the machine is not better (exit code 1)."""
+    """Push a proposal, test the signs of its tables, measure again; roll back if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import display, rollback_when_safe, run_job
     from abbe.service.compensation.correct import push as work_push
     from abbe.service.compensation.gate import PushContext, admit

@@ -28,7 +28,7 @@ class NcSettings:
     memory_kib: Mapping[str, float] = field(default_factory=dict)
 
     def memory_of(self, dialect: str) -> float | None:
-        """Program memory in KiB; None: no relevant limit."""
+        """Return the program memory in KiB; None: no relevant limit."""
         return self.memory_kib.get(dialect, USUAL_MEMORY_KIB.get(dialect))
 
 
@@ -245,7 +245,7 @@ class Runtime:
 
     @property
     def total_s(self) -> float:
-        """Sum of both."""
+        """Time of motion and dwells together, s."""
         return self.moving_s + self.resting_s
 
 

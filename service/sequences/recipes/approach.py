@@ -121,7 +121,7 @@ class Cup:
         return np.asarray(self.centre + self.radius_mm * self.up)
 
     def lowest(self, points: Iterable[Point]) -> float:
-        """Height of the lowest point above the equator, as a share of the radius; negative: below."""
+        """Return the height of the lowest point above the equator, as a share of the radius; negative: below."""
         return float(((np.array(list(points)) - self.centre) @ self.up).min()) / self.radius_mm
 
 

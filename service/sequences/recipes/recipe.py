@@ -114,7 +114,7 @@ class Helix(CupTest):
     even: bool = inner(False)
 
     def path(self) -> Path:
-        """All points in the order of driving, feed-in and feed-out included."""
+        """Return all points in the order of driving, feed-in and feed-out included."""
         length = 2 * np.pi * self.radius_mm * self.turns
         arcs = np.deg2rad([self.feed_in_deg, self.feed_out_deg])
         lead, tail = (int(np.ceil(self.radius_mm * a / self.chord_mm)) for a in arcs)
@@ -131,7 +131,7 @@ class Helix(CupTest):
         return joined((first, curve, last))
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: to the centre, mount, out to the path's start, record the path, clear away.
+        """Return the test with its steps: to the centre, mount, out to the path's start, record the path, clear away.
 
         Raises
         ------
@@ -170,14 +170,17 @@ class HelixPoints(CupTest):
     kind: Literal["helix_points"] = "helix_points"
 
     def path(self) -> Path:
-        """Positions in the order of reading."""
+        """Return the positions in the order of reading."""
         curve = helix_points(np.array(self.centre_mm), self.radius_mm, turns=self.turns, n=self.points, law=self.law, axis=self.axis)
         if self.opens < 0:
             curve[:, self.axis] = 2.0 * self.centre_mm[self.axis] - curve[:, self.axis]
         return as_points(curve[:: self.direction]), None
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: to the centre, mount, out to the first position; read, move along the sphere, read; clear away. Raises as `Helix`."""
+        """Return the test with its steps: to the centre, mount, out to the first position; read and move along the sphere; clear away.
+
+        Raises as `Helix.plan`.
+        """
         _check_turns(self.label, self.turns)
         path, _ = self.path()
         up = pole_of(self)[1]
@@ -219,7 +222,7 @@ class Circle(CupTest):
     chord_mm: float = inner(0.5)
 
     def arc(self) -> dict[str, float]:
-        """Start, span, feed-in and feed-out of the arc, degrees, with defaults for fields without a value."""
+        """Return start, span, feed-in and feed-out of the arc, degrees, with defaults for fields without a value."""
         upright = AXES[self.axis] in self.plane
         span = self.span_deg if self.span_deg is not None else PARTIAL_DEG if upright else 360.0
         pole = (0.0 if self.plane[0] == AXES[self.axis] else 90.0) + (0.0 if self.opens > 0 else 180.0)
@@ -233,7 +236,7 @@ class Circle(CupTest):
         }
 
     def path(self) -> Path:
-        """All points in the order of driving, feed-in and feed-out included."""
+        """Return all points in the order of driving, feed-in and feed-out included."""
         turn, arc = float(self.direction), self.arc()
         first = arc["start_deg"] if turn > 0 else arc["start_deg"] + arc["span_deg"]
         parts = np.array([arc["feed_in_deg"], arc["span_deg"], arc["feed_out_deg"]])
@@ -248,7 +251,7 @@ class Circle(CupTest):
         return joined((arcs[0], arcs[1], arcs[2]))
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: to the centre, mount, out to the path's start, record the path, clear away."""
+        """Return the test with its steps: to the centre, mount, out to the path's start, record the path, clear away."""
         path, measured = self.path()
         steps = to_path(self, path, machine)
         steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction, measured))
@@ -324,7 +327,7 @@ class Diagonal(BeamTest):
     kind: Literal["diagonal"] = "diagonal"
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: approach, mount, zero, one reading after every move, clear away.
+        """Return the test with its steps: approach, mount, zero, one reading after every move, clear away.
 
         Raises
         ------
@@ -361,7 +364,7 @@ class FaceDiagonal(BeamTest):
     kind: Literal["face"] = "face"
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: approach, mount, zero, one reading after every move, clear away."""
+        """Return the test with its steps: approach, mount, zero, one reading after every move, clear away."""
         box = machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM])
         start, end = face_ends(box, self.plane, self.diagonal, self.at_share)
         letters = ["p", "p", "p"]
@@ -387,7 +390,7 @@ class Linear(BeamTest):
     kind: Literal["line"] = "line"
 
     def plan(self, machine: Machine) -> TestPlan:
-        """Steps: approach, mount, zero, one reading after every move, clear away."""
+        """Return the test with its steps: approach, mount, zero, one reading after every move, clear away."""
         others = [a for a in range(3) if a != self.axis]
         start = machine.stroke_mm[:, 0].copy()
         start[others] += np.array(self.at_share) * machine.length_mm[others]
