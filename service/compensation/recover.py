@@ -145,7 +145,7 @@ async def accept(controller: TableController, store: Store, site: Site, by: str 
             what = (
                 "the table from before it was made active again: look at the controller once more"
                 if changed
-                else "its active table is unchanged"
+                else "the active table is unchanged"
             )
             return f"push {journal[-1].push} was interrupted and is finished now ({journal[-1].state}); {what}; nothing was accepted"
     return await _accepted(controller, store, site, by)
