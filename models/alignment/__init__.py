@@ -1,1 +1,1 @@
-"""Clocks of devices and this computer: what time a sample was taken at, and where the machine was then."""
+"""When a sample was taken, by the clocks of devices and this computer, and where the machine was then."""

@@ -1,6 +1,7 @@
-"""Device time to host time by a robust fit with drift; steps of a clock and restarts of a device.
+"""Fit of device time to host time with drift, and detection of clock steps and device restarts.
 
-Arrival times are never taken for sample times, only for upper bounds of them. Samples before and after a break must never be joined.
+The host knows when a sample arrived, not when the device took it: arrival times are only upper bounds of sample times. Each segment between
+two breaks has a fit of its own.
 """
 
 from __future__ import annotations
@@ -13,33 +14,33 @@ import numpy as np
 
 from abbe.models.arrays import F1
 
-# The straight line under a cloud of arrivals: nothing arrives before it was sampled, but anything may arrive late.
+# The straight line under a cloud of arrivals: no sample arrives before it was taken, but any may arrive late.
 
 
 BLOCKS = 200
 LOWEST = 24
 MANY = 100
-"""Number of least delays from which the power of their distribution near the least possible delay is estimated; fewer for few points."""
+"""Number of smallest delays that give the exponent of the delay distribution near its lower end; `LOWEST` if there are few points."""
 LEAST_PAIRS = 2 * LOWEST + 2
 EARLY = 3.0
-"""A single arrival that lies below the line of all others by more than this many times the 24th least delay is not an arrival: a stamp is
-wrong."""
+"""If one arrival lies below the line of all others by more than this many times their 24th smallest delay, its time stamp is wrong."""
 MOST_EARLY = 3
 STEP_BLOCKS = 40
 LEAST_IN_BLOCK = 10
 SURE = 10.0
-"""Smallest step that is recognised, as a multiple of the scatter of the blocks' shortest delays."""
+"""Smallest step that is detected, as a multiple of the scatter of the blocks' smallest delays."""
 LEAST_STEP_S = 1e-3
 SIDE = 4
-"""Minimum number of blocks on either side of a step: fewer late ones at an end are a spike."""
+"""Minimum number of blocks on either side of a step; fewer late blocks at an end count as a spike of the delays."""
 
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of the line under delays with a power-law distribution, in units of the 24th least delay, by the estimated power.
+    """Error of the lower envelope of delays with a power-law distribution, in units of the 24th smallest delay.
 
-    ``bias``: of the line in the middle, upwards; ``half`` and ``tilt``: half the 95.45 % width of its error there, and of its rise from end
-    to end. Counted on 40 000 and 60 000 clouds with powers 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
+    ``shape``: estimated exponent, for which the others hold. ``bias``: how much too high the line lies in the middle. ``half``, ``tilt``:
+    half the 95.45 % width of the error there, and of the rise from end to end. Simulated on 40 000 and 60 000 clouds with exponents 0.6 to
+    4.5 (tests/experiments/campaigns/envelope_constants.py).
     """
 
     shape: tuple[float, ...]
@@ -64,9 +65,9 @@ MANY_DELAYS = Constants(
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """Line ``level + slope (x - middle)`` under the cloud, its bias taken off; uncertainties are standard ones (half of 95 %).
+    """Line ``level + slope (x - middle)`` under a cloud of points, corrected for its bias, with standard uncertainties.
 
-    ``span``: from the first to the last x. ``lowest``: indices of the two points that it rests on.
+    ``span``: from the first to the last x. ``lowest``: indices of the two points on which the line rests.
     """
 
     middle: float
@@ -79,7 +80,7 @@ class Envelope:
 
 
 def lower_envelope(x: F1, y: F1) -> Envelope:
-    """The line below all points with the least sum of distances to them (an edge of the lower convex hull), corrected for its bias.
+    """Fit the line below all points with the least sum of distances (an edge of the lower convex hull), corrected for its bias.
 
     Parameters
     ----------
@@ -89,14 +90,14 @@ def lower_envelope(x: F1, y: F1) -> Envelope:
     Raises
     ------
     ValueError
-        Fewer points, x not rising, or values that are not finite.
+        Fewer points, x that decreases, or values that are not finite.
     """
     if x.size < 2 * LOWEST + 2 or x.shape != y.shape:
-        raise ValueError(f"envelope: {x.size} points, at least {2 * LOWEST + 2} are needed")
+        raise ValueError(f"envelope: {x.size} points given, at least {2 * LOWEST + 2} needed")
     if not (np.isfinite(x).all() and np.isfinite(y).all()) or (np.diff(x) < 0.0).any() or x[-1] <= x[0]:
         raise ValueError("envelope: x must rise, and all x and y must be finite")
     middle = 0.5 * float(x[0] + x[-1])
-    slope0 = float(np.polyfit(x - middle, y, 1)[0])  # rough: what is left is small, so that nothing is lost to rounding
+    slope0 = float(np.polyfit(x - middle, y, 1)[0])  # a rough slope first: small residuals lose no digits
     left, rest = x - middle, y - y[0] - slope0 * (x - middle)
     i, k = _edge(left, rest)
     slope = float((rest[k] - rest[i]) / (left[k] - left[i]))
@@ -111,19 +112,19 @@ def lower_envelope(x: F1, y: F1) -> Envelope:
 
 
 def _edge_of_delays(lowest: F1) -> tuple[float, float]:
-    """The 24th least delay, and with what power of the delay their number grows."""
+    """Return the 24th smallest delay, and the exponent with which the number of delays grows with their size."""
     top, scale = float(lowest.max()), float(np.partition(lowest, LOWEST - 1)[LOWEST - 1])
     if scale <= 0.0:
-        return 0.0, 1.0  # all delays are the same: the line lies where it should
+        return 0.0, 1.0  # all delays are equal: the line has no bias
     logs = np.log(top / np.maximum(lowest, 1e-9 * top))
     return scale, float((lowest.size - 1) / max(float(logs.sum()), 1e-12))
 
 
 def _edge(x: F1, y: F1) -> tuple[int, int]:
-    """Indices of the two ends of that edge of the lower convex hull which spans the mean of x."""
+    """Return the end points (indices) of the edge of the lower convex hull that spans the mean of x."""
     some = np.unique([a + int(np.argmin(y[a:b])) for a, b in pairwise(np.linspace(0, x.size, min(BLOCKS, x.size) + 1).astype(int))])
     rough = _hull(x, y, np.unique(np.concatenate([[0], some, [x.size - 1]])))
-    # what lies above the hull of some of the points is not a corner of the hull of all
+    # a point above the hull of some points cannot be a corner of the hull of all
     hull = _hull(x, y, np.flatnonzero(y <= np.interp(x, x[rough], y[rough]) + 1e-15))
     at = int(np.searchsorted(x[hull], x.mean())) - 1
     at = min(max(at, 0), len(hull) - 2)
@@ -148,11 +149,11 @@ def _above(x: F1, y: F1, a: int, b: int, c: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ClockFit:
-    """One clock in terms of another: ``host = host_s0 + rate (device - device_s0)``, least delay taken off.
+    """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, the shortest delay subtracted.
 
-    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host's time there, ``u_rate`` of the rate,
-    ``u_delay_s`` of the least delay, which arrivals cannot show. ``early``: arrivals that were left out because they came too soon to be
-    possible.
+    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host time there, ``u_rate`` of the rate,
+    ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number left out because
+    they came impossibly early.
     """
 
     device_s0: float
@@ -166,7 +167,7 @@ class ClockFit:
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster than the host the device's clock runs."""
+        """How much faster the device's clock runs than the host's."""
         return (1.0 / self.rate - 1.0) * 1e6
 
     @property
@@ -175,46 +176,45 @@ class ClockFit:
         return self.u_rate / self.rate**2 * 1e6
 
     def host_s(self, device_s: F1) -> F1:
-        """Host time at which the device's clock showed ``device_s``."""
+        """Return the host time at which the device's clock showed ``device_s``."""
         return np.asarray(self.host_s0 + self.rate * (np.asarray(device_s, dtype=np.float64) - self.device_s0))
 
     def u_host_s(self, device_s: F1) -> F1:
-        """Standard uncertainty of `host_s` at ``device_s``."""
+        """Return the standard uncertainty of `host_s`."""
         away = self.u_rate * (np.asarray(device_s, dtype=np.float64) - self.device_s0)
         return np.sqrt(self.u_offset_s**2 + self.u_delay_s**2 + away**2)
 
     def device_s(self, host_s: F1) -> F1:
-        """What the device's clock showed at a host time."""
+        """Return the device time at a host time."""
         return np.asarray(self.device_s0 + (np.asarray(host_s, dtype=np.float64) - self.host_s0) / self.rate)
 
 
 def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_delay_s: float = 0.0, grid_s: float = 0.0) -> ClockFit:
-    """Fit host time over device time to pairs of stamp and arrival.
+    """Fit host time over device time to pairs of device time stamp and host arrival time.
 
-    Delays are never negative and have a long tail (adapters collect bytes for 16 ms, the operating system adds spikes), so the fit is the
-    line under all arrivals, not through their middle (Moon, Skelly, Towsley 1999; here with its bias and uncertainty from the least
-    delays).
+    Delays are never negative and have a long tail (adapters collect bytes for 16 ms, the operating system adds spikes). So the line runs
+    under all arrivals, not through their middle (Moon, Skelly, Towsley 1999); its bias and uncertainty come from the smallest delays.
 
     Parameters
     ----------
     device_s, arrived_s : array, shape (n,)
-        Device time of a sample (the newest of those that arrived together), and monotonic host time of its arrival.
-        50 pairs or more, of one segment: no reboot, no step in between.
+        Device time of a sample (the newest of those that arrived together), and monotonic host time of its arrival. At least 50 pairs from
+        one segment, without a restart or a clock step.
     least_delay_s, u_delay_s : float
-        Shortest delay of the link itself, and its standard uncertainty; the arrivals do not show it.
+        Shortest delay of the link itself, which the arrivals do not show, and its standard uncertainty.
     grid_s : float
         If an adapter collects bytes in step with the samples, delays lie on a grid of this width (the greatest common divisor of both
-        periods), and the arrivals do not show a slow drift. Uncertainties include the grid (0.6 of it over the span; for the offset a
-        uniform distribution from 0 to the grid).
+        periods) and hide a slow drift. The uncertainties then include the grid: 0.6 of it over the span for the rate, and a uniform
+        distribution from 0 to the grid for the offset.
 
     Raises
     ------
     ValueError
-        Too few pairs, device time that does not rise, or values that are not finite.
+        Too few pairs, times that do not rise, or values that are not finite.
     """
     x, y = np.asarray(device_s, dtype=np.float64), np.asarray(arrived_s, dtype=np.float64)
     if x.size < LEAST_PAIRS:
-        raise ValueError(f"clock: {x.size} pairs of stamp and arrival, at least {LEAST_PAIRS} are needed")
+        raise ValueError(f"clock: {x.size} pairs of time stamp and arrival, at least {LEAST_PAIRS} are needed")
     early = 0
     found = lower_envelope(x, y)
     while early < MOST_EARLY and x.size > LEAST_PAIRS:
@@ -224,7 +224,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
         x, y, early = np.delete(x, worst), np.delete(y, worst), early + 1
         found = lower_envelope(x, y)
     if not found.slope > 0.0:
-        raise ValueError("clock: the host's time does not grow with the device's")
+        raise ValueError("clock: host time does not rise with device time")
     level = found.level - least_delay_s
     u_level = float(np.hypot(found.u_level, grid_s / np.sqrt(3.0)))
     u_slope = float(np.hypot(found.u_slope, 0.6 * grid_s / found.span))
@@ -232,7 +232,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
 
 
 def _too_early(x: F1, y: F1, lowest: tuple[int, int]) -> int | None:
-    """The one of the two points under the line that the others do not explain."""
+    """Return the index of that one of the ``lowest`` points which lies impossibly far below the line of all others, if any."""
     for k in lowest:
         rest_x, rest_y = np.delete(x, k), np.delete(y, k)
         line = lower_envelope(rest_x, rest_y)
@@ -245,7 +245,7 @@ def _too_early(x: F1, y: F1, lowest: tuple[int, int]) -> int | None:
 
 
 def across(device: ClockFit, other: ClockFit, device_s: F1) -> tuple[F1, F1]:
-    """A device's time in the time of another one's clock, by way of the host, with its standard uncertainty."""
+    """Convert a device's time to the clock of another device through host time; return it with its standard uncertainty."""
     host = device.host_s(device_s)
     there = other.device_s(host)
     u = np.sqrt(device.u_host_s(device_s) ** 2 + other.u_host_s(there) ** 2) / other.rate
@@ -253,15 +253,14 @@ def across(device: ClockFit, other: ClockFit, device_s: F1) -> tuple[F1, F1]:
 
 
 def relative_rate(device: ClockFit, other: ClockFit) -> tuple[float, float]:
-    """Seconds of the other clock per second of the device's, and the standard uncertainty."""
+    """Return the seconds of the other clock per second of the device's clock, and their standard uncertainty."""
     rate = device.rate / other.rate
     return rate, rate * float(np.hypot(device.u_rate / device.rate, other.u_rate / other.rate))
 
 
 @dataclass(frozen=True, slots=True)
 class Break:
-    """Between pair ``index - 1`` and ``index`` the device restarted (its time fell) or one of the clocks was set by ``step_s`` of host
-    time."""
+    """A break between the pairs ``index - 1`` and ``index``: the device restarted, or a clock was set by ``step_s`` of host time."""
 
     index: int
     kind: Literal["restart", "step"]
@@ -269,9 +268,9 @@ class Break:
 
 
 def breaks(device_s: F1, arrived_s: F1) -> tuple[Break, ...]:
-    """All places where stamps and arrivals contradict a single, evenly running clock, in order.
+    """Find all breaks of a device's clock, in order.
 
-    A restart: device time falls. A step: the least delays jump to another level and stay there; a spike, however long, comes back.
+    At a restart, device time falls. At a step, the smallest delays jump to another level and stay there; after a spike they come back.
     """
     x, y = np.asarray(device_s, dtype=np.float64), np.asarray(arrived_s, dtype=np.float64)
     falls = np.flatnonzero(np.diff(x) < 0.0) + 1
@@ -299,7 +298,7 @@ def _steps(x: F1, y: F1, shift: int) -> list[Break]:
 
 @dataclass(frozen=True, slots=True)
 class _Split:
-    """Two levels with one slope: the first block of the second level, both levels, scatter about them, slope."""
+    """Two levels with a common slope: first block of the second level, both levels, scatter about them, slope."""
 
     at: int
     before: float
@@ -313,7 +312,7 @@ class _Split:
 
 
 def _lowest(x: F1, y: F1) -> int:
-    """The earliest arrival of a block, its trend taken out."""
+    """Return the index of the earliest arrival of a block after its trend is removed."""
     if x[-1] <= x[0]:
         return int(np.argmin(y))
     trend = (y[-1] - y[0]) / (x[-1] - x[0])
@@ -321,7 +320,7 @@ def _lowest(x: F1, y: F1) -> int:
 
 
 def _best_split(x: F1, y: F1) -> _Split:
-    """Best split into two levels with one slope, by medians, which ignore blocks that arrived late as a whole."""
+    """Find the best split into two levels with a common slope; medians ignore blocks that arrived late as a whole."""
     best, least = _Split(0, 0.0, 0.0, 1.0, 0.0), np.inf
     first, second = np.triu_indices(x.size, 1)
     slopes = (y[second] - y[first]) / (x[second] - x[first])
@@ -336,10 +335,10 @@ def _best_split(x: F1, y: F1) -> _Split:
 
 
 def _first_after(rest: F1, around: tuple[int, int], split: _Split) -> int:
-    """The pair at which the level changes, among those of the blocks about it."""
+    """Return the index of the pair at which the level changes, within the blocks ``around`` the split."""
     a, b = around
     hit = np.flatnonzero(rest[a:b] < 0.5 * (split.before + split.after))
     if hit.size == 0:
         return a
-    # arrivals come earlier from here on: the first that was not possible before; or later: behind the last that is not possible any more
+    # After a jump to earlier: the first arrival impossible before it. After a jump to later: behind the last arrival impossible after it.
     return a + (int(hit[0]) if split.jump < 0.0 else int(hit[-1]) + 1)

@@ -1,4 +1,7 @@
-"""Standstills of a program that Abbe did not start, and their assignment to the planned readings."""
+"""Find the standstills in the readings of a program that Abbe did not start, and assign them to the planned ones.
+
+A place is a planned standstill: a target, mm, along the measured direction.
+"""
 
 from __future__ import annotations
 
@@ -10,26 +13,28 @@ import numpy as np
 from abbe.models.arrays import F1
 
 GAP = 7.0
-"""Cost of a place or a standstill without a partner: minus the logarithm of its probability (one in a thousand)."""
+"""Cost of a place or a standstill without a partner: minus the logarithm of the probability (one in a thousand)."""
 SURE = 3.0
-"""An assignment whose cost exceeds the least by no more than this counts as equally good."""
+"""An assignment that costs at most this much more than the best one counts as equally good."""
 NEAR, LARGEST_MM = 0.75, 2.0
-"""Largest change of the deviation from one place to the next: share of the distance to the nearest other place approached from the same
-side, and absolute limit."""
+"""Largest change of the deviation from one place to the next: as a share of the distance to the nearest other place that may be approached
+from the same side, and absolute."""
 SAME = 0.25
-"""Standstills that differ by less than this share of that distance are at one place."""
+"""Two standstills are at one place if they differ by less than this share of that largest change."""
 BASE_MM, PER_MM, TURN_MM = 1e-3, 3e-5, 1e-2
-"""Usual change of the deviation from place to place: constant part, part per millimetre between them, part where the side changes."""
+"""Usual change of the deviation from place to place: a constant, a part per mm of distance, and a part if the side of approach changes."""
 ZERO_MM, ZERO_PER_MM = 2e-2, 5e-5
-"""Largest deviation of the first place, for an instrument that was zeroed at target 0: constant part and part per millimetre."""
+"""Usual deviation of the first place if the instrument was zeroed at target 0: a constant, and a part per mm of the target."""
 INFINITE = np.inf
 I1 = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """``pairs``: number of the place to number of the standstill; ``cost``; ``rival``: a standstill and its two possible places, if two
-    assignments are equally good."""
+    """An assignment: ``pairs`` maps the index of a place to that of its standstill; ``cost`` is minus the logarithm of its probability.
+
+    ``rival``: if another assignment is equally good, a standstill and two places to which it may belong.
+    """
 
     cost: float
     pairs: dict[int, int]
@@ -38,7 +43,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Possible pairs, ordered by standstill: place, standstill, deviation, and its largest change."""
+    """Possible pairs, ordered by standstill: place, standstill, deviation, and the largest change of the deviation to this place."""
 
     place: I1
     stand: I1
@@ -47,7 +52,7 @@ class _Candidates:
 
 
 def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: float, zeroed: bool, rivals: bool = True) -> Match:
-    """Cheapest assignment in order.
+    """Find the cheapest assignment of standstills to places that keeps their order.
 
     Parameters
     ----------
@@ -56,9 +61,11 @@ def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: flo
     targets : array, shape (n,)
         Places, mm.
     offset : float
-        Offset of the readings from the places; known (``zeroed``) or tried.
+        Reading at target 0, mm.
     noise : float
-        Standard deviation of a level.
+        Standard deviation of a level, mm.
+    zeroed : bool
+        Whether the instrument was zeroed at target 0, so that the deviation of the first place must be small.
     rivals : bool
         Whether to look for an equally good assignment.
     """
@@ -85,7 +92,7 @@ def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: flo
 
 
 def places_reach(targets: F1, sides: F1) -> F1:
-    """Largest change of the deviation from the previous place to each place, (n,) mm."""
+    """Return the largest change of the deviation from the previous place to each place, mm, shape (n,)."""
     away = np.abs(targets[:, None] - targets[None, :])
     other = (away > 1e-6) & ((sides[:, None] * sides[None, :]) >= 0.0)
     nearest = np.where(other, away, np.inf).min(axis=1)
@@ -110,7 +117,7 @@ def _reversed(some: _Candidates) -> _Candidates:
 
 
 def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, mirrored: bool = False) -> tuple[F1, I1]:
-    """Least cost of a chain that ends at each candidate, and the one before it (-1: none). ``mirrored``: from the end to the beginning."""
+    """Return the least cost of a chain that ends at each candidate, and its predecessor (-1: none); ``mirrored``: chains run backwards."""
     targets, sides, noise = about
     cost, back = single_cost.copy(), np.full(single_cost.size, -1, dtype=np.intp)
     sign = -1 if mirrored else 1
@@ -123,14 +130,14 @@ def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, m
         step = cost[:p] + GAP * (places + stands - 2) + np.log1p((change / scale) ** 2)
         step = np.where((places > 0) & (stands > 0) & (change <= limit), step, INFINITE)
         best = int(np.argmin(step))
-        # from the end, ``alone`` is the cost of a chain that begins here; a longer one may cost less
-        if step[best] < cost[p]:
+        if step[best] < cost[p]:  # cheaper than a chain of this candidate alone
             cost[p], back[p] = step[best], best
     return cost, back
 
 
 def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], about: tuple[F1, F1, F1]) -> tuple[int, int, int] | None:
-    """A standstill that an equally good assignment gives another place, or a place that it gives another standstill."""
+    """Return (standstill, place, other place) if an equally good assignment pairs them differently; both places are one if it differs in
+    the standstill of this place."""
     targets, levels, reach = about
     taken = {s: k for k, s in pairs.items()}
     for p in np.flatnonzero(through < cost + SURE):
@@ -143,20 +150,20 @@ def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], a
     return None
 
 
-# Standstills of a stream, and their sides of approach.
+# Standstills of a stream of readings, and their sides of approach.
 
 
 CLEAR = 6.0
-"""A difference of two samples beyond this many of its standard deviations is motion."""
+"""Two samples that differ by more than this many standard deviations show motion."""
 RESOLVED = 1e-6
 LEAST_SAMPLES = 4
 OVERSHOOT, OVERSHOOT_MM = 0.3, 0.1
-"""Largest overshoot of a controller: share of a move, and absolute."""
+"""Largest overshoot of a controller: as a share of the move, and absolute, mm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Standstill:
-    """One standstill: first and last sample (indices), their times, median of the readings."""
+    """A standstill: indices and times of its first and last sample, and the median of its readings."""
 
     first: int
     last: int
@@ -166,22 +173,22 @@ class Standstill:
 
 
 def noise_of(y: F1) -> float:
-    """Standard deviation of one sample from second differences: neither standing nor steady motion adds to it (robust)."""
+    """Return the standard deviation of one sample from the median of second differences, which steady motion does not change."""
     second = y[2:] - 2.0 * y[1:-1] + y[:-2]
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6.0))
 
 
 def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Standstill, ...]:
-    """All standstills of a stream, in order.
+    """Return all standstills of a stream, in order.
 
-    Two neighbouring samples belong to one standstill if noise explains their difference. Single outliers do not end a standstill.
+    Two neighbouring samples belong to one standstill if noise explains their difference. A single outlier does not end a standstill.
 
     Parameters
     ----------
     t_s, y : array, shape (n,)
         Sample times and readings.
     smallest_move : float
-        Of the plan, in the unit of ``y``.
+        Smallest planned move, in the unit of ``y``.
     least_s : float
         Shortest standstill that counts.
     """
@@ -205,15 +212,15 @@ def _stand(t_s: F1, y: F1, first: int, last: int) -> Standstill:
 
 
 def _runs(still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[tuple[int, int]]:
-    """First and last sample of each unbroken run of small differences."""
+    """Return the first and last sample of each unbroken sequence of small differences."""
     edge = np.diff(np.concatenate([[0], still.astype(int), [0]]))
     return [(int(a), int(b)) for a, b in zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True)]
 
 
 def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
-    """Side of approach of each standstill: +1 from smaller readings, -1 from larger, 0 unknown.
+    """Return the side of approach of each standstill: +1 from smaller readings, -1 from larger, 0 unknown.
 
-    The last earlier sample that differs by more than an overshoot decides.
+    The last earlier sample that differs from it by more than an overshoot decides. ``smallest``: smallest planned move.
     """
     out, least = np.zeros(len(found)), CLEAR * noise_of(y)
     for s in range(1, len(found)):
@@ -227,17 +234,17 @@ def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
 
 
 TOLERANCE = 0.3
-"""A change of the reading without motion is a jump from this share of the smallest planned move on."""
+"""A change between two standstills without motion is a jump, up to this share of the smallest planned move."""
 LONG, SHORT = 1.8, 0.4
-"""A standstill longer or shorter than planned by these factors is reported."""
+"""A standstill is reported if it is more than LONG times or less than SHORT times as long as planned."""
 JUMP_SAMPLES = 2
 MATCHED = 0.5
-"""Minimum share of the targets to be found: with fewer, the stream belongs to another program."""
+"""Share of the planned standstills that must be found; with fewer, the stream belongs to another program."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedDwell:
-    """One planned standstill: target (mm along the measured direction), duration, and number of readings taken there."""
+    """A planned standstill: target (mm along the measured direction), duration, and number of readings to take there."""
 
     target: float
     seconds: float
@@ -246,7 +253,7 @@ class PlannedDwell:
 
 @dataclass(frozen=True, slots=True)
 class DwellReading:
-    """A reading found for a planned point: mean, standard uncertainty, time window and number of samples."""
+    """A reading for a planned standstill: mean, standard uncertainty, time window and number of samples."""
 
     value: float
     u: float
@@ -257,11 +264,10 @@ class DwellReading:
 
 @dataclass(frozen=True, slots=True)
 class Dwells:
-    """Standstills found of a plan. ``readings``: in the plan's order, None where the standstill is missing.
+    """Result of `detect`. ``readings``: in the order of the plan, None if the standstill is missing.
 
-    ``missing``: numbers (from 0) of planned standstills not found; ``extra``: unplanned standstills, each with the number of the planned
-    one before it (-1: before the first); ``odd``: planned standstills that were much longer or shorter than planned.
-    ``noise``: standard deviation of one sample, from the samples themselves.
+    ``missing``: indices of the planned standstills not found. ``extra``: unplanned standstills, each with the index of the planned one
+    before it (-1: none). ``odd``: indices of standstills much longer or shorter than planned. ``noise``: standard deviation of one sample.
     """
 
     readings: tuple[DwellReading | None, ...]
@@ -272,70 +278,78 @@ class Dwells:
 
 
 def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
-    """Match the standstills of a stream to the planned ones, in order; those without a partner are reported, never shifted.
+    """Match the standstills of a stream to the planned ones, in order, and take the planned readings from them.
 
-    ``zero``: the instrument's reading at target 0, if it was zeroed there. None: the offset between plan and stream is found together with
-    the match; if two offsets explain the stream about equally well, the match is refused.
+    A standstill without a partner is reported and shifts no other.
 
     Parameters
     ----------
     t_s, y : array, shape (n,)
         Sample times, and readings in the unit of the targets.
     planned : tuple of PlannedDwell
-        In order; neighbours stand at different places.
+        In order; two neighbours have different targets.
     settle_s : float
-        The first part of each standstill, in which the axes settle and no readings are taken.
+        First part of each standstill, in which the axes settle and no readings are taken.
+    zero : float, optional
+        Reading of the instrument at target 0, if it was zeroed there. Without it the match determines the offset between plan and stream,
+        and is refused if two offsets explain the stream equally well.
 
     Raises
     ------
     ValueError
-        Too short a stream or plan; the reading jumped while nothing moved;
-        less than half of the plan was found: the stream is of another program; or two matches are as good.
+        The stream or the plan is too short; two neighbours have one target; the reading jumped while nothing moved; less than half of the
+        plan was found; or two matches are equally good.
     """
     if t_s.size < 10 or len(planned) < 2:
-        raise ValueError("dwells: a stream of ten samples and a plan of two standstills are the least")
+        raise ValueError("dwells: a stream of ten samples or more and a plan of two standstills or more are needed")
     targets = np.array([p.target for p in planned])
     smallest = float(np.abs(np.diff(targets)).min())
     if not smallest > 0.0:
-        raise ValueError("dwells: two planned standstills in a row are at one place; plan them as one with two readings")
+        raise ValueError("dwells: two planned standstills in a row have the same target; plan them as one standstill with two readings")
     found = stands(t_s, y, smallest_move=smallest, least_s=SHORT * settle_s)
     tolerance = min(TOLERANCE * smallest, LARGEST_MM)
     _check_jumps(found, tolerance)
     noise = noise_of(y)
     pairs = _matched(found, sides(t_s, y, found, smallest), targets, zero, noise)
     if len(pairs) < MATCHED * len(planned):
-        raise ValueError(f"dwells: {len(pairs)} of {len(planned)} planned standstills were found: the stream is of another program")
+        raise ValueError(
+            f"dwells: only {len(pairs)} of {len(planned)} planned standstills were found: the stream comes from another program; "
+            "start the planned one"
+        )
     _check_moves(found, pairs, targets)
     lasted = {k: (found[s].end_s - found[s].start_s) / planned[k].seconds for k, s in pairs.items()}
     pairs = {k: s for k, s in pairs.items() if lasted[k] > LONG or not _either_side(k, pairs, targets)}
     readings: list[DwellReading | None] = []
     for k, plan in enumerate(planned):
         stand = found[pairs[k]] if k in pairs else None
-        if stand is not None and k == 0:  # the axes have long settled: its last seconds are those before the program moves
+        if stand is not None and k == 0:  # the axes have long settled: use the last seconds before the program moves
             stand = replace(stand, start_s=max(stand.start_s, stand.end_s - plan.seconds))
-        elif stand is not None and (k == len(planned) - 1 or lasted[k] > LONG):  # later it may have left and come back
+        elif stand is not None and (k == len(planned) - 1 or lasted[k] > LONG):  # the axis may have left later and come back
             stand = replace(stand, end_s=min(stand.end_s, stand.start_s + plan.seconds))
         readings += [None] * plan.readings if stand is None else _readings(t_s, y, stand, plan, (settle_s, noise))
-    ends = (0, len(planned) - 1)  # the duration before the first and after the last is free
+    ends = (0, len(planned) - 1)  # the program may stand longer at its start and its end
     odd = tuple(k for k in pairs if lasted[k] < SHORT or (lasted[k] > LONG and k not in ends))
     missing = tuple(k for k in range(len(planned)) if k not in pairs)
     return Dwells(tuple(readings), missing, _extra(found, pairs), odd, noise)
 
 
 def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
-    """Refuse two standstills without motion between them: the reading jumped, counts were lost, all later readings are wrong."""
+    """Refuse a jump between two standstills without motion: the instrument lost counts, and all later readings are wrong."""
     for before, after in pairwise(found):
         by = after.level - before.level
         if after.first - before.last <= JUMP_SAMPLES and abs(by) < tolerance:
             at_s = after.start_s - found[0].start_s
             raise ValueError(
-                f"dwells: the reading jumped by {by:.4f} mm {at_s:.1f} s after the first standstill began, while nothing moved"
+                f"dwells: the reading jumped by {by:.4f} mm while nothing moved, {at_s:.1f} s after the first standstill began; "
+                "zero the instrument and measure again"
             )
 
 
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
-    """Whether a place is planned twice, with a turn between, and only one of the three standstills was found: a turn that short shows in
-    no sample, so the standstill may belong to either pass."""
+    """Tell whether the standstill of place ``k`` may belong to an earlier or later pass over the same target.
+
+    This is so if two passes have a turning point between them and only one of the three standstills was found.
+    """
     if k in (0, targets.size - 1):
         return False
     for far in (k - 2, k + 2):
@@ -345,7 +359,7 @@ def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
 
 
 def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: F1) -> None:
-    """Refuse steps without samples between two standstills, unless a short move was planned there."""
+    """Refuse a step without samples between two standstills, unless such a move was planned."""
     taken = {s: k for k, s in pairs.items()}
     for s, (before, after) in enumerate(pairwise(found)):
         by = after.level - before.level
@@ -361,12 +375,13 @@ def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: 
         if not any(abs(by - move) <= 0.5 * abs(move) for move in moves):
             at_s = after.start_s - found[0].start_s
             raise ValueError(
-                f"dwells: the reading jumped by {by:.4f} mm {at_s:.1f} s after the first standstill began: the plan has no such move"
+                f"dwells: the reading jumped by {by:.4f} mm {at_s:.1f} s after the first standstill began, and the plan has no such move; "
+                "zero the instrument and measure again"
             )
 
 
 def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[int, Standstill], ...]:
-    """Standstills between (or before, or behind) those of the plan."""
+    """Return the unplanned standstills, each with the index of the planned one before it (-1: none)."""
     used = {s: k for k, s in pairs.items()}
     out, last = [], -1
     for s, stand in enumerate(found):
@@ -377,9 +392,9 @@ def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[
 
 
 def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
-    """Planned number to number of the standstill; refuses if two assignments are equally good.
+    """Map each planned index to the index of its standstill; refuse if two assignments are equally good.
 
-    Without a zero, offsets are tried from the first and last few of both.
+    Without ``zero``, try the offsets between the first few and the last few standstills and targets.
     """
     levels = np.array([s.level for s in found])
     if levels.size == 0:
@@ -399,34 +414,34 @@ def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float |
     best = match(levels, side, targets, offset=offsets[first], noise=u_level, zeroed=False)
     whole = len(best.pairs) >= MATCHED * targets.size
     if whole and any(one.cost < best.cost + SURE and _shifted(one.pairs, best.pairs) for one in matches):
-        raise ValueError("dwells: the stream fits the plan in two ways; zero the instrument at the first target, then the place is known")
+        raise ValueError("dwells: the stream fits the plan in two ways; zero the instrument at the first target and measure again")
     return _unambiguous(best, found) if whole else best.pairs
 
 
 def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
-    """The pairs, if no other assignment is equally good."""
+    """Return the pairs; refuse if another assignment is equally good."""
     if best.rival is None:
         return best.pairs
     stand, ours, other = best.rival
     at_s = found[stand].start_s - found[0].start_s
-    which = f"planned standstill {ours + 1} or {other + 1}" if ours != other else f"planned standstill {ours + 1}, or another of them"
-    raise ValueError(f"dwells: the standstill that began {at_s:.1f} s after the first may be {which}; nothing is guessed")
+    which = f"planned standstill {ours + 1} or {other + 1}" if ours != other else f"planned standstill {ours + 1}, and so may another one"
+    raise ValueError(f"dwells: the standstill that began {at_s:.1f} s after the first may be {which}; nothing is guessed, measure again")
 
 
 def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
-    """Whether two matches give most of their common standstills different targets."""
+    """Tell whether two matches give most of their common standstills different targets."""
     first, second = ({s: k for k, s in pairs.items()} for pairs in (one, other))
     both = first.keys() & second.keys()
     return 2 * sum(first[s] != second[s] for s in both) > len(both)
 
 
 def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[float, float]) -> list[DwellReading | None]:
-    """The standstill's readings: its time after settling, in as many equal parts as the plan reads there."""
+    """Split the settled part of a standstill into as many equal parts as the plan has readings there, and average each."""
     settle_s, noise = how
     at = np.arange(stand.first, stand.last + 1)
     at = at[(t_s[at] >= stand.start_s) & (t_s[at] <= stand.end_s)]
     settled = at[t_s[at] >= min(stand.start_s + settle_s, stand.end_s - 0.4 * (stand.end_s - stand.start_s))]
-    settled = settled[:-1] if settled.size > LEAST_SAMPLES else settled  # the last may have been taken as the axes began to move
+    settled = settled[:-1] if settled.size > LEAST_SAMPLES else settled  # the axes may have moved at the last sample
     out: list[DwellReading | None] = []
     for part in np.array_split(settled, plan.readings):
         out.append(_mean(t_s[part], y[part], noise) if part.size else None)
@@ -434,7 +449,7 @@ def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[
 
 
 def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
-    """Mean without outliers, and its uncertainty from the local scatter, at least that of the whole stream's noise."""
+    """Return the mean without outliers and its uncertainty from the local scatter, which counts at least as the noise of the stream."""
     keep = np.abs(y - np.median(y)) <= CLEAR * max(noise, 1.4826 * float(np.median(np.abs(y - np.median(y)))))
     kept = y[keep]
     scatter = max(noise, float(np.std(kept, ddof=1)) if kept.size > 1 else 0.0)
@@ -448,17 +463,17 @@ def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
 
 
 def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
-    """Differences from the plan for people, one line each; standstills count from 1."""
+    """Return one line per difference from the plan, for people; standstills count from 1."""
     lines = [f"standstill {k + 1} of {len(planned)} (at {planned[k].target:.3f} mm) is missing" for k in found.missing]
     for after, stand in found.extra:
         place = "before the first" if after < 0 else f"after standstill {after + 1}"
-        lines.append(f"an unplanned standstill at {stand.level:.3f} mm of the reading {place}, {stand.end_s - stand.start_s:.1f} s long")
-    lines += [f"standstill {k + 1} was not {planned[k].seconds:.1f} s long" for k in found.odd]
+        lines.append(f"an unplanned standstill {place}: reading {stand.level:.3f} mm, {stand.end_s - stand.start_s:.1f} s long")
+    lines += [f"standstill {k + 1} was much longer or shorter than the planned {planned[k].seconds:.1f} s" for k in found.odd]
     return tuple(lines)
 
 
 def merged(planned: list[PlannedDwell]) -> tuple[PlannedDwell, ...]:
-    """Neighbours at one place are one standstill with the readings and the time of both."""
+    """Merge neighbours with the same target into one standstill with the readings and the time of both."""
     out: list[PlannedDwell] = []
     for one in planned:
         if out and abs(out[-1].target - one.target) < 1e-6:

@@ -16,7 +16,7 @@ SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """``lag_s`` > 0: the signal is late by this time, with standard uncertainty ``u_s``. ``determined``: the readings carry it."""
+    """``lag_s`` > 0: the signal is late by this time, with standard uncertainty ``u_s``. ``determined``: the readings show a lag."""
 
     lag_s: float
     u_s: float
@@ -24,28 +24,29 @@ class Lag:
 
 
 def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | None = None, search_s: float = 0.5) -> Lag:
-    """Lag of a signal behind the expected one, by least squares: signal(t) = expected(t - lag) + columns @ unknowns.
+    """Fit the lag of a signal behind the expected one by least squares: signal(t) = expected(t - lag) + columns @ unknowns.
 
-    A coarse search finds the minimum (the peak of the cross-correlation), Gauss-Newton refines it. The uncertainty includes the
-    autocorrelation of the residuals (Newey-West), so that drift and vibration do not make it too small.
+    A coarse search finds the minimum and Gauss-Newton refines it. The uncertainty includes the autocorrelation of the residuals
+    (Newey-West), so that drift and vibration do not make it too small.
 
     Parameters
     ----------
     t_s, signal : array, shape (n,)
+        Times and values of the signal.
     expected_s, expected : array, shape (m,)
-        The signal without a lag, linearly interpolated.
+        Times and values of the signal without lag; interpolated linearly.
     columns : array, shape (n, k), optional
         Further components of the signal; default: a constant.
     search_s : float
-        Largest lag either way.
+        Largest lag in either direction.
 
     Raises
     ------
     ValueError
-        Fewer than 10 values, or arrays that do not fit each other.
+        Fewer than 10 values, or arrays of different lengths.
     """
     if t_s.size < 10 or signal.shape != t_s.shape or expected.shape != expected_s.shape:
-        raise ValueError("lag: ten values or more, each with its time")
+        raise ValueError("lag: ten values or more are needed, each with its time")
     free = np.ones((t_s.size, 1)) if columns is None else columns
     basis = np.linalg.qr(free)[0]
 
@@ -74,7 +75,7 @@ def fit_lag(t_s: F1, signal: F1, expected_s: F1, expected: F1, *, columns: F2 | 
 
 
 def _newey_west(score: F1) -> float:
-    """Standard deviation of the sum of an autocorrelated score (Newey-West)."""
+    """Return the standard deviation of the sum of an autocorrelated score (Newey-West)."""
     n = score.size
     reach = min(n // 4, int(4 * (n / 100.0) ** (2.0 / 9.0)) + 20)
     total = float(score @ score)
@@ -84,26 +85,33 @@ def _newey_west(score: F1) -> float:
 
 
 def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, search_s: float = 0.5, smooth_s: float = 2.0) -> Lag:
-    """Lag of a reading that was taken along one path both ways at one speed: the two patterns are shifted against each other by twice the
-    lag.
+    """Fit the lag of readings taken out and back along one path at one speed: the two patterns are shifted by twice the lag.
 
     Parameters
     ----------
     t_s : array, shape (n,)
-        Time along the path at which the readings of the way out were taken, evenly spaced.
+        Times of the readings on the way out, evenly spaced.
     out, back : array, shape (n,)
-        Readings of the way out, and of the way back at the same places.
+        Readings on the way out, and on the way back at the same positions.
     columns : array, shape (n, k), optional
-        Other differences of the ways (lost motion: the bar's direction times the change of sign of each axis); a constant is always free.
+        Other differences between the two ways, e.g. lost motion (direction of the bar times the change of sign of each axis). A constant
+        is always included.
+    search_s : float
+        The lag counts as determined if its uncertainty is below half of this.
     smooth_s : float
-        Window of the cubic from which the pattern's slope is estimated: noise in the slope would hide the lag.
+        Window of the smoothing cubic that gives the slope of the pattern; noise in the slope would hide the lag.
+
+    Raises
+    ------
+    ValueError
+        The path is shorter than three windows.
     """
     step = float(np.median(np.diff(t_s)))
     width = max(2, round(smooth_s / step / 2)) * 2 + 1
     if t_s.size < 3 * width:
-        raise ValueError("lag: the path is too short for this smoothing")
+        raise ValueError(f"lag: the path has {t_s.size} readings, a smoothing window of {smooth_s:g} s needs {3 * width}")
     slope_all = np.asarray(scipy.signal.savgol_filter(0.5 * (out + back), width, 3, deriv=1, delta=step))
-    inner = slice(width, t_s.size - width)  # the ends know only one side
+    inner = slice(width, t_s.size - width)  # at the ends the window is incomplete
     slope = slope_all[inner]
     free = np.ones((t_s.size, 1)) if columns is None else np.column_stack([np.ones(t_s.size), columns])
     basis = np.linalg.qr(free[inner])[0]

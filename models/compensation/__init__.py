@@ -1,1 +1,1 @@
-"""From error parameters to what a controller stores, and what will be left after it."""
+"""Compensation tables from identified error motions, and the errors that remain with them."""

@@ -1,18 +1,16 @@
-"""Achievable accuracy of each kind of table on this machine: residual errors of distances with their uncertainty.
+"""Achievable accuracy of each kind of compensation table on this machine: residual errors of distances with their uncertainty.
 
-All kinds are made from the same identified deviation; its unknown part (`PredictedDistances.unknown_mm`) is in every row. The errors are
-those over the inner 80 % of the strokes, to first order; distances do not contain rigid motion.
+All kinds correct the same identified deviation; its unknown part (`PredictedDistances.unknown_mm`) remains with each of them. Errors are
+first-order ones over the inner 80 % of the strokes.
 
-Tables of single error motions, for controls that store up to 21 of them and compute the deviation by their own kinematic model.
+This module also makes tables of single error motions, for controls that store up to 21 of them and compute the deviation by their own
+kinematic model. One campaign with one tool does not determine every motion: at one tool length, turning and shifting a carriage look alike.
+The caller names the motions to write:
 
-One campaign with one tool does not determine every single motion: turning and shifting a carriage look alike at one tool length (math.md
-4.6). A motion that the data do not separate from others is not written under its name. The caller chooses by naming the motions:
-
-- only motions that are observable by themselves (`individually_observable`, the default): valid for every tool, but motions that are known
-  only together with a hidden one, or are mostly an assumption, stay uncorrected;
-- `enough_for_the_field`: as few motions as carry the whole deviation; the others are zero. Valid at this tool length only, and so labelled.
-
-In the first case every motion has its own estimate; in the second the written motions also carry the effect of the others at this tool.
+- `individually_observable` (default): only motions that the data separate from all others. The tables hold for every tool, but the other
+  motions stay uncorrected.
+- `enough_for_the_field`: the fewest motions that reproduce the whole deviation; they also carry the effect of the others. The tables hold
+  at this tool length only, and are labelled so.
 """
 
 from __future__ import annotations
@@ -49,26 +47,27 @@ from abbe.models.uncertainty.sources import ErrorSources, error_sources, varianc
 NODES = 7
 RANK_TOLERANCE = 1e-7
 TOWARDS_ESTIMATE = 1e-6
-"""Weight of a motion's own estimate against reproducing the deviation: it decides only combinations that the deviation leaves open."""
+"""Weight of a motion's own estimate against the deviation: it only decides combinations of motions that the deviation leaves open."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionTables:
-    """Error motions (not corrections: the control changes the sign) at the grid of their axis.
+    """Tables of error motions over their own axis; the control changes the sign to correct them.
 
     Attributes
     ----------
     machine : Machine
         Nominal machine, with the tool for which the tables hold.
     position_mm : three arrays
+        Grid of X, Y, Z.
     motions, u : dict
-        ``"EXX"`` ..: values at the grid of the moving axis, mm or rad, and their standard uncertainty. Motions that are missing are zero.
+        ``"EXX"`` ..: values at the grid of the moving axis, mm or rad, and their standard uncertainty. Missing motions are zero.
     squareness_rad, u_squareness_rad : dict
         ``"C0Y"`` ..; travel counts from the start of the stroke.
     left_out : tuple of str
-        Motions that are not written: hidden, weak, or not named by the caller.
+        Motions not in the tables: not observable by themselves, or not named by the caller.
     any_tool : bool
-        Whether every motion in the tables is observable by itself, so that they hold for any tool.
+        Whether the tables hold for any tool, because every motion in them is observable by itself.
     """
 
     machine: Machine
@@ -81,7 +80,7 @@ class MotionTables:
     any_tool: bool
 
     def correction_at(self, axes_mm: F2, tool_mm: F1 | None = None) -> F2:
-        """What a control adds to commanded positions, shape (n, 3), mm: straight lines between nodes, rule G for the levers."""
+        """Return what a control adds to commanded positions, mm, shape (n, 3): linear between nodes, with the levers of rule G."""
         values = np.zeros((axes_mm.shape[0], 3, 6))
         for name, table in self.motions.items():
             axis, component = PLACES[name]
@@ -99,30 +98,30 @@ def motion_tables(
     any_tool: bool = True,
     sources: ErrorSources | None = None,
 ) -> MotionTables:
-    """Tables of the named motions only; the others are listed in ``left_out``.
+    """Make tables of the named motions; ``left_out`` of the result lists the others.
 
     Parameters
     ----------
     counts : (int, int, int)
         Grid points of X, Y, Z.
     motions : set of str, optional
-        Motions to write: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``. Default: all that are observable by themselves.
+        Motions to write: ``"EXX"`` .. ``"ECZ"``, ``"C0Y"``, ``"B0Z"``, ``"A0Z"``. Default: `individually_observable`.
     any_tool : bool
-        True: each motion has its own estimate, and only what is observable by itself may be written. False, for `enough_for_the_field`:
-        values that reproduce the identified deviation with the machine's own tool best, all others being zero.
+        True: each motion gets its own estimate and must be observable by itself. False, for `enough_for_the_field`: the motions get values
+        that best reproduce the identified deviation with the machine's own tool while all others are zero.
     sources : ErrorSources, optional
-        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
+        Sources of uncertainty; default: ``error_sources(solution)``, with the documented inputs.
 
     Raises
     ------
     ValueError
-        A name that is not a motion of the solution, no name at all, or (``any_tool``) a motion that the data do not separate from others.
+        A name is not a motion of the solution, there is no name, or (``any_tool``) the data do not separate a motion from others.
     """
     known = {t.motion for t in solution.terms}
     motions = _writable(solution, known, motions, any_tool)
     sources = sources or error_sources(solution)
     grids = grid_positions(solution.machine, counts)
-    keep = [i for i, t in enumerate(sources.terms) if t.motion in motions]  # the solution's own, then orders above it, that have no value
+    keep = [i for i, t in enumerate(sources.terms) if t.motion in motions]  # the solution's own, then higher orders without a value
     operator = np.eye(len(sources.terms))[keep]
     if not any_tool:
         n, own = len(solution.terms), [i for i in keep if i < len(solution.terms)]
@@ -143,11 +142,14 @@ def motion_tables(
 
 
 def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] | set[str] | None, any_tool: bool) -> frozenset[str]:
-    """The motions to be written, if they may be."""
+    """Return the motions to write; refuse those that may not be written."""
     observable_names = individually_observable(solution) if motions is None or any_tool else frozenset(known)
     wanted = observable_names if motions is None else frozenset(motions)
     if not wanted or not wanted <= known:
-        raise ValueError(f"motion tables: {', '.join(sorted(wanted - known)) or 'no motion'} cannot be written")
+        raise ValueError(
+            f"motion tables: {', '.join(sorted(wanted - known)) or 'no motion'} cannot be written; the solution has "
+            f"{', '.join(sorted(known))}"
+        )
     if not wanted <= observable_names:
         raise ValueError(
             f"motion tables: {', '.join(sorted(wanted - observable_names))} cannot be written under their own names: the readings do not "
@@ -157,7 +159,7 @@ def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] 
 
 
 def _entries(sources: ErrorSources, name: str, grids: tuple[F1, F1, F1], keep: list[int], operator: F2) -> tuple[F1, F1]:
-    """Values and standard uncertainties of one motion on the grid of its axis; of a squareness one value (rad)."""
+    """Return values and standard uncertainties of a motion on the grid of its axis; for a squareness, one value in rad."""
     machine = sources.solution.machine
     mine = [k for k, i in enumerate(keep) if sources.terms[i].motion == name]
     terms = tuple(sources.terms[keep[k]] for k in mine)
@@ -170,15 +172,15 @@ def _entries(sources: ErrorSources, name: str, grids: tuple[F1, F1, F1], keep: l
 
 
 def individually_observable(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:
-    """Motions that the report on this solution calls observed (with ``weak``: or weak), by the same rule (`observable_motions`).
+    """Return the motions that the report calls observed, with ``weak`` also the weak ones.
 
-    None of their coefficients is in a hidden combination, and the readings carry at least 90 % (10 %) of their information.
+    No coefficient of these motions is part of a hidden combination, and the readings carry at least 90 % (weak: 10 %) of the information.
     """
     return frozenset(observable_motions(motions_of(solution), weak=weak))
 
 
 def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
-    """Motions that carry the deviation with the machine's own tool when all others are zero; angles are given up first."""
+    """Return a smallest set of motions that reproduces the deviation with the machine's own tool; angles are dropped first."""
     field = _field(solution)
     triangle = scipy.linalg.qr(field / np.maximum(np.linalg.norm(field, axis=0), 1e-300), mode="r")[0][: field.shape[1]]
     names = [*[t.motion for t in solution.terms], *["rigid"] * 6]
@@ -197,14 +199,14 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
 
 
 def _field(solution: JointSolution) -> F2:
-    """Deviation over the volume per unit of every coefficient, then of the six rigid motions, shape (3 points, terms + 6)."""
+    """Return the deviation over the volume per unit of every coefficient and of the six rigid motions, shape (3 points, terms + 6)."""
     grid = volume_grid(solution.machine.stroke_mm, max(NODES, max(t.order for t in solution.terms) + 2))
     full = design(solution.machine, solution.terms, grid).reshape(3 * len(grid), -1)
     return np.concatenate([full, rigid_design(grid).reshape(-1, 6)], axis=1)
 
 
 def _refit(solution: JointSolution, keep: list[int]) -> F2:
-    """Coefficients of the kept terms that reproduce the whole deviation best, per unit of every coefficient, shape (kept, terms)."""
+    """Return the coefficients of the kept terms that best reproduce the deviation of one unit of each coefficient, shape (kept, terms)."""
     n = len(solution.terms)
     field = _field(solution)
     weight = TOWARDS_ESTIMATE * np.sqrt(len(field))
@@ -215,31 +217,31 @@ def _refit(solution: JointSolution, keep: list[int]) -> F2:
     return np.asarray(np.linalg.lstsq(np.concatenate([a, ridge]), np.concatenate([field[:, :n], near]), rcond=None)[0][: len(keep)])
 
 
-# Tables for controllers that take less than nine: positioning alone, cross tables beside it, squareness as a parameter.
+# Tables for controls that take fewer than nine: positioning tables, cross tables beside them, squareness as parameters.
 #
-# No correction is in two parts, and all parts together correct the same as the nine tables (but for a rotation of the frame, which
-# squareness parameters cannot express and which changes no distance).
+# No error is corrected twice, and all parts together correct as much as the nine tables. Only a rotation of the frame is lost, which
+# squareness parameters cannot express and which changes no distance.
 
 
 def positioning_only(tables: NineTables) -> NineTables:
-    """The three own-axis tables of nine (pitch error compensation), everything else zero."""
+    """Return the three own-axis tables of nine (pitch error compensation), the others zero."""
     return _kept(tables, lambda a: np.arange(3) == a)
 
 
 def cross_only(tables: NineTables) -> NineTables:
-    """The six cross tables of nine, own-axis tables zero: to be used beside `positioning_only`, which contains the scale."""
+    """Return the six cross tables of nine, own-axis tables zero; they complement `positioning_only`."""
     return _kept(tables, lambda a: np.arange(3) != a)
 
 
 @dataclass(frozen=True, eq=False)
 class SquarenessTables:
-    """Squareness as three parameters (C0Y, B0Z, A0Z, rad, with u), and tables without squareness.
+    """Squareness as three ``parameters`` (C0Y, B0Z, A0Z, rad, with u), and ``tables`` without squareness.
 
-    The parameters are the squareness of these tables, which count the body diagonals as much as the volume: not the mean squareness over
-    the volume (`abbe.models.compensation.additive.mean_linear`), from which it can differ by more than its uncertainty.
+    The parameters come from the nine tables, which weigh the body diagonals as much as the volume. They can differ from the mean squareness
+    over the volume (`abbe.models.compensation.additive.mean_linear`) by more than its uncertainty.
 
-    ``tables``: own-axis tables as before; cross tables without slope, so straightness alone. The rest of their slopes was a rotation of the
-    frame and is left out. ``start_mm``: position of each axis at which the parameters correct nothing.
+    ``tables``: the own-axis tables of the nine, and cross tables without slope, i.e. pure straightness. The rest of their
+    slopes is a rotation of the frame and is left out. ``start_mm``: axis positions at which the parameters correct nothing.
     """
 
     parameters: tuple[MeanParameter, ...]
@@ -247,23 +249,23 @@ class SquarenessTables:
     start_mm: F1
 
     def squareness_at(self, axes_mm: F2) -> F2:
-        """Correction by the parameters alone at commanded positions, shape (n, 3), mm: +C0Y y to X, −B0Z z to X, +A0Z z to Y."""
+        """Return the correction by the parameters alone, mm, shape (n, 3): +C0Y y to X, −B0Z z to X, +A0Z z to Y, from ``start_mm`` on."""
         out = np.zeros((axes_mm.shape[0], 3))
         for parameter, (_, first, second, sign) in zip(self.parameters, SQUARENESS_SLOPES, strict=True):
             out[:, first] -= sign * parameter.value * (axes_mm[:, second] - self.start_mm[second])
         return out
 
     def correction_at(self, axes_mm: F2) -> F2:
-        """Parameters and tables together, shape (n, 3), mm."""
+        """Return the correction by parameters and tables together, mm, shape (n, 3)."""
         return self.squareness_at(axes_mm) + self.tables.correction_at(axes_mm)
 
 
 def squareness_tables(
     solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9, sources: ErrorSources | None = None
 ) -> SquarenessTables:
-    """Nine tables with squareness taken out of them; parameters as `nine_tables`.
+    """Split the nine tables into squareness parameters and tables without squareness; arguments as in `nine_tables`.
 
-    The squareness parameters are least-squares slopes of the tables themselves, and their uncertainty that of the same slopes.
+    The squareness parameters and their uncertainties are those of the least-squares slopes of the tables.
     """
     sources = sources or error_sources(solution)
     nine = nine_tables(solution, counts, nodes=nodes, sources=sources)
@@ -298,18 +300,18 @@ GRID_NODES = (5, 9, 13, 17)
 
 @dataclass(frozen=True)
 class Achievable:
-    """One kind of table.
+    """Accuracy that one kind of table can achieve.
 
     Attributes
     ----------
     kind : str
-        Name for the user.
+        Name shown to the user.
     entries : int
-        Number of values in the controller.
+        Number of values that the controller stores.
     distances : PredictedDistances
         Residual errors with the table as stored, rounding included.
     rounding_mm : float
-        Rms share of the distance errors that comes from rounding to the controller's unit alone; 0 without a unit.
+        Rms of the distance errors that come from rounding to the controller's unit alone; 0 without a unit.
     """
 
     kind: str
@@ -327,7 +329,7 @@ def achievable(
     observable: frozenset[str] | None = None,
     sources: ErrorSources | None = None,
 ) -> tuple[Achievable, ...]:
-    """Every kind of table on this machine, from none to the finest grid.
+    """Predict the accuracy of every kind of table on this machine, from no table to the finest grid.
 
     Parameters
     ----------
@@ -336,11 +338,11 @@ def achievable(
     grid_nodes : tuple of int
         Nodes per axis of the 3-D grids.
     lsb_mm : float
-        The controller's unit; 0: no rounding. Tables of single motions and squareness parameters are not rounded.
+        The controller's unit, mm; 0: no rounding. Tables of single motions and squareness parameters are not rounded.
     observable : set of str, optional
         Motions that are observable by themselves; default: `individually_observable`.
     sources : ErrorSources, optional
-        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
+        Sources of uncertainty; default: ``error_sources(solution)``, with the documented inputs.
     """
     judge = _ResidualJudge(solution, random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
     rows = [judge.row("no table", 0), *judge.one_axis(counts), *judge.single_motions(counts, observable)]
@@ -356,14 +358,14 @@ def grid_row(
     pairs: Pairs | None = None,
     sources: ErrorSources | None = None,
 ) -> Achievable:
-    """Residual errors with a 3-D grid of ``nodes`` per axis; other parameters as `achievable`."""
+    """Predict the accuracy of a 3-D grid of ``nodes`` per axis; other parameters as in `achievable` and `grid_table`."""
     judge = _ResidualJudge(solution, pairs or random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
     return judge.grid(nodes, compensable)
 
 
 @dataclass(frozen=True, eq=False)
 class _ResidualJudge:
-    """Common basis for all kinds of table: pairs, sources of uncertainty, rounding."""
+    """Judges all kinds of table by the same pairs, sources of uncertainty and unit."""
 
     solution: JointSolution
     pairs: Pairs
@@ -371,7 +373,7 @@ class _ResidualJudge:
     lsb_mm: float
 
     def row(self, kind: str, entries: int, stored: Correction | None = None, exact: Correction | None = None) -> Achievable:
-        """Row of a kind of table from its correction as stored, and without rounding."""
+        """Judge a kind of table by its correction as ``stored``; ``exact`` is the same without rounding."""
         rounding = 0.0
         if stored is not None and exact is not None:
             added = correction_error_mm(stored, self.pairs) - correction_error_mm(exact, self.pairs)
@@ -379,7 +381,7 @@ class _ResidualJudge:
         return Achievable(kind, entries, predict_distances(self.solution, stored, pairs=self.pairs, sources=self.sources), rounding)
 
     def one_axis(self, counts: tuple[int, int, int]) -> list[Achievable]:
-        """Positioning alone, with squareness, and all nine."""
+        """Judge positioning tables, these with squareness parameters, and all nine tables."""
         nine = nine_tables(self.solution, counts, sources=self.sources)
         square = squareness_tables(self.solution, counts, sources=self.sources)
         positioning = positioning_only(nine)
@@ -396,7 +398,7 @@ class _ResidualJudge:
         ]
 
     def single_motions(self, counts: tuple[int, int, int], observable: frozenset[str] | None) -> list[Achievable]:
-        """Tables of motions under their own names."""
+        """Judge tables of single error motions."""
         observable_names = individually_observable(self.solution) if observable is None else observable
         out = []
         for kind, motions, any_tool in (
@@ -409,7 +411,7 @@ class _ResidualJudge:
         return out
 
     def grid(self, nodes: int, compensable: Mask | None) -> Achievable:
-        """A grid of ``nodes`` per axis."""
+        """Judge a 3-D grid of ``nodes`` per axis."""
         table = grid_table(self.solution, (nodes,) * 3, compensable=compensable, sources=self.sources)
         stored = quantise_grid(table, self.lsb_mm) if self.lsb_mm > 0 else table
         return self.row(f"grid {nodes} x {nodes} x {nodes}", 3 * nodes**3, stored.correction_at, table.correction_at)

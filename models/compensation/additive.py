@@ -1,12 +1,12 @@
-"""The best sum of three functions, one of each axis, for a deviation field: over the volume and along its body diagonals.
+"""Best approximation of a deviation field by a sum of three functions, one of each axis.
 
-The mean over the other two axes (the main effect) is the least-squares answer over the volume alone. The effect of angles at a distance
-that depends on two axes at once remains, and much of it lies along the body diagonals, which ISO 230-6 tests. So the four diagonals
-together weigh as much as the whole volume (tests/models/compensation/test_tables.py states gain and cost).
+Over the volume alone, the least-squares solution is the mean over the other two axes (the main effect). The effect of angles at a lever
+that depends on two axes remains, and much of it lies along the body diagonals, which ISO 230-6 tests. So the four diagonals together weigh
+as much as the whole volume (tests/models/compensation/test_tables.py states gain and cost).
 
-`mean_linear`: scale errors and squareness as the whole volume sees them, slopes of the main effects. The coefficients of the model are
-stated at the carriages' pivots, where one tool length often cannot separate them from angles. Their mean effect over the volume - most of
-what one-axis tables correct - is known far better, and is what people mean by "the" squareness.
+`mean_linear` returns scale errors and squareness as slopes of the main effects. The coefficients of the model hold at the pivots of the
+carriages, where one tool length often cannot separate them from angles. Their mean effect over the volume is known far better, and is what
+people mean by "the" squareness.
 """
 
 from __future__ import annotations
@@ -29,44 +29,44 @@ from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
 
 DIAGONAL_WEIGHT = 1.0
-"""Weight of the four body diagonals together against that of the volume."""
+"""Weight of the four body diagonals together; the volume has weight 1."""
 DIAGONAL_POINTS = 33
 
 Field = Callable[[F2], F3]
-"""Values at positions, shape (n, 3) -> (n, 3 outputs, m): a design, or one field with m = 1."""
+"""From positions, shape (n, 3), to values, shape (n, 3 directions, m): the deviation per unit of m coefficients, or one field (m = 1)."""
 
 
 def additive_design(
     solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int, terms: tuple[Term, ...] | None = None
 ) -> tuple[F3, F3, F3]:
-    """Design of the best additive field of a solution: per axis shape (len(grid), 3, terms), mm per unit of every coefficient.
+    """Return the best additive field per unit of every coefficient of a solution: per axis, shape (len(grid), 3, terms).
 
-    ``terms``: the solution's own, or with orders above them (`abbe.models.uncertainty.sources`); the fit is the same.
+    ``terms``: default the solution's own; may hold higher orders too (`abbe.models.uncertainty.sources`).
     """
-    order = max(t.order for t in solution.terms) + 1  # an angle times a travel is of one order more along a diagonal than the angle
+    order = max(t.order for t in solution.terms) + 1  # along a diagonal, an angle times a travel is one order higher than the angle
     field = _design_of(solution.machine, terms or solution.terms)
     return additive(field, solution.machine.stroke_mm, grids_mm, nodes=nodes, order=order)
 
 
 def additive(field: Field, stroke_mm: F2, grids_mm: tuple[F1, F1, F1], *, nodes: int, order: int) -> tuple[F3, F3, F3]:
-    """Best sum of three functions of one axis each, for the volume and its body diagonals, by least squares.
+    """Fit a sum of three functions of one axis each to a field, over the volume and its body diagonals, by least squares.
 
     Parameters
     ----------
     field : function
-        Values at positions.
+        Values at positions (`Field`).
     stroke_mm : array, shape (3, 2)
     grids_mm : three arrays
-        Positions of X, Y, Z at which the functions are wanted.
+        Positions of X, Y, Z at which to return the functions.
     nodes : int
         Nodes per axis of the volume.
     order : int
-        Highest Legendre order of what the diagonals may add to the main effects.
+        Highest Legendre order of the addition to the main effects for the diagonals.
 
     Returns
     -------
     three arrays, shape (len(grid), 3, m)
-        In the unit of the field; constants are shared out arbitrarily between the axes.
+        In the unit of the field. The split of constants between the axes is arbitrary.
     """
     beta = _towards_diagonals(field, stroke_mm, nodes, order)
     out = []
@@ -77,7 +77,7 @@ def additive(field: Field, stroke_mm: F2, grids_mm: tuple[F1, F1, F1], *, nodes:
 
 
 def main_effect(machine: Machine, terms: tuple[Term, ...], axis: int, positions_mm: F1, nodes: int) -> F3:
-    """Design of the mean deviation over the other two axes, shape (len(positions), 3, terms)."""
+    """Return the mean deviation over the other two axes per unit of every coefficient, shape (len(positions), 3, terms)."""
     return _mean_over_others(_design_of(machine, terms), machine.stroke_mm, axis, positions_mm, nodes)
 
 
@@ -96,8 +96,8 @@ def _mean_over_others(field: Field, stroke_mm: F2, axis: int, positions_mm: F1, 
 
 
 def _towards_diagonals(field: Field, stroke_mm: F2, nodes: int, order: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Additions to the main effects that serve the diagonals, as Legendre coefficients per axis, shape (3 axes, order, 3, m)."""
-    volume = volume_grid(stroke_mm, max(nodes, order + 2))  # fewer nodes than polynomials would not hold them between the nodes
+    """Return the additions to the main effects for the diagonals, as Legendre coefficients per axis, shape (3 axes, order, 3, m)."""
+    volume = volume_grid(stroke_mm, max(nodes, order + 2))  # fewer nodes would not determine the polynomials
     lines = np.concatenate([np.linspace(*diagonal_ends(stroke_mm, d), DIAGONAL_POINTS) for d in DIAGONALS])
     points = np.concatenate([volume, lines])
     weight = np.sqrt(np.r_[np.full(len(volume), 1.0 / len(volume)), np.full(len(lines), DIAGONAL_WEIGHT / len(lines))])
@@ -119,15 +119,15 @@ def _cell_centres(stroke_mm: F1, nodes: int) -> F1:
 
 
 SCALE_NOTE = "at the machine's temperature while it was measured"
-"""What every printed scale has to say: no material temperature correction is made."""
+"""Note beside every printed scale error: Abbe does not correct it to 20 degree C."""
 
 SQUARENESS_SLOPES = (("C0Y", 0, 1, -1.0), ("B0Z", 0, 2, 1.0), ("A0Z", 1, 2, -1.0))
-"""Name, the two axes, and the sign that turns the sum of both slopes into it (docs/explanation/conventions.md)."""
+"""Name, its two axes, and the sign of the sum of their slopes (docs/explanation/conventions.md)."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeanParameter:
-    """A linear parameter averaged over the volume: mm/mm for scales (EXX...), rad for squareness, with its standard uncertainty."""
+    """A scale error (EXX..., mm/mm) or squareness (rad) averaged over the volume, with its standard uncertainty."""
 
     name: str
     value: float
@@ -135,15 +135,14 @@ class MeanParameter:
 
 
 def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9) -> tuple[MeanParameter, ...]:
-    """Mean scale error of X, Y, Z (slope of EXX, EYY, EZZ) and mean squareness C0Y, B0Z, A0Z over the volume.
+    """Return the mean scale errors of X, Y, Z (slopes of EXX, EYY, EZZ) and the mean squareness C0Y, B0Z, A0Z over the volume.
 
-    Scales hold at the temperature the machine had while it was measured: nothing is reduced to 20 degree C, and 1 K of a steel machine is
-    about 11 um/m; so the uncertainty of the scales' temperature is not in. All other sources are (`abbe.models.uncertainty.sources`),
-    orders above the chosen one included. Least-squares slopes over equidistant positions. The laser's wavelength is an unknown of every
-    solution with a laser (`laser_scale`) and so within its sources; without one, scales carry its uncertainty all the same: none is known
-    better.
+    They are least-squares slopes over equidistant positions. Scale errors hold at the temperature of the machine during the measurement,
+    without correction to 20 degree C (1 K of a steel machine is about 11 um/m). Their uncertainty therefore excludes the temperature of the
+    scales and includes all other sources (`abbe.models.uncertainty.sources`). It always includes the laser's wavelength: as an unknown
+    (`laser_scale`) if a laser was used, otherwise as an assumed uncertainty of the reference length.
     """
-    sources = error_sources(solution, replace(StatedInputs().as_measured(), u_wavelength=0.0))  # the wavelength is in ``common``
+    sources = error_sources(solution, replace(StatedInputs().as_measured(), u_wavelength=0.0))  # ``common`` holds the wavelength
     slopes = {}
     for a in range(3):
         first, last = (float(v) for v in solution.machine.stroke_mm[a])
@@ -157,6 +156,6 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
 
 
 def mean_parameter(sources: ErrorSources, name: str, gradient: F1, u_common: float = 0.0) -> MeanParameter:
-    """Parameter that is ``gradient @ coefficients``, with its uncertainty from all sources and ``u_common`` on top."""
+    """Return the parameter ``gradient @ coefficients`` with its uncertainty from all sources, ``u_common`` included."""
     u = float(np.sqrt(variances(sources, gradient[None])[0]))
     return MeanParameter(name, float(gradient @ sources.coefficients), float(np.hypot(u, u_common)))

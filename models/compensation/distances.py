@@ -1,6 +1,6 @@
-"""Errors of distances between two points of a part: the machine's errors as its user sees them, without rigid motion.
+"""Errors of distances between two points of a part: the machine's errors as its user sees them, which a rigid motion does not change.
 
-They measure a table, before and after, with the whole uncertainty of the field.
+They judge a compensation table by the errors without and with it.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.sources import ErrorSources, approach_variance_mm2, error_sources, joint_factor
 
 Correction = Callable[[F2], F2]
-"""Commanded positions, shape (n, 3), to corrections added to the command, shape (n, 3), mm."""
+"""From commanded positions, shape (n, 3), to the corrections that are added to them, shape (n, 3), mm."""
 
 
 INNER_SHARE = 0.8
-"""Share of each stroke, about its middle, over which distances are judged."""
+"""Share of each stroke, about its middle, in which distances are judged."""
 PAIRS = 2000
-SEED = 230  # one fixed draw of pairs: the same solution always gives the same figures
+SEED = 230  # fixed, so that a solution always gives the same figures
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of positions: ``first_mm``, ``second_mm``, shape (n, 3); ``unit``: direction from first to second."""
+    """Pairs of positions, mm, shape (n, 3) each."""
 
     first_mm: F2
     second_mm: F2
@@ -41,7 +41,7 @@ class Pairs:
         return np.asarray(gap / np.linalg.norm(gap, axis=1, keepdims=True))
 
     def error_mm(self, first: F2, second: F2) -> F1:
-        """Error of each distance, actual minus nominal, from the deviations at both ends (exact, not linearised), shape (n,)."""
+        """Return the error of each distance, actual minus nominal, mm, shape (n,), from the deviations at both ends (not linearised)."""
         gap = self.second_mm - self.first_mm
         off = second - first
         length = np.linalg.norm(gap, axis=1)
@@ -50,13 +50,13 @@ class Pairs:
 
 
 def inner_box_mm(machine: Machine, share: float = INNER_SHARE) -> F2:
-    """Box of a share of each stroke about its middle, shape (3, 2)."""
+    """Return the box with a ``share`` of each stroke about its middle, shape (3, 2)."""
     half = 0.5 * share * machine.length_mm
     return np.stack([machine.centre_mm - half, machine.centre_mm + half], axis=1)
 
 
 def random_pairs(box_mm: F2, n: int = PAIRS, seed: int = SEED) -> Pairs:
-    """Pairs of independent, uniformly distributed positions in a box (shape (3, 2))."""
+    """Draw n pairs of independent, uniformly distributed positions in a box, shape (3, 2)."""
     rng = np.random.default_rng(seed)
     first, second = rng.uniform(box_mm[:, 0], box_mm[:, 1], (2, n, 3))
     return Pairs(first, second)
@@ -72,18 +72,18 @@ class DistanceStatistics:
 
 
 def figures(error_mm: F1) -> DistanceStatistics:
-    """Figures of distance errors, shape (n,)."""
+    """Return the statistics of distance errors, shape (n,)."""
     size = np.abs(error_mm)
     return DistanceStatistics(float(np.sqrt(np.mean(size**2))), float(np.quantile(size, 0.95)), float(size.max()))
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedDistances:
-    """Distance errors to be expected of the machine, over the inner volume, each with its standard uncertainty, mm.
+    """Predicted statistics of the distance errors over the inner volume, each with its standard uncertainty, mm.
 
-    Means over draws of the field from all sources of its uncertainty (noise, set-ups, typical sizes, orders above the chosen one,
-    wavelength, temperatures; `abbe.models.uncertainty.sources`), corrected as stated; the uncertainty is the scatter of the draws.
-    ``known_mm``: rms of the known part that the table leaves; ``unknown_mm``: of the unknown part, which no table can remove.
+    Each value is the mean over random draws of the deviation field from all sources of its uncertainty (noise, set-ups, typical sizes,
+    higher orders, wavelength, temperatures; `abbe.models.uncertainty.sources`); its uncertainty is the scatter of the draws.
+    ``known_mm``: rms of the known error that remains; ``unknown_mm``: rms of the unknown error, which no table can remove.
     """
 
     rms_mm: float
@@ -97,13 +97,13 @@ class PredictedDistances:
 
 
 def pair_design(machine: Machine, terms: tuple[Term, ...], pairs: Pairs) -> F2:
-    """Error of each distance per unit of every smooth term's coefficient, shape (n, terms)."""
+    """Return the error of each distance per unit of every coefficient, shape (n, terms)."""
     both = [np.einsum("ni,nik->nk", pairs.unit, design(machine, terms, p)) for p in (pairs.first_mm, pairs.second_mm)]
     return np.asarray(both[1] - both[0])
 
 
 def correction_error_mm(correction: Correction, pairs: Pairs) -> F1:
-    """What a correction adds to each distance, shape (n,)."""
+    """Return the change of each distance by a correction, mm, shape (n,)."""
     return np.asarray(np.einsum("ni,ni->n", pairs.unit, correction(pairs.second_mm) - correction(pairs.first_mm)))
 
 
@@ -115,21 +115,21 @@ def predict_distances(
     sources: ErrorSources | None = None,
     draws: int = 200,
 ) -> PredictedDistances:
-    """Distance errors that the identified machine will have, without or with a correction.
+    """Predict the distance errors of the identified machine, without or with a correction.
 
-    First order: a correction shifts the place where the machine's error acts, which changes it by the error's slope times the correction
-    (0.0001 x 50 um = 5 nm).
+    First order only: a correction also shifts the position at which the machine's error acts; this changes the error by its slope times the
+    correction (0.0001 x 50 um = 5 nm), which is neglected.
 
     Parameters
     ----------
-    correction : function, optional
-        Commanded positions (n, 3) to what is added to them (n, 3), mm; none: the machine as it is.
+    correction : Correction, optional
+        Default: the machine as it is.
     pairs : Pairs, optional
-        Default: `PAIRS` random ones in the inner 80 % of every stroke, always the same.
+        Default: `PAIRS` fixed random pairs in the inner 80 % of every stroke.
     sources : ErrorSources, optional
-        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
+        Sources of uncertainty; default: ``error_sources(solution)``, with the documented inputs.
     draws : int
-        Draws of the field, by a fixed generator.
+        Number of random draws of the field, with a fixed seed.
     """
     pairs = pairs or random_pairs(inner_box_mm(solution.machine))
     sources = sources or error_sources(solution)
@@ -146,7 +146,7 @@ def predict_distances(
 
 
 def _summed(known: F1, drawn: F2, unknown_mm: float) -> PredictedDistances:
-    """Statistics of the known error (n,) plus each of the draws (n, draws) of the unknown one."""
+    """Return the statistics of the known error, shape (n,), plus each draw of the unknown one, shape (n, draws)."""
     size = np.abs(known[:, None] + drawn)
     rms, q95, largest = np.sqrt(np.mean(size**2, axis=0)), np.quantile(size, 0.95, axis=0), size.max(axis=0)
     return PredictedDistances(

@@ -1,7 +1,7 @@
-"""3-D grid of corrections with trilinear interpolation: the table that also corrects the effect of angles at a distance.
+"""3-D grid of corrections with trilinear interpolation: unlike one-axis tables, it also corrects the effect of angles at a lever.
 
-Frame: the best-fit rigid motion over the grid is left out of the corrections, because it changes no distance between two points of a part;
-then one constant is added so that the reference node does not move (a controller's reference point must stay where it is).
+The corrections do not contain the best-fit rigid motion over the grid, which changes no distance between two points of a part. A constant
+keeps the reference node in place, because a controller's reference point must not move.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from abbe.models.uncertainty.prediction import compensable_mask, predict_deviati
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 FIT_SAMPLES = 5
-"""Sampled positions per cell when a function is fitted: the fit of a parabola is then within 2 % of the continuous one."""
+"""Samples per cell for the fit of a function; the fit of a parabola is then within 2 % of the continuous one."""
 
 
 def cells(nodes_mm: F1, position_mm: F1) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.intp]], F1]:
-    """Cell of each position and its place in it (0 at the cell's first node, 1 at its last; never outside, so end values are held)."""
+    """Return the index of the cell of each position, and the position within the cell, clipped to 0 .. 1."""
     index = np.clip(np.searchsorted(nodes_mm, position_mm, side="right") - 1, 0, nodes_mm.size - 2)
     share = (position_mm - nodes_mm[index]) / (nodes_mm[index + 1] - nodes_mm[index])
     return index, np.clip(share, 0.0, 1.0)
 
 
 def trilinear(nodes_mm: tuple[F1, F1, F1], values: F4, axes_mm: F2) -> F2:
-    """Trilinear interpolation in a grid.
+    """Interpolate trilinearly in a grid.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def trilinear(nodes_mm: tuple[F1, F1, F1], values: F4, axes_mm: F2) -> F2:
         Increasing positions of the nodes on X, Y, Z.
     values : array, shape (nx, ny, nz, m)
     axes_mm : array, shape (n, 3)
-        Positions; outside the grid the nearest value on its surface.
+        Positions; a position outside the grid gets the nearest value on its surface.
 
     Returns
     -------
@@ -57,16 +57,16 @@ def trilinear(nodes_mm: tuple[F1, F1, F1], values: F4, axes_mm: F2) -> F2:
 
 
 def fit_positions(nodes_mm: F1) -> F1:
-    """Positions at which a function of one axis is sampled for a fit: `FIT_SAMPLES` in the middle of equal parts of every cell."""
+    """Return the positions at which a function of one axis is sampled for a fit: the middles of `FIT_SAMPLES` equal parts of each cell."""
     part = (np.arange(FIT_SAMPLES) + 0.5) / FIT_SAMPLES
     return np.asarray((nodes_mm[:-1, None] + np.diff(nodes_mm)[:, None] * part).ravel())
 
 
 def fit_operator(nodes_mm: F1) -> F2:
-    """Node values of the least-squares broken line from the values at `fit_positions`, shape (nodes, samples).
+    """Return the matrix from values at `fit_positions` to node values of the least-squares polyline, shape (nodes, samples).
 
-    Node values of the function itself put all of a curve's departure from its chord on one side, h^2 f''/8 in the middle of a cell of
-    length h; the best broken line shares it out and leaves about 0.4 times as much rms of a parabola (0.6 of the distances in a volume).
+    A polyline through points of a curve lies on one side of it, h^2 f''/8 off in the middle of a cell of length h. The least-squares
+    polyline crosses the curve and leaves about 0.4 times the rms for a parabola (0.6 times for distances in a volume).
     """
     x = fit_positions(nodes_mm)
     index, share = cells(nodes_mm, x)
@@ -76,23 +76,23 @@ def fit_operator(nodes_mm: F1) -> F2:
     return np.asarray(np.linalg.pinv(hat))
 
 
-# Nodes whose deviation is smaller than its uncertainty are not compensated; this section treats the border to the others.
+# Nodes whose deviation is smaller than its uncertainty are not compensated. This section treats the border between them and the others.
 #
-# The rule. All nodes that are not compensated hold one and the same correction: no distance between two of them changes. The compensated
-# nodes hold minus the deviation, in the frame (rigid motion) that makes the errors of the distances across the border least. Between a
-# compensated and an uncompensated node the correction runs linearly over one cell, as everywhere else.
+# Rule: all nodes that are not compensated have the same correction, so that no distance between them changes. The compensated nodes have
+# minus the deviation plus the rigid motion that minimises the errors of distances across the border. In the cells between, the correction
+# changes linearly.
 #
-# The promise. By the identified field, the sum of squares of the errors of distances (fixed pairs over the whole volume) is never larger
-# than without any correction. The unknown part of the field is the same with and without: so it holds for the expected error too. Where the
-# rule cannot keep the promise, as with a mask that cuts a smooth error into pieces, nothing is compensated.
+# Guarantee: by the identified field, the sum of squares of the distance errors (fixed pairs over the whole volume) is never larger than
+# without correction. As the unknown part of the field is the same in both cases, this holds for the expected error too. If a mask breaks
+# the guarantee, for example because it cuts a smooth error into pieces, nothing is compensated.
 
 
 SMALL_CORRECTIONS = 1e-2
-"""Weight of small corrections against correct distances: it decides only the frame of a mask of a few nodes."""
+"""Weight of small corrections against correct distances; it matters only if the mask has a few nodes."""
 
 
 def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.bool_]) -> tuple[F4, NDArray[np.bool_]]:
-    """Corrections at the nodes and the nodes that are compensated.
+    """Compute the corrections at the nodes for a mask of nodes to compensate.
 
     Parameters
     ----------
@@ -101,12 +101,14 @@ def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.
     error_mm : array, shape (nx, ny, nz, 3)
         Deviation at the nodes, in any frame.
     compensable : array of bool, shape (nx, ny, nz)
+        Nodes to compensate.
 
     Returns
     -------
     correction_mm : array, shape (nx, ny, nz, 3)
-        Zero where nothing is compensated.
+        Zero at nodes that are not compensated.
     compensated : array of bool, shape (nx, ny, nz)
+        ``compensable``, or all False if the correction would make distances worse.
     """
     shape = error_mm.shape
     points = np.stack(np.meshgrid(*position_mm, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -130,7 +132,7 @@ def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.
 
 
 def _distance_errors(position_mm: tuple[F1, F1, F1], fields_mm: F3, pairs: Pairs) -> F2:
-    """Errors of the distances in trilinear fields given at the nodes, shape (nodes, 3, k); result (pairs, k)."""
+    """Return the errors of distances in k trilinear fields given at the nodes, shape (nodes, 3, k), as shape (pairs, k)."""
     grid = fields_mm.reshape(*(p.size for p in position_mm), -1)
     ends = [trilinear(position_mm, grid, p).reshape(pairs.unit.shape[0], 3, -1) for p in (pairs.first_mm, pairs.second_mm)]
     return np.asarray(np.einsum("ni,nik->nk", pairs.unit, ends[1] - ends[0]))
@@ -141,7 +143,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class GridTable:
-    """Corrections at the nodes of a grid, added to the command.
+    """Corrections at the nodes of a grid, to be added to the command.
 
     Attributes
     ----------
@@ -150,13 +152,13 @@ class GridTable:
     correction_mm : array, shape (nx, ny, nz, 3)
         Zero at the reference node.
     u_mm : array, shape (nx, ny, nz, 3)
-        Standard uncertainty of the deviation at each node from all sources (`abbe.models.uncertainty.prediction`), in the frame in which
-        the deviation has no rigid motion over the grid: the same figures that `compensable_nodes` judges by.
+        Standard uncertainty of the deviation at each node from all sources (`abbe.models.uncertainty.prediction`), in the frame without
+        rigid motion over the grid. `compensable_nodes` uses the same values.
     compensated : array of bool, shape (nx, ny, nz)
-        False: the deviation there is not known well enough; all these nodes hold one and the same correction, so that no distance between
-        two of them is changed (`abbe.models.compensation.grid`).
+        False: the deviation there is not known well enough. All these nodes have the same correction, so that no distance between two of
+        them changes.
     reference : (int, int, int)
-        The node that is not moved.
+        Index of the node that stays in place.
     """
 
     position_mm: tuple[F1, F1, F1]
@@ -166,27 +168,26 @@ class GridTable:
     reference: tuple[int, int, int]
 
     def correction_at(self, axes_mm: F2) -> F2:
-        """Correction at commanded positions by trilinear interpolation, end values held, shape (n, 3), mm."""
+        """Return the correction at commanded positions, mm, shape (n, 3): trilinear, constant beyond the grid."""
         return trilinear(self.position_mm, self.correction_mm, axes_mm)
 
     @property
     def largest_step_mm(self) -> float:
-        """Largest change of any axis' correction from one node to the next: what a controller limits, and what shows on a surface."""
+        """Largest change of the correction of any axis from one node to the next; controllers limit it, and it marks surfaces."""
         return max(float(np.abs(np.diff(self.correction_mm, axis=a)).max()) for a in range(3))
 
 
 def nodes_mm(position_mm: tuple[F1, F1, F1]) -> F2:
-    """All nodes of a grid, X slowest, shape (nx ny nz, 3)."""
+    """Return all nodes of a grid, X slowest, shape (nx ny nz, 3)."""
     return np.stack(np.meshgrid(*position_mm, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitted: bool = True) -> F3:
-    """Node values of the best trilinear field for each of the solution's terms, shape (nodes, 3, terms).
+    """Return the node values of the best trilinear field per unit of each coefficient of the solution, shape (nodes, 3, terms).
 
-    ``fitted``: least-squares fit of the trilinear interpolant over the volume of the grid; else the terms' own values at the nodes. Every
-    term bends along its own axis only and is at most linear in the others (rule G), where a trilinear field follows it exactly: so the fit
-    over the volume is the fit along the term's axis (tests/models/compensation/test_tables_grid.py fits the whole volume and finds the
-    same).
+    ``fitted``: by a least-squares fit over the volume of the grid; otherwise the deviation at the nodes themselves. A term is at most
+    linear in the other two axes (rule G), where trilinear interpolation is exact, so the fit along its own axis is the fit over the volume
+    (tests/models/compensation/test_tables_grid.py).
     """
     counts = tuple(p.size for p in position_mm)
     out: F3 = np.empty((int(np.prod(counts)), 3, len(solution.terms)))
@@ -212,20 +213,20 @@ def grid_table(
     fitted: bool = True,
     sources: ErrorSources | None = None,
 ) -> GridTable:
-    """Best 3-D grid for the machine as identified.
+    """Make the best 3-D grid of corrections for the identified machine.
 
     Parameters
     ----------
     counts : (int, int, int)
         Nodes of X, Y, Z.
     compensable : array of bool, shape ``counts``, optional
-        Nodes at which to compensate, e.g. `compensable_nodes`; none given: all.
+        Nodes to compensate, e.g. from `compensable_nodes`; default: all.
     reference : (int, int, int)
-        Node that the corrections do not move.
+        Index of the node that stays in place.
     fitted : bool
-        Fit the interpolant instead of sampling the field at the nodes: leaves about 0.6 of the rms between the nodes.
+        Fit the interpolant to the field instead of sampling the field at the nodes; this leaves about 0.6 of the rms between the nodes.
     sources : ErrorSources, optional
-        Sources of uncertainty for ``u_mm``, with the stated inputs they rest on; default: ``error_sources(solution)``.
+        Sources of uncertainty for ``u_mm``; default: ``error_sources(solution)``.
 
     Raises
     ------
@@ -235,7 +236,7 @@ def grid_table(
     position = grid_positions(solution.machine, counts)
     keep = np.ones(counts, dtype=bool) if compensable is None else np.asarray(compensable, dtype=bool)
     if keep.shape != counts:
-        raise ValueError(f"grid table: mask of shape {keep.shape} for {counts} nodes")
+        raise ValueError(f"grid table: the mask has shape {keep.shape}, expected {counts}")
     if not all(0 <= r < n for r, n in zip(reference, counts, strict=True)):
         raise ValueError(f"grid table: reference node {reference} is outside the grid of {counts} nodes")
     error = (node_design(solution, position, fitted=fitted) @ solution.coefficients).reshape(*counts, 3)
@@ -248,10 +249,10 @@ def grid_table(
 def compensable_nodes(
     solution: JointSolution, counts: tuple[int, int, int], *, inputs: StatedInputs | None = None, k: float | None = None
 ) -> Mask:
-    """Nodes at which the deviation is larger than its expanded uncertainty (`abbe.models.uncertainty.prediction`), shape ``counts``.
+    """Return the nodes at which the deviation exceeds its expanded uncertainty from all sources, shape ``counts``.
 
-    All sources of uncertainty count; the deviation is that without rigid motion over the grid. ``k``: coverage factor, default 95 %.
-    A node is not compensated either where the part that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`).
+    The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes where the part that no
+    reading shows may exceed the deviation are excluded too (`abbe.models.uncertainty.prediction`).
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)
@@ -261,7 +262,7 @@ def compensable_nodes(
 
 
 def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:
-    """The grid as the controller will store it: every correction rounded to its unit; the reference stays zero.
+    """Return the grid as the controller stores it: every correction rounded to the controller's unit.
 
     Raises
     ------
@@ -278,10 +279,10 @@ def check_steps(table: GridTable, limit_mm: float) -> None:
     Raises
     ------
     ValueError
-        Names the axis of the step, its node and its size; or the limit is not a number of 0 or more.
+        A step is too large (the message names axis, node and size), or the limit is negative or NaN.
     """
     if not limit_mm >= 0:
-        raise ValueError(f"grid table: the largest allowed step is {limit_mm} mm, must be a number of 0 or more")
+        raise ValueError(f"grid table: the largest allowed step is {limit_mm} mm, but must be a number of 0 or more")
     for a in range(3):
         step = np.abs(np.diff(table.correction_mm, axis=a)).max(axis=3)
         worst = np.unravel_index(int(step.argmax()), step.shape)
@@ -289,14 +290,14 @@ def check_steps(table: GridTable, limit_mm: float) -> None:
             at = ", ".join(f"{axis} {table.position_mm[k][i]:g}" for k, (axis, i) in enumerate(zip(AXES, worst, strict=True)))
             raise ValueError(
                 f"grid table: from the node at {at} to the next on {AXES[a]} the correction changes by {1e3 * step[worst]:.1f} um, "
-                f"the controller allows {1e3 * limit_mm:.1f} um: take more nodes on {AXES[a]}"
+                f"but the controller allows {1e3 * limit_mm:.1f} um: take more nodes on {AXES[a]}"
             )
 
 
 def quantisation_mm(lsb_mm: float) -> float:
-    """Standard uncertainty that rounding to the unit adds to one axis' correction between the nodes, mm.
+    """Return the standard uncertainty of one axis' interpolated correction from rounding to the controller's unit, mm.
 
-    Each node is off by a uniform lsb / sqrt(12); trilinear interpolation averages eight of them, which leaves (2/3)^(3/2) of it as rms over
-    a cell. A distance sees two ends: sqrt(2) of that.
+    Rounding gives each node a standard uncertainty of lsb / sqrt(12). Trilinear interpolation averages eight nodes, which leaves
+    (2/3)^(3/2) of it as rms over a cell. A distance has two ends and sqrt(2) times as much.
     """
     return float(lsb_mm / np.sqrt(12.0) * (2.0 / 3.0) ** 1.5)

@@ -1,7 +1,7 @@
 """Nine one-axis tables: correction of each axis as a function of each axis, on the controller's grid.
 
-The best nine tables for a deviation field are its best sum of functions of one axis (`abbe.models.compensation.additive`). The effect of
-angles at a distance that depends on two axes at once remains; a 3-D grid (`abbe.models.compensation.grid`) corrects it.
+The best nine tables approximate the deviation field by a sum of functions of one axis (`abbe.models.compensation.additive`). The effect of
+angles at a lever that depends on two axes remains; a 3-D grid (`abbe.models.compensation.grid`) corrects it.
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ from abbe.models.uncertainty.sources import ErrorSources, error_sources, varianc
 
 @dataclass(frozen=True)
 class NineTables:
-    """Correction added to the command: ``correction_mm[a][:, i]`` for output i at ``position_mm[a]`` of input axis a.
+    """Corrections added to the command: ``correction_mm[a][:, i]`` is added to axis i at the positions ``position_mm[a]`` of axis a.
 
-    ``u_mm`` has the same shapes: standard uncertainty of each entry relative to the entry at the first position, from all sources (noise,
-    priors, orders above the chosen one, stated inputs; `abbe.models.uncertainty.sources`), in the frame in which the deviation field has no
-    rigid motion over the volume (docs/explanation/conventions.md, "Frame"). The slope of a cross table (Y and Z over X, ...) is partly a
-    rotation of the whole frame, which no measurement of this kind sees, which moves no distance between two points of a part, and which the
-    corrections leave as the model happens to place it: compare tables only after taking the best-fit rotation out.
+    ``u_mm``, of the same shapes: standard uncertainty of each entry relative to the first one of its table, from all sources
+    (`abbe.models.uncertainty.sources`), in the frame without rigid motion over the volume (docs/explanation/conventions.md, "Frame"). The
+    slope of a cross table is partly a rotation of the whole frame. No reading shows this rotation, it changes no distance on a part, and
+    its value here is arbitrary: remove the best-fit rotation before you compare tables.
     """
 
     position_mm: tuple[F1, F1, F1]
@@ -39,7 +38,7 @@ class NineTables:
     u_mm: tuple[F2, F2, F2]
 
     def correction_at(self, axes_mm: F2) -> F2:
-        """Correction at commanded positions by linear interpolation, end values held, shape (n, 3), mm."""
+        """Return the correction at commanded positions, mm, shape (n, 3): linear, constant beyond the grid."""
         out = np.zeros((axes_mm.shape[0], 3))
         for a in range(3):
             for i in range(3):
@@ -48,11 +47,11 @@ class NineTables:
 
 
 def grid_positions(machine: Machine, counts: tuple[int, int, int]) -> tuple[F1, F1, F1]:
-    """Equidistant grid of each axis over its stroke, pitch rounded to whole 10 nm so that the controller stores it exactly."""
+    """Return an equidistant grid per axis over its stroke, the pitch rounded down to 10 nm so that the controller stores it exactly."""
     grids = []
     for a, n in enumerate(counts):
         if n < 2:
-            raise ValueError(f"table grid of {AXES[a]}: {n} points, at least 2 are needed")
+            raise ValueError(f"table grid of {AXES[a]}: {n} points given, at least 2 needed")
         pitch = np.floor(machine.length_mm[a] / (n - 1) * 1e5) / 1e5
         grids.append(machine.stroke_mm[a, 0] + pitch * np.arange(n))
     return grids[0], grids[1], grids[2]
@@ -61,7 +60,7 @@ def grid_positions(machine: Machine, counts: tuple[int, int, int]) -> tuple[F1, 
 def nine_tables(
     solution: JointSolution, counts: tuple[int, int, int], *, nodes: int = 9, sources: ErrorSources | None = None
 ) -> NineTables:
-    """Best nine tables for the machine as identified, zero at the first grid position of each axis.
+    """Make the best nine tables for the identified machine, zero at the first grid position of each axis.
 
     Parameters
     ----------
@@ -70,7 +69,7 @@ def nine_tables(
     nodes : int
         Nodes per axis of the volume over which the tables are fitted.
     sources : ErrorSources, optional
-        Sources of uncertainty, with the stated inputs they rest on; default: ``error_sources(solution)``, so the documented inputs.
+        Sources of uncertainty; default: ``error_sources(solution)``, with the documented inputs.
     """
     machine, sources = solution.machine, sources or error_sources(solution)
     grids = grid_positions(machine, counts)
@@ -78,37 +77,37 @@ def nine_tables(
     rotation = frame_rotation(machine, sources.terms, nodes)
     for a, relative in enumerate(table_design(solution, grids, nodes, sources.terms)):
         corrections.append(-(relative @ sources.coefficients))
-        turned = np.cross(rotation.T, np.eye(3)[a]).T  # slope over axis a that a rotation of the frame gives every output
+        turned = np.cross(rotation.T, np.eye(3)[a]).T  # slope of the corrections over axis a by a rotation of the frame
         fixed = relative - (grids[a] - grids[a][0])[:, None, None] * turned
         uncertainties.append(entry_u(sources, fixed))
     return NineTables(grids, (corrections[0], corrections[1], corrections[2]), (uncertainties[0], uncertainties[1], uncertainties[2]))
 
 
 def entry_u(sources: ErrorSources, per_unit: F3) -> F2:
-    """Standard uncertainty of table entries from all sources, (n, 3), for their design (n, 3, len(sources.terms))."""
+    """Return the standard uncertainty of table entries, shape (n, 3), from their values ``per_unit`` of each coefficient."""
     return np.asarray(np.sqrt(variances(sources, per_unit.reshape(-1, per_unit.shape[2]))).reshape(per_unit.shape[:2]))
 
 
 def table_design(
     solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int, terms: tuple[Term, ...] | None = None
 ) -> tuple[F3, F3, F3]:
-    """Best nine tables of the deviation per unit of every coefficient, first entries zero: per axis shape (len(grid), 3, terms).
+    """Return the best nine tables of the deviation per unit of every coefficient, first entries zero: per axis (len(grid), 3, terms).
 
-    ``terms``: the solution's own, or with orders above them, which have uncertainty but no value.
+    ``terms``: default the solution's own; may hold higher orders too, which have an uncertainty only.
     """
     x, y, z = (effect - effect[0] for effect in additive_design(solution, grids_mm, nodes, terms))
     return x, y, z
 
 
 def frame_rotation(machine: Machine, terms: tuple[Term, ...], nodes: int) -> F2:
-    """Best-fit rotation of the deviation field over the volume per unit of every coefficient, shape (3, terms), rad."""
+    """Return the best-fit rotation of the deviation over the volume per unit of every coefficient, rad, shape (3, terms)."""
     grid = volume_grid(machine.stroke_mm, nodes)
     full = design(machine, terms, grid).reshape(-1, len(terms))
     return np.asarray(np.linalg.lstsq(rigid_design(grid).reshape(-1, 6), full, rcond=None)[0][3:])
 
 
 def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
-    """The tables as the controller will store them: every entry rounded to its unit.
+    """Return the tables as the controller stores them: every entry rounded to the controller's unit.
 
     Raises
     ------
@@ -121,20 +120,14 @@ def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
 
 
 def check_unit(lsb_mm: float) -> None:
-    """Refuse a controller's unit that is not a positive number: rounding to it would make tables of nothing.
-
-    Raises
-    ------
-    ValueError
-        Names the unit.
-    """
+    """Refuse a controller's unit that is not a positive number; entries cannot be rounded to it."""
     if not (np.isfinite(lsb_mm) and lsb_mm > 0):
-        raise ValueError(f"tables: the controller's unit is {lsb_mm} mm, must be a positive number")
+        raise ValueError(f"tables: the controller's unit is {lsb_mm} mm, but must be a positive number")
 
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """Volumetric rms (rigid motion removed) by the identified model, mm; ``u_model_mm``: rms error of the model itself, all sources."""
+    """Predicted volumetric rms error (rigid motion removed) before and after correction, and `model_uncertainty_mm`, mm."""
 
     before_mm: float
     after_mm: float
@@ -142,7 +135,7 @@ class Predicted:
 
 
 def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int = 9, sources: ErrorSources | None = None) -> Predicted:
-    """Predicted errors of the machine without and with these tables, and the model's uncertainty (`model_uncertainty_mm`)."""
+    """Predict the rms error of the machine without and with these tables, and the uncertainty of the model."""
     machine = solution.machine
     grid = volume_grid(machine.stroke_mm, nodes)
     field = solution.deviation_mm(grid)
@@ -155,25 +148,24 @@ def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int 
 
 
 def model_uncertainty_mm(solution: JointSolution, *, nodes: int = 9, sources: ErrorSources | None = None) -> float:
-    """Rms over the volume of the standard uncertainty of the identified deviation vector, rigid motion removed, mm.
+    """Return the rms over the volume of the standard uncertainty of the identified deviation vector, rigid motion removed, mm.
 
-    All sources count: noise, set-ups, typical sizes, orders above the chosen one, wavelength, temperatures. ``sources``: with other stated
-    inputs than the documented ones.
+    It includes all sources: noise, set-ups, typical sizes, higher orders, wavelength, temperatures.
     """
     grid = volume_grid(solution.machine.stroke_mm, nodes)
     return budget_over(predict_deviation(sources or error_sources(solution), grid, frame=RigidFree(grid))).u_mm
 
 
 WITHIN_MM = 5e-4
-"""Largest difference of a smooth table from its polynomial at any position; others are pitch errors, or made by hand."""
+"""Largest difference of a smooth table from its polynomial; other tables hold pitch errors or values entered by hand."""
 ORDERS = range(2, 13)
 
 
 def smooth_of(tables: NineTables) -> Callable[[F2], F2] | None:
-    """Polynomials through nine tables: corrections at commanded positions (n, 3), mm, shape (n, 3); None where there are none such.
+    """Fit polynomials to nine tables; return the correction (n, 3), mm, as a function of positions (n, 3), or None if a fit fails.
 
-    Each table gets the lowest order of 2 to 12 that fits it within 0.5 µm at its positions. The residual comes from interpolation, rounding
-    and cut ends, which no error of a machine resembles and a solver would take for motions of high order.
+    Each table gets the lowest order from 2 to 12 that fits its entries within 0.5 µm. The polynomials are free of interpolation corners,
+    rounding and cut ends, which a solver would take for motions of high order.
     """
     found = [[_meets(tables.position_mm[a], tables.correction_mm[a][:, i]) for i in range(3)] for a in range(3)]
     if any(one is None for row in found for one in row):

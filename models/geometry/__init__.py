@@ -1,1 +1,1 @@
-"""Functions of axis position and the 3-axis chain that turns them into a deviation of the tool."""
+"""The 3-axis kinematic chain, which turns error motions into a deviation of the tool."""

@@ -1,7 +1,7 @@
-"""Smooth error functions of one axis: Legendre polynomials over the stroke, with the field's datum rules built in.
+"""Smooth error functions of one axis: Legendre polynomials over the stroke that meet the datum rules.
 
-Positioning and angles are zero at the start of the stroke; straightness has no constant and no slope (math.md 1), by construction: the
-Legendre polynomials of order 2 and more are orthogonal to 1 and x over the stroke.
+Positioning and angles are zero at the start of the stroke. Straightness has no constant and no slope: it starts at order 2, and these
+Legendre polynomials are orthogonal to 1 and x over the stroke.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ __all__ = ["DIRECTIONS", "ROTATIONS", "Term", "layout_of", "legendre_values", "m
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One column of the model: error motion ``motion`` (e.g. ``"EYX"``), Legendre order ``order``, of axis index ``axis``.
+    """One term of the model: the part of an error motion with one Legendre order; its coefficient is an unknown of a solution.
 
-    ``component`` 0..2 is a translation X, Y, Z; 3..5 a rotation A, B, C. Squareness is ``C0Y``, ``B0Z``, ``A0Z`` with order 0.
+    ``motion``: e.g. ``"EYX"``, with ``order`` 1 or more; squareness is ``"C0Y"``, ``"B0Z"``, ``"A0Z"`` with order 0. ``axis``: index of the
+    moving axis. ``component``: 0..2 for the translations X, Y, Z, 3..5 for the rotations A, B, C.
     """
 
     motion: str
@@ -34,15 +35,15 @@ class Term:
 
     @property
     def name(self) -> str:
-        """Name as people read it: ``EYX.3``, ``C0Y``."""
+        """Name of the coefficient: ``EYX.3``, ``C0Y``."""
         return f"{self.motion}.{self.order}" if self.order else self.motion
 
 
 @lru_cache(maxsize=64)
 def smooth_terms(order: int) -> tuple[Term, ...]:
-    """All terms of the 21 error motions up to a Legendre order: 18 order - 3 columns (math.md 4.6)."""
+    """Return all 18 order - 3 terms of the 21 error motions up to a Legendre order."""
     if order < 1:
-        raise ValueError(f"order {order}: must be 1 or more")
+        raise ValueError(f"Legendre order {order}: must be 1 or more")
     terms: list[Term] = []
     for a, axis in enumerate(DIRECTIONS):
         for c, motion in enumerate(motion_names(axis)):
@@ -53,7 +54,7 @@ def smooth_terms(order: int) -> tuple[Term, ...]:
 
 
 def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
-    """Value of each term's own function at commanded positions, before any lever arm.
+    """Return the value of each term's function at commanded positions, without lever arms.
 
     Parameters
     ----------
@@ -63,8 +64,9 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
 
     Returns
     -------
-    array, shape (n, len(terms)): Legendre value (zero at stroke start for positioning and angles), or, for squareness, the travel of the
-    axis from its stroke start with the sign of docs/explanation/conventions.md.
+    array, shape (n, len(terms))
+        Legendre polynomial (zero at the start of the stroke for positioning and angles); for squareness, the travel from the start of the
+        stroke, mm, with the sign of docs/explanation/conventions.md.
     """
     layout = layout_of(terms)
     start, travel_mm = stroke_mm[:, :1], np.asarray(axes_mm).T - stroke_mm[:, :1]
@@ -78,11 +80,11 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
 
 @dataclass(frozen=True)
 class TermLayout:
-    """Where the terms of a model stand, shape (terms,) each.
+    """Indices that `term_values` needs for a tuple of terms, shape (terms,) each.
 
-    ``motion``: which of the 18 motions (axis x 6 + component). ``row``: of the Legendre tables, 3 x order + axis. ``at_start``: what is
-    taken off, the value at the start of the stroke of positioning and angles. ``highest``: order. ``squareness``: (index, axis, sign) of
-    each squareness.
+    ``motion``: index of the error motion, 6 axis + component. ``row``: row of the Legendre tables, 3 order + axis. ``at_start``: value at
+    the start of the stroke, which is subtracted; zero for straightness. ``highest``: highest order. ``squareness``: (index of the term,
+    axis, sign) of each squareness.
     """
 
     motion: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
@@ -94,7 +96,7 @@ class TermLayout:
 
 @lru_cache(maxsize=64)
 def layout_of(terms: tuple[Term, ...]) -> TermLayout:
-    """The layout of these terms, made once."""
+    """Return the layout of these terms; it is cached."""
     straight = np.array([t.component < 3 and t.component != t.axis for t in terms], dtype=bool)
     return TermLayout(
         np.array([6 * t.axis + t.component for t in terms], dtype=np.intp),

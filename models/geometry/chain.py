@@ -1,8 +1,8 @@
 """Deviation of the tool relative to the workpiece for any of the 24 chains, and its derivatives.
 
-The deviation by rule G (first order), with its design matrix, and by the exact transforms; its derivative with respect to every error
-motion and every squareness, first order and exact. Columns of a derivative are in the units of the motions: mm per mm for translations, mm
-per rad for rotations and squareness."""
+The deviation comes to first order by rule G (docs/explanation/conventions.md) or from the exact transforms. Derivatives by error motions
+and squareness exist for both, mm per mm for translations and mm per rad for rotations and squareness.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from abbe.models.machine import AXES, Machine, levers_mm, split_chain
 
 
 def all_chains() -> tuple[str, ...]:
-    """The 24 serial arrangements of three carriages, 6 orders times 4 places of the bed, e.g. ``"w-X-Y-b-Z-t"``."""
+    """Return the 24 serial arrangements of three carriages: 6 orders times 4 positions of the bed, e.g. ``"w-X-Y-b-Z-t"``."""
     return tuple("-".join(("w", *order[:k], "b", *order[k:], "t")) for order in permutations(AXES) for k in range(4))
 
 
 def checked_axes(axes_mm: ArrayLike) -> F2:
-    """Commanded positions as float64 of shape (n, 3); ValueError for another shape. NaN passes: it comes out as NaN."""
+    """Return commanded positions as float64; ValueError if the shape is not (n, 3). NaN is allowed."""
     axes = np.asarray(axes_mm, dtype=np.float64)
     if axes.ndim != 2 or axes.shape[1] != 3:
         raise ValueError(f"chain: axes_mm must have shape (n, 3), got {axes.shape}")
@@ -31,13 +31,7 @@ def checked_axes(axes_mm: ArrayLike) -> F2:
 
 
 def checked(axes_mm: ArrayLike, motions: ArrayLike) -> tuple[F2, F3]:
-    """Positions and motions as float64 of shapes (n, 3) and (n, 3, 6).
-
-    Raises
-    ------
-    ValueError
-        They have other shapes.
-    """
+    """Return positions and motions as float64; ValueError if their shapes are not (n, 3) and (n, 3, 6). NaN is allowed."""
     axes, values = np.asarray(axes_mm, dtype=np.float64), np.asarray(motions, dtype=np.float64)
     n = axes.shape[0] if axes.ndim else 0
     if axes.shape != (n, 3) or values.shape != (n, 3, 6):
@@ -46,7 +40,7 @@ def checked(axes_mm: ArrayLike, motions: ArrayLike) -> tuple[F2, F3]:
 
 
 def deviation_mm(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | None = None) -> F2:
-    """First-order deviation of the functional point for given error motions, any of the 24 chains (math.md 2, rule G).
+    """Return the first-order deviation of the functional point for given error motions (rule G, docs/explanation/conventions.md).
 
     Parameters
     ----------
@@ -55,17 +49,17 @@ def deviation_mm(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | 
     motions : array, shape (n, 3 axes, 6)
         EX EY EZ (mm, squareness included) and EA EB EC (rad) of the X, Y, Z carriage at these positions, ISO signs.
     tool_mm : array, shape (3,) or (n, 3), optional
-        Tool in place of ``machine.tool_mm``: one for all points or one per point.
+        Tool vector in place of ``machine.tool_mm``: one for all points or one per point.
 
     Returns
     -------
     array, shape (n, 3)
-        Actual minus nominal, tool relative to workpiece, mm. NaN in a row of the input is NaN in that row: nothing is checked but shapes.
+        Actual minus nominal, tool relative to workpiece, mm. NaN in the input gives NaN in the same row.
 
     Raises
     ------
     ValueError
-        Another shape.
+        An array has another shape.
     """
     axes_mm, motions = checked(axes_mm, motions)
     r = levers_mm(machine, axes_mm, tool_mm)
@@ -76,19 +70,17 @@ def deviation_mm(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | 
 def exact_deviation_mm(
     machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | None = None, *, rotation: RotationForm = "vector"
 ) -> F2:
-    """The same with finite rotations; parameters, result and errors as in `deviation_mm`.
+    """Return the deviation with finite rotations (docs/explanation/conventions.md, "Exact kinematics").
 
-    Source: docs/explanation/conventions.md, "Exact kinematics".
-
-    Only what the errors add is carried along the chain, never the position itself, so the result is good to about 16 digits of its own
-    size and not of the machine's.
+    Parameters, result and errors are those of `deviation_mm`. The chain adds up displacements, never positions, so the rounding error is
+    relative to the deviation and not to the size of the machine.
 
     Parameters
     ----------
     rotation : "vector", "zyx" or "small"
-        Rotation from a carriage's three angles: by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation (a table's own
-        is −E, and its transform is inverted exactly); or the papers' matrix I + [E]×, on the work side the exact inverse of I + [−E]×.
-        Pahk (1), (3) leave the choice open; they differ in second order only.
+        How three angles make a rotation; the forms differ in second order only, and Pahk (1), (3) leave the choice open. ``vector``: by the
+        vector E. ``zyx``: Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation; that of a work-side carriage is −E, and its transform is
+        inverted exactly. ``small``: the papers' I + [E]×; on the work side, the exact inverse of I + [−E]×.
     """
     axes_mm, motions = checked(axes_mm, motions)
     work, tool = split_chain(machine.chain)
@@ -104,9 +96,9 @@ def exact_deviation_mm(
 
 
 def design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2) -> F3:
-    """Derivative of the deviation with respect to every term's coefficient, shape (n, 3, len(terms)).
+    """Return the first-order derivative of the deviation with respect to every coefficient, shape (n, 3, len(terms)).
 
-    Coefficients are mm for translations, rad for rotations and squareness. Rule G is linear, so ``design @ coefficients`` is the deviation.
+    Coefficients are in mm for translations, in rad for rotations and squareness. ``design @ coefficients`` is the deviation by rule G.
     """
     per_motion = motion_jacobian(machine, axes_mm).reshape(-1, 3, 18)
     out: F3 = per_motion[:, :, layout_of(terms).motion]
@@ -115,14 +107,14 @@ def design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2) -> F3:
 
 
 REST_MM = 1e-8
-"""A difference of two commanded positions below this is rounding (1e-13 of a metre), not a motion: no axis reverses by it."""
+"""A smaller difference of two commanded positions is rounding and no motion."""
 
 
 def travel_sign(axes_mm: F2) -> F2:
-    """Direction in which each axis last moved, -1, 0 or +1, shape (n, 3), for a sequence of positions.
+    """Return the direction in which each axis last moved, -1, 0 or +1, shape (n, 3), for a sequence of positions.
 
-    An axis that rests keeps its last sign; before its first motion it has the sign of that first motion (sequences approach their start
-    in that direction), 0 if it never moves.
+    An axis at rest keeps its last sign. Before its first motion it has the sign of this motion, because sequences approach their start in
+    that direction; an axis that never moves has 0.
     """
     moved_mm = np.diff(axes_mm, axis=0, prepend=axes_mm[:1])
     step = np.sign(np.where(np.abs(moved_mm) > REST_MM, moved_mm, 0.0))
@@ -136,24 +128,24 @@ def travel_sign(axes_mm: F2) -> F2:
 
 
 SQUARENESS = tuple(t for t in smooth_terms(1) if t.order == 0)
-"""C0Y, B0Z, A0Z: which translation of which axis each of them is (docs/explanation/conventions.md)."""
+"""Terms of C0Y, B0Z, A0Z (docs/explanation/conventions.md)."""
 
 
 def motion_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> F4:
-    """First order: derivative of the deviation with respect to each error motion (math.md 2, rule G: Σ_j d_j + E_j × r_j).
+    """Return the first-order derivative of the deviation with respect to each error motion (rule G: Σ_j d_j + E_j × r_j).
 
     Parameters
     ----------
     axes_mm : array, shape (n, 3)
         Commanded positions.
     tool_mm : array, shape (3,) or (n, 3), optional
-        Tool in place of ``machine.tool_mm``.
+        Tool vector in place of ``machine.tool_mm``.
 
     Returns
     -------
     array, shape (n, 3 components of the deviation, 3 carriages X Y Z, 6)
-        Last index EX EY EZ (mm per mm) and EA EB EC (mm per rad) of that carriage. Rule G is linear: summed over the last two with the
-        motions it is `abbe.models.geometry.chain.deviation_mm`, exactly.
+        Last index: EX EY EZ (mm per mm) and EA EB EC (mm per rad) of that carriage. The sum of products with the motions is
+        `deviation_mm`.
 
     Raises
     ------
@@ -168,21 +160,22 @@ def motion_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = Non
 
 
 def exact_jacobian(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | None = None) -> F4:
-    """The same of the exact kinematics with rotation vectors, at given errors (docs/explanation/conventions.md, "Exact kinematics").
+    """Return the derivative of the exact deviation, with rotation vectors, with respect to each error motion, at given motions.
 
-    Analytic: each carriage turns what the carriages before it contributed, and its own turn is Rodrigues' formula differentiated. Without
-    errors it is `motion_jacobian`.
+    It is analytic: each carriage rotates the contributions of the carriages before it, and Rodrigues' formula is differentiated. At zero
+    motions it equals `motion_jacobian`.
 
     Parameters
     ----------
     axes_mm : array, shape (n, 3)
     motions : array, shape (n, 3 axes, 6)
-        Where to differentiate: EX EY EZ (mm, squareness included), EA EB EC (rad), ISO signs.
+        Motions at which to differentiate: EX EY EZ (mm, squareness included), EA EB EC (rad), ISO signs.
     tool_mm : array, shape (3,) or (n, 3), optional
+        Tool vector in place of ``machine.tool_mm``.
 
     Returns
     -------
-    array, shape (n, 3, 3, 6), as `motion_jacobian`; derivative of ``exact_deviation_mm(..., rotation="vector")``.
+    array, shape (n, 3, 3, 6), as from `motion_jacobian`; derivative of ``exact_deviation_mm(..., rotation="vector")``.
 
     Raises
     ------
@@ -197,7 +190,7 @@ def exact_jacobian(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 
     out: F4 = np.zeros((n, 3, 3, 6))
     for j in (*reversed(tool), *reversed(work)):
         moved, turned = motions[:, j, :3], motions[:, j, 3:]
-        if j in work:  # a table is displaced before it turns, a head after
+        if j in work:  # a work-side carriage is displaced before it turns, a tool-side one after
             off = off + moved
             out[:, :, j, :3] = np.eye(3)
         arm = r[:, j] + off
@@ -211,7 +204,7 @@ def exact_jacobian(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 
 
 
 def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
-    """Error motions per unit of squareness: slope times travel, signs of docs/explanation/conventions.md (X the datum).
+    """Return the error motions per rad of squareness: slope times travel, with X as the datum (docs/explanation/conventions.md).
 
     C0Y gives EXY = −C0Y·y, B0Z gives EXZ = +B0Z·z, A0Z gives EYZ = −A0Z·z.
 
@@ -219,9 +212,9 @@ def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
     ----------
     axes_mm : array, shape (n, 3)
     start_mm : array, shape (3,), optional
-        Position at which the travel of X, Y, Z is zero. Default: the axis zero, as the papers' matrices write it (−αX). Solutions of this
-        program (`abbe.models.geometry.bases.term_values`) count from the start of the stroke, ``machine.stroke_mm[:, 0]``, where
-        positioning and angles are zero too. To first order the choice shifts the whole map by a constant and changes no shape.
+        Position at which the travel of X, Y, Z is zero. Default: the axis zero, as in the papers' matrices (−αX). Abbe's solutions
+        (`abbe.models.geometry.bases.term_values`) count from the start of the stroke, ``machine.stroke_mm[:, 0]``. To first order the
+        choice only shifts the whole map by a constant.
 
     Returns
     -------
@@ -230,7 +223,7 @@ def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
     Raises
     ------
     ValueError
-        Another shape.
+        An array has another shape.
     """
     axes_mm = checked_axes(axes_mm)
     start = np.zeros(3) if start_mm is None else np.asarray(start_mm, dtype=np.float64)
@@ -244,14 +237,14 @@ def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
 
 
 def squareness_jacobian(axes_mm: F2, start_mm: F1 | None = None, *, motion: F4 | None = None) -> F3:
-    """Derivative of the deviation with respect to C0Y, B0Z, A0Z, where they enter as slope times travel.
+    """Return the derivative of the deviation with respect to C0Y, B0Z, A0Z, which act as slope times travel.
 
     Parameters
     ----------
     axes_mm, start_mm
         As in `squareness_motions`.
     motion : array, shape (n, 3, 3, 6), optional
-        An `exact_jacobian`, to go through the exact kinematics. Without it first order, where chain, tool and pivots do not matter.
+        Result of `exact_jacobian`, for the exact kinematics. Default: first order, which does not depend on chain, tool and pivots.
 
     Returns
     -------
@@ -260,7 +253,7 @@ def squareness_jacobian(axes_mm: F2, start_mm: F1 | None = None, *, motion: F4 |
     Raises
     ------
     ValueError
-        Another shape.
+        An array has another shape.
     """
     per_angle = squareness_motions(axes_mm, start_mm)
     if motion is None:

@@ -1,4 +1,4 @@
-"""Uncertainty of the tool's deviation from uncertain parameters of the error motions."""
+"""Uncertainty of the tool's deviation from the covariance of the parameters of the error motions."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from abbe.models.geometry.chain import exact_jacobian, motion_jacobian
 from abbe.models.machine import Machine
 
 TOLERANCE = 1e-6
-"""Of a correlation: covariances come out of files, where six or seven digits are usual."""
+"""Tolerance of a correlation: covariances come from files with six or seven digits."""
 
 
 def checked_covariance(matrix: ArrayLike, size: int, what: str = "covariance") -> F2:
-    """A covariance, made exactly symmetric.
+    """Check a covariance matrix and return it exactly symmetric.
 
-    mm and rad differ by five orders, so the correlations are judged and not the raw numbers. A parameter whose variance is zero is
-    certain: nothing can be correlated with it.
+    The check uses correlations, because variances in mm^2 and rad^2 differ by many orders of magnitude. A parameter with variance zero is
+    certain and has no correlation.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def checked_covariance(matrix: ArrayLike, size: int, what: str = "covariance") -
     size : int
         Number of parameters.
     what : str
-        Its name in error messages.
+        Name of the matrix in error messages.
 
     Returns
     -------
@@ -39,9 +39,8 @@ def checked_covariance(matrix: ArrayLike, size: int, what: str = "covariance") -
     Raises
     ------
     ValueError
-        Another shape, text or truth values in place of numbers, a number that is not finite, a negative variance, a covariance with a
-        parameter of variance zero or above what the two variances allow, no symmetry, or a combination of parameters whose variance
-        would be negative (the last three beyond `TOLERANCE` of a correlation).
+        The matrix has another shape, holds something else than finite numbers, or has a negative variance or a covariance with a parameter
+        of variance zero; or, beyond `TOLERANCE` of a correlation, it is not symmetric or not positive semidefinite.
     """
     raw = np.asarray(matrix)
     if raw.dtype.kind not in "fiu":
@@ -58,27 +57,27 @@ def checked_covariance(matrix: ArrayLike, size: int, what: str = "covariance") -
         )
     certain = (variance == 0.0) & ((c != 0.0).any(axis=0) | (c != 0.0).any(axis=1))
     if certain.any():
-        raise ValueError(f"{what}, row {int(np.argmax(certain)) + 1}: the variance is zero, so the whole row and column must be")
+        raise ValueError(f"{what}, row {int(np.argmax(certain)) + 1}: the variance is zero, so the whole row and column must be zero")
     _check_correlations(c, np.sqrt(np.where(variance > 0.0, variance, 1.0)), what)
     half: F2 = 0.5 * c
-    return half + half.T  # each half first: the sum of two large numbers would be infinite
+    return half + half.T  # halved first, so that the sum of two large numbers does not overflow
 
 
 def _check_correlations(c: F2, spread: F2, what: str) -> None:
-    with np.errstate(all="ignore"):  # what overflows is far above 1, and refused as that
+    with np.errstate(all="ignore"):  # an overflow is refused as a correlation above 1
         scaled = c / spread[:, None] / spread
         if (np.abs(scaled - scaled.T) > TOLERANCE).any():
             raise ValueError(f"{what}: it is not symmetric: row i, column j must hold the same number as row j, column i")
         impossible = not (np.abs(scaled) <= 1.0 + TOLERANCE).all()
     if impossible or (scaled.size and np.linalg.eigvalsh(scaled).min() < -TOLERANCE):
-        raise ValueError(f"{what}: no covariance: some combination of the parameters would have a negative variance")
+        raise ValueError(f"{what}: not a covariance: some combination of the parameters would have a negative variance")
 
 
 CHUNK = 8192
-"""Maximum number of points at a time."""
+"""Maximum number of points in one batch."""
 
 WEIGHTS = 2**20
-"""Maximum number of weights (points times parameters) at a time, 8 MB: for many points or long tables all would not fit into memory."""
+"""Maximum number of points times parameters in one batch: 8 MB, so that many points and long tables fit into memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +89,9 @@ class Points:
     axes_mm : array, shape (n, 3)
         Commanded positions.
     direction : array, shape (n, 3), optional
-        Sign of each axis' last move, as `ErrorMotions.motions` takes it.
+        Sign of the last move of each axis, as `ErrorMotions.motions` takes it.
     tool_mm : array, shape (n, 3), optional
-        Tool at each point in place of the machine's.
+        Tool vector at each point in place of the machine's.
     """
 
     axes_mm: F2
@@ -100,21 +99,21 @@ class Points:
     tool_mm: F2 | None = None
 
     def rows(self, which: slice) -> Points:
-        """Some of the points."""
+        """Return a slice of the points."""
         direction = None if self.direction is None else self.direction[which]
         return Points(self.axes_mm[which], direction, None if self.tool_mm is None else self.tool_mm[which])
 
 
 def sensitivity(machine: Machine, errors: ErrorMotions, names: Sequence[str], at: Points, *, exact: bool = False) -> F3:
-    """Derivative of the deviation with respect to parameters of the error motions.
+    """Return the derivative of the deviation with respect to parameters of the error motions.
 
     Parameters
     ----------
     names : sequence of str
-        As `ErrorMotions.parameter_names` writes them.
+        Some of `ErrorMotions.parameter_names`.
     at : Points
     exact : bool
-        With finite rotations, at the given errors, instead of rule G.
+        Use finite rotations at the given errors instead of rule G.
 
     Returns
     -------
@@ -136,12 +135,12 @@ def sensitivity(machine: Machine, errors: ErrorMotions, names: Sequence[str], at
 def deviation_covariance(
     machine: Machine, errors: ErrorMotions, covariance: tuple[Sequence[str], F2], at: Points, *, exact: bool = False
 ) -> F3:
-    """Covariance of the three components of the deviation at each point, by the law of propagation.
+    """Return the covariance of the three components of the deviation at each point, by the law of propagation (GUM).
 
     Parameters
     ----------
     covariance : (names, matrix)
-        Parameters and their covariance, shape (p, p), units of the parameters squared. Parameters that are not named count as certain.
+        Names of parameters, and their covariance, shape (p, p), in products of their units. Other parameters count as certain.
     at, exact
         As in `sensitivity`.
 
@@ -152,7 +151,7 @@ def deviation_covariance(
     Raises
     ------
     ValueError
-        The matrix does not fit the names or is not a covariance (`checked_covariance`), or as in `sensitivity`.
+        The matrix does not fit the names or is not a covariance (`checked_covariance`), or `sensitivity` would raise.
     """
     names, matrix = covariance
     matrix = checked_covariance(matrix, len(names))
@@ -175,25 +174,25 @@ def deviation_covariance(
 
 
 def _slopes(machine: Machine, errors: ErrorMotions, at: Points, *, exact: bool) -> F4:
-    """Derivative of the deviation with respect to each error motion, shape (n, 3, 3, 6)."""
+    """Return the derivative of the deviation with respect to each error motion, shape (n, 3, 3, 6)."""
     if exact:
         return exact_jacobian(machine, at.axes_mm, errors.motions(at.axes_mm, at.direction), at.tool_mm)
     return motion_jacobian(machine, at.axes_mm, at.tool_mm)
 
 
 def _motion_covariance(weights: F2, covariance: F2, first: NDArray[np.intp]) -> F3:
-    """Covariance of the error motions themselves, shape (n, g, g): at most 18 of them link the parameters to the deviation.
+    """Return the covariance of the g error motions with uncertain parameters, shape (n, g, g).
 
-    A parameter acts in one motion, so that only the matrix' block of two motions enters for each pair of them, and half of the pairs do.
+    Each parameter acts in one motion only, so each pair of motions needs only its block of the matrix; symmetry gives half of the pairs.
 
     Parameters
     ----------
     weights : array, shape (n, p)
-        Derivative of its motion with respect to each parameter, parameters of one motion together.
+        Derivative of its motion with respect to each parameter; the parameters of one motion stand together.
     covariance : array, shape (p, p)
-        Symmetric, in the same order.
+        In the same order.
     first : array of int, shape (g,)
-        Where the parameters of each motion begin.
+        Index of the first parameter of each motion.
     """
     g = first.size
     out: F3 = np.empty((weights.shape[0], g, g))

@@ -1,7 +1,6 @@
-"""Change of a vector by a small rotation: (R − I) v without forming R, so that no digits are lost by subtracting long vectors.
+"""Displacement (R − I) v of a vector v by a small rotation R, computed without R, so that no subtraction of long vectors loses digits.
 
-Three exact forms of the rotation of a carriage that turns by E = (EA, EB, EC) (docs/explanation/conventions.md, "Exact kinematics"):
-they agree to first order and differ at the second, by the order of the three turns.
+Three forms make a rotation of E = (EA, EB, EC) (docs/explanation/conventions.md, "Exact kinematics"). They agree to first order.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ RotationForm = Literal["vector", "zyx", "small"]
 
 
 def cross(a: F2, b: F2) -> F2:
-    """Vector product over the last axis of two arrays of equal shape (..., 3); a third of the time of `numpy.cross`."""
+    """Return the cross product over the last axis of two arrays of equal shape (..., 3), in a third of the time of `numpy.cross`."""
     out = np.empty(np.broadcast(a, b).shape, dtype=np.result_type(a, b))
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
@@ -26,20 +25,20 @@ def cross(a: F2, b: F2) -> F2:
 
 
 def rotation_factors(angle_squared: F1) -> tuple[F1, F1]:
-    """Rodrigues' two factors sin|E|/|E| and (1 − cos|E|)/|E|² from |E|² (rad²), both smooth through |E| = 0."""
+    """Return Rodrigues' factors sin|E|/|E| and (1 − cos|E|)/|E|² from |E|² (rad²), also at |E| = 0."""
     angle = np.sqrt(angle_squared)
-    angle = np.where(angle == 0.0, 1e-20, angle)  # its sine is itself
+    angle = np.where(angle == 0.0, 1e-20, angle)  # small enough for sin(x) = x
     half = np.sin(0.5 * angle) / angle
     return np.asarray(np.sin(angle) / angle), np.asarray(2.0 * half * half)
 
 
 S_SERIES = tuple((-1.0) ** n * 2 * n / factorial(2 * n + 1) for n in range(10, 0, -1))
 C_SERIES = tuple((-1.0) ** n * 2 * n / factorial(2 * n + 2) for n in range(10, 0, -1))
-"""Slopes of Rodrigues' two factors, divided by the angle, as series in its square, highest power first."""
+"""Power series in |E|² of the results of `factor_slopes`, highest power first."""
 
 
 def factor_slopes(angle_squared: F1) -> tuple[F1, F1]:
-    """Derivative of Rodrigues' two factors with respect to |E|, divided by |E|: a power series below 1 rad, where the formulas cancel."""
+    """Return the derivatives of Rodrigues' factors by |E|, divided by |E|; below 1 rad from power series, to avoid cancellation."""
     q = np.asarray(angle_squared, dtype=np.float64)
     near = np.minimum(q, 1.0)
     s_series, c_series = (np.polyval(series, near).astype(np.float64, copy=False) for series in (S_SERIES, C_SERIES))
@@ -51,7 +50,7 @@ def factor_slopes(angle_squared: F1) -> tuple[F1, F1]:
 
 
 def cross_matrix(v: F2) -> F3:
-    """[v]x with [v]x u = v × u, shape (n, 3, 3)."""
+    """Return the matrices [v]× with [v]× u = v × u, shape (n, 3, 3)."""
     out = np.zeros((*v.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[..., i, j], out[..., j, i] = -v[..., k], v[..., k]
@@ -59,7 +58,7 @@ def cross_matrix(v: F2) -> F3:
 
 
 def rotation_matrix(rotation_rad: F2) -> F3:
-    """Matrix of the rotation by the vector E, shape (n, 3, 3) for E of shape (n, 3)."""
+    """Return the matrices of the rotations by the vectors E, shape (n, 3, 3) for E of shape (n, 3)."""
     s, c = rotation_factors((rotation_rad * rotation_rad).sum(axis=-1))
     k = cross_matrix(rotation_rad)
     matrix: F3 = np.eye(3) + s[..., None, None] * k + c[..., None, None] * (k @ k)
@@ -67,9 +66,9 @@ def rotation_matrix(rotation_rad: F2) -> F3:
 
 
 def turn_vector_slope(rotation_rad: F2, v_mm: F2) -> F3:
-    """Derivative of `turn_vector` with respect to the rotation vector, shape (n, 3 components, 3 of E), mm per rad.
+    """Return the derivative of `turn_vector` with respect to the rotation vector, shape (n, 3 components, 3 of E), mm per rad.
 
-    Rodrigues' formula differentiated; at E = 0 it is −[v]x, as rule G has it.
+    At E = 0 it is −[v]×, as in rule G.
     """
     square = (rotation_rad * rotation_rad).sum(axis=-1)
     (s, c), (ds, dc) = rotation_factors(square), factor_slopes(square)
@@ -82,7 +81,7 @@ def turn_vector_slope(rotation_rad: F2, v_mm: F2) -> F3:
 
 
 def turn_vector(rotation_rad: F2, v_mm: F2) -> F2:
-    """(R − I) v for the rotation by the vector E (angle |E|, axis E/|E|), right-handed.
+    """Return (R − I) v for the right-handed rotation by the vector E (angle |E|, axis E/|E|).
 
     Parameters
     ----------
@@ -99,9 +98,9 @@ def turn_vector(rotation_rad: F2, v_mm: F2) -> F2:
 
 
 def turn_zyx(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
-    """(R − I) v for R = Rz(EC) Ry(EB) Rx(EA), first about X; ``reverse``: R = Rx(EA) Ry(EB) Rz(EC), the inverse of that of −E.
+    """Return (R − I) v for R = Rz(EC) Ry(EB) Rx(EA); with ``reverse``, R = Rx(EA) Ry(EB) Rz(EC), the inverse of the same for −E.
 
-    Shapes as in `turn_vector`.
+    Shapes are those of `turn_vector`.
     """
     added = np.zeros(np.broadcast(rotation_rad, v_mm).shape)
     for k in (2, 1, 0) if reverse else (0, 1, 2):
@@ -114,9 +113,9 @@ def turn_zyx(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
 
 
 def turn_small(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
-    """(R − I) v for the papers' matrix R = I + [E]×; ``reverse``: R = (I + [−E]×)⁻¹, exactly.
+    """Return (R − I) v for the papers' matrix R = I + [E]×; with ``reverse``, for the exact inverse R = (I − [E]×)⁻¹.
 
-    (I − [E]×)⁻¹ − I = ([E]× + [E]×²) / (1 + |E|²). Shapes as in `turn_vector`.
+    (I − [E]×)⁻¹ − I = ([E]× + [E]×²) / (1 + |E|²). Shapes are those of `turn_vector`.
     """
     once = cross(rotation_rad, v_mm)
     if not reverse:
@@ -126,21 +125,21 @@ def turn_small(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
 
 
 def turned_by(rotation: RotationForm, rotation_rad: F2, v_mm: F2, *, work_side: bool) -> F2:
-    """Displacement (R − I) v of v by a carriage with the ISO rotation E (tool relative to workpiece), in one of three exact forms.
+    """Return the displacement (R − I) v by a carriage with the ISO rotation E (tool relative to workpiece), in one of three forms.
 
     Parameters
     ----------
     rotation : "vector", "zyx" or "small"
-        What R is: the rotation by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own angles; or I + [E]× as in the papers.
+        R: the rotation by the vector E; Rz(EC) Ry(EB) Rx(EA) of the carriage's own angles; or I + [E]× as in the papers.
     rotation_rad, v_mm : arrays, shape (n, 3)
     work_side : bool
-        A work-side carriage's own rotation is −E, and its transform is inverted exactly (math.md 2: p ← T⁻¹(p − L)). For the rotation by
-        a vector the inverse of −E is E itself, so the side makes no difference there.
+        The own rotation of a work-side carriage is −E, and its transform is inverted exactly. For ``vector`` the inverse of −E is E, so the
+        side makes no difference.
 
     Raises
     ------
     ValueError
-        ``rotation`` is none of the three.
+        ``rotation`` has another value.
     """
     if rotation == "vector":
         return turn_vector(rotation_rad, v_mm)

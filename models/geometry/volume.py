@@ -1,7 +1,8 @@
-"""The deviation over a volume: grid, best-fit rigid motion, rms and maximum, and the deviation per unit of each coefficient.
+"""Deviation over a volume: grid, best-fit rigid motion, rms and maximum, and the deviation per unit of each coefficient.
 
-The pose of the workpiece is not a property of the machine: two error maps are compared only after the best-fit rigid motion over one volume
-is removed from both (math.md 3). It must be removed from their uncertainty too, which otherwise includes the frame."""
+The pose of the workpiece is not a property of the machine. So error maps can be compared only after the best-fit rigid motion over one
+volume is removed from each map and from its uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +17,13 @@ from abbe.models.machine import Machine, with_tool
 
 
 def volume_grid(box_mm: F2, nodes: int) -> F2:
-    """Product grid over a box (shape (3, 2)), x slowest, shape (nodes**3, 3)."""
+    """Return an equidistant grid over a box (shape (3, 2)), X slowest, shape (nodes**3, 3)."""
     axes = [np.linspace(lo, hi, nodes) for lo, hi in box_mm]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def rigid_design(points_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Derivative of a small rigid motion (3 translations, 3 rotations about the centroid), shape (n, 3, 6)."""
+    """Return the displacement by 3 translations and 3 small rotations about the centroid, per unit of each, shape (n, 3, 6)."""
     d = points_mm - points_mm.mean(axis=0)
     out = np.zeros((points_mm.shape[0], 3, 6))
     out[:, :, :3] = np.eye(3)
@@ -32,7 +33,7 @@ def rigid_design(points_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.float
 
 
 def remove_rigid(points_mm: F2, deviation_mm: F2) -> F2:
-    """Deviation left after the best-fit small rigid motion (least squares), shape (n, 3)."""
+    """Return the deviation without its best-fit small rigid motion (least squares), shape (n, 3)."""
     a = rigid_design(points_mm).reshape(-1, 6)
     fit = a @ np.linalg.lstsq(a, deviation_mm.ravel(), rcond=None)[0]
     return np.asarray(deviation_mm - fit.reshape(-1, 3))
@@ -40,37 +41,40 @@ def remove_rigid(points_mm: F2, deviation_mm: F2) -> F2:
 
 @dataclass(frozen=True, slots=True)
 class FieldStatistics:
-    """Rms and maximum of the deviation's length with the rigid motion removed, mm."""
+    """Rms and maximum of the length of the deviation vectors, rigid motion removed, mm."""
 
     rms_mm: float
     max_mm: float
 
 
 def field_statistics(points_mm: F2, deviation_mm: F2) -> FieldStatistics:
-    """Rms and maximum length of the deviation vectors after removing the best-fit rigid motion."""
+    """Return the rms and maximum length of the deviation vectors after removal of the best-fit rigid motion."""
     length: F1 = np.linalg.norm(remove_rigid(points_mm, deviation_mm), axis=1)
     return FieldStatistics(float(np.sqrt(np.mean(length**2))), float(length.max()))
 
 
 @dataclass(frozen=True)
 class RigidFree:
-    """Frame of the deviation without its best-fit rigid motion over these points, shape (k, 3)."""
+    """A frame for the deviation: its best-fit rigid motion over these reference points, shape (k, 3), is removed."""
 
     reference_mm: F2
 
     def __post_init__(self) -> None:
-        """Six unknowns of a rigid motion need points that do not lie on one line."""
+        """Check that there are enough points for the six unknowns of a rigid motion."""
         if self.reference_mm.ndim != 2 or self.reference_mm.shape[1] != 3 or len(self.reference_mm) < 3:
-            raise ValueError(f"rigid-free frame: reference points of shape {self.reference_mm.shape}, expected (k, 3) with k of 3 or more")
+            raise ValueError(f"rigid-free frame: expected 3 or more reference points in shape (k, 3), got shape {self.reference_mm.shape}")
 
 
 def volume_frame(machine: Machine, nodes: int = 5) -> RigidFree:
-    """The rigid-free frame of a machine's whole volume: reference points on an even grid over the strokes."""
+    """Return the rigid-free frame of a machine's whole volume, with reference points on an equidistant grid over the strokes."""
     return RigidFree(volume_grid(machine.stroke_mm, nodes))
 
 
 def unit_deviation(machine: Machine, terms: tuple[Term, ...], points_mm: F2, tool_mm: F1 | None, frame: RigidFree | None) -> F3:
-    """Deviation per unit of each coefficient at points, shape (m, 3, len(terms)), in the machine's frame (None) or the rigid-free one."""
+    """Return the deviation per unit of each coefficient at points, shape (m, 3, len(terms)), in a rigid-free frame or the machine's own.
+
+    ``tool_mm`` and ``frame``: None for the machine's own.
+    """
     m = with_tool(machine, tool_mm)
     at = design(m, terms, points_mm)
     if frame is None:
@@ -83,7 +87,7 @@ def unit_deviation(machine: Machine, terms: tuple[Term, ...], points_mm: F2, too
 
 
 def rigid_at(points_mm: F2, reference_mm: F2) -> F3:
-    """`rigid_design` of the reference points, at other points, shape (m, 3, 6)."""
+    """Return `rigid_design` at other points, with rotations about the centroid of the reference points, shape (m, 3, 6)."""
     centre = reference_mm.mean(axis=0)
-    balanced = np.concatenate([points_mm, 2.0 * centre - points_mm])  # their centroid is the reference's
+    balanced = np.concatenate([points_mm, 2.0 * centre - points_mm])  # the centroid is ``centre``
     return rigid_design(balanced)[: len(points_mm)]

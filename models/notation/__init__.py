@@ -1,1 +1,1 @@
-"""One module per paper: its names and signs in ISO 230-1 (math.md 1)."""
+"""One module per paper: conversion of its names and signs to ISO 230-1."""

@@ -1,4 +1,4 @@
-"""Pahk's ten machine types and parameters in ISO 230-1 names (math.md 1 and 2; P = Pahk 1995)."""
+"""Pahk's ten machine types and parameters in ISO 230-1 names; P (n) is equation n of Pahk 1995."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from abbe.models.machine import Machine, split_chain
 
 @dataclass(frozen=True)
 class PahkType:
-    """One of Pahk's ten names.
+    """One of Pahk's ten machine types.
 
     Parameters
     ----------
     name : str
         MB, FB, MH, FH (moving/fixed bridge, moving/fixed horizontal arm) 1 or 2, CX, CY (column).
     chain : str
-        From the workpiece over the bed to the tool in our form; Pahk's "Y F X Z" is ``w-Y-b-X-Z-t``.
+        Carriages from the workpiece over the bed to the tool; Pahk's "Y F X Z" is ``w-Y-b-X-Z-t``.
     alpha_sign : float
-        +1 when alpha is obtuse-positive (theta_XY = +alpha), -1 when it is acute-positive: there X is on the workpiece side and the
-        printed lateral term -alpha X acts on a table that moves by -X (math.md 1).
+        +1 if alpha is obtuse-positive (theta_XY = +alpha), -1 if it is acute-positive. It is acute-positive if X is on the workpiece side:
+        the printed lateral term -alpha X then acts on a table that moves by -X.
     """
 
     name: str
@@ -31,7 +31,7 @@ class PahkType:
 
     @property
     def work_side(self) -> F1:
-        """Axes between bed and workpiece, shape (3,), 0 or 1."""
+        """1 for axes between bed and workpiece, else 0, shape (3,)."""
         side = np.zeros(3)
         side[list(split_chain(self.chain)[0])] = 1.0
         return side
@@ -52,44 +52,38 @@ TYPES: dict[str, PahkType] = {
         PahkType("CY", "w-X-Y-b-Z-t", -1.0),
     )
 }
-"""The ten types by name; FH1 = FB2 and FH2 = FB1 as chains, so ten names give eight distinct equations (math.md 2)."""
+"""The ten types by name. FH1 and FB2 have the same chain, as have FH2 and FB1: ten names give eight distinct equations."""
 
 
 def pahk_type(name: str) -> PahkType:
-    """One of the ten types by its name.
-
-    Raises
-    ------
-    ValueError
-        There is no such type.
-    """
+    """Return a type by its name; ValueError if there is no such type."""
     if name not in TYPES:
         raise ValueError(f"Pahk type {name!r}: expected one of {', '.join(TYPES)}")
     return TYPES[name]
 
 
 def pahk_machine(kind: PahkType, stroke_mm: F2, probe_offset_mm: F1 | None = None) -> Machine:
-    """Nominal machine of a type: no pivots, the probe offset (Xp, Yp, Zp) as tool.
+    """Return the nominal machine of a type: pivots at zero, and the probe offset (Xp, Yp, Zp) as tool vector.
 
     Parameters
     ----------
     stroke_mm : array, shape (3, 2)
     probe_offset_mm : array, shape (3,), optional
-        Default: none.
+        Default: zero.
 
     Raises
     ------
     ValueError
-        Wrong shapes or an empty stroke.
+        A shape is wrong or a stroke is empty.
     """
     return Machine(kind.chain, stroke_mm, tool_mm=np.zeros(3) if probe_offset_mm is None else probe_offset_mm)
 
 
 def parameter_signs(kind: PahkType) -> F2:
-    """Sign with which Pahk's functions of an axis become ISO motions, shape (3 axes, 6: dx dy dz Ex Ey Ez).
+    """Return the signs that turn Pahk's functions of an axis into ISO motions and back, shape (3 axes, 6: dx dy dz Ex Ey Ez).
 
-    +1 on the tool side. On the workpiece side Pahk states the table's own motion: lateral d and all E change sign, the d along the
-    axis does not (math.md 1). Applying the signs twice gives the functions back.
+    They are +1 on the tool side. On the workpiece side Pahk states the table's own motion: lateral d and all E change sign, the d along the
+    axis does not.
     """
     signs = np.ones((3, 6))
     for j in np.flatnonzero(kind.work_side):
@@ -99,10 +93,10 @@ def parameter_signs(kind: PahkType) -> F2:
 
 
 def squareness_slopes(kind: PahkType) -> F3:
-    """ISO translations per mm of own travel and unit of alpha, beta1, beta2, shape (3 axes, 3 directions, 3 parameters).
+    """Return ISO translations per mm of travel and rad of alpha, beta1, beta2, shape (3 axes, 3 directions, 3 parameters).
 
-    Y is the datum; the X line runs along (1, -alpha, 0), the Z line along (-beta1, -beta2, 1) (math.md 1, 2; P (2), (3) with the erratum
-    that Lz holds -beta1 Z). On the workpiece side the lateral entry is the table's and changes sign.
+    Y is the datum; the X line runs along (1, -alpha, 0), the Z line along (-beta1, -beta2, 1): P (2), (3) with the erratum that Lz holds
+    -beta1 Z. If X is on the workpiece side, its lateral entry belongs to the table and changes sign.
     """
     slopes = np.zeros((3, 3, 3))
     slopes[0, 1, 0] = -kind.alpha_sign
@@ -112,7 +106,7 @@ def squareness_slopes(kind: PahkType) -> F3:
 
 
 def motions_from_pahk(kind: PahkType, axes_mm: F2, d_mm: F3, e_rad: F3, squareness_rad: F1) -> F3:
-    """Pahk's functions and squareness at commanded positions as ISO motions for `abbe.models.geometry.chain`.
+    """Convert Pahk's functions and squareness at commanded positions to ISO motions for `abbe.models.geometry.chain`.
 
     Parameters
     ----------
@@ -122,7 +116,7 @@ def motions_from_pahk(kind: PahkType, axes_mm: F2, d_mm: F3, e_rad: F3, squarene
     e_rad : array, shape (n, 3 axes j, 3 directions i)
         E_i(j) at these positions, rad, Pahk's signs.
     squareness_rad : array, shape (3,)
-        alpha, beta1, beta2; beta1 = XZ, beta2 = YZ as in the equations (the nomenclature list has them exchanged, math.md 3).
+        alpha, beta1, beta2; beta1 = XZ, beta2 = YZ as in the equations (Pahk's nomenclature list exchanges them).
 
     Returns
     -------
@@ -132,7 +126,7 @@ def motions_from_pahk(kind: PahkType, axes_mm: F2, d_mm: F3, e_rad: F3, squarene
     Raises
     ------
     ValueError
-        Shapes do not agree.
+        A shape is wrong.
     """
     axes, d, e = (np.asarray(v, dtype=np.float64) for v in (axes_mm, d_mm, e_rad))
     angles = np.asarray(squareness_rad, dtype=np.float64)
@@ -147,7 +141,7 @@ def motions_from_pahk(kind: PahkType, axes_mm: F2, d_mm: F3, e_rad: F3, squarene
 
 
 def pahk_from_motions(kind: PahkType, axes_mm: F2, motions: F3, squareness_rad: F1) -> tuple[F3, F3]:
-    """Inverse of `motions_from_pahk` for known squareness: (d_mm, e_rad), each (n, 3 axes j, 3 directions i), Pahk's signs."""
+    """Invert `motions_from_pahk` for known squareness: return (d_mm, e_rad), each (n, 3 axes j, 3 directions i), with Pahk's signs."""
     own: F3 = np.array(motions, dtype=np.float64)
     own[:, :, :3] -= np.asarray(axes_mm)[:, :, None] * (squareness_slopes(kind) @ np.asarray(squareness_rad))
     own *= parameter_signs(kind)
@@ -155,15 +149,15 @@ def pahk_from_motions(kind: PahkType, axes_mm: F2, motions: F3, squareness_rad: 
 
 
 def iso_squareness(kind: PahkType, squareness_rad: F1) -> F1:
-    """C0Y, B0Z, A0Z (rad, right-handed, shape (3,)) of alpha, beta1, beta2.
+    """Convert alpha, beta1, beta2 to C0Y, B0Z, A0Z (rad, right-handed, shape (3,)).
 
-    theta_XY = alpha_sign * alpha = C0Y, theta_XZ = beta1 = -B0Z, theta_YZ = beta2 = A0Z (math.md 1). Pahk's datum is the Y line, ours the
-    X line: deviation maps of the two agree after a best-fit rotation only.
+    theta_XY = alpha_sign * alpha = C0Y, theta_XZ = beta1 = -B0Z, theta_YZ = beta2 = A0Z. Pahk's datum is the Y line, ours the X line, so
+    deviation maps agree only after a best-fit rotation.
     """
     signs: F1 = np.array([kind.alpha_sign, -1.0, 1.0])
     return signs * np.asarray(squareness_rad, dtype=np.float64)
 
 
 def pahk_squareness(kind: PahkType, iso_rad: F1) -> F1:
-    """alpha, beta1, beta2 (rad, shape (3,), the type's own sign of alpha) of C0Y, B0Z, A0Z; inverse of `iso_squareness` (math.md 1)."""
+    """Convert C0Y, B0Z, A0Z to alpha, beta1, beta2 (rad, shape (3,)), alpha with the sign of the type; inverse of `iso_squareness`."""
     return iso_squareness(kind, iso_rad)

@@ -69,7 +69,7 @@ async def test_a_control_with_another_convention_is_named_and_no_table_is_writte
     found = await commission(b.session, store, b.site, progress=ignore_progress)
     x, y, z = found.proof.faults
     assert x == "X: it moves Y"
-    assert y == "Y: it moves X, the sign is turned over"
+    assert y == "Y: it moves X, the sign is reversed"
     assert z.startswith("Z: the step has no effect")
     with pytest.raises(TableRefused, match="does not act as the tables say"):
         await check_commissioned(b.session.controller, store, b.site)

@@ -90,7 +90,7 @@ def test_the_change_is_between_old_and_new():
     step = expected_changes(PLACES, CENTRE, old, new)
     whole = expected_changes(PLACES, CENTRE, None, new) - expected_changes(PLACES, CENTRE, None, old)
     assert step == pytest.approx(whole, abs=1e-12)
-    with pytest.raises(ValueError, match="same places"):
+    with pytest.raises(ValueError, match="one of each per position"):
         probe(step, np.zeros(3), np.zeros(12))
 
 
@@ -135,7 +135,7 @@ def test_every_sign_and_every_exchange_of_axes_is_found():
         wrong = [a for a in range(3) if order[a] != a or signs[a] < 0]
         assert [f[0] for f in found.faults] == ["XYZ"[a] for a in wrong]
         for text, a in zip(found.faults, wrong, strict=True):
-            assert ("the sign is turned over" in text) == (signs[a] < 0)
+            assert ("the sign is reversed" in text) == (signs[a] < 0)
             assert (f"it moves {'XYZ'[order[a]]}" in text) == (order[a] != a)
 
 
@@ -151,7 +151,7 @@ def test_units_and_dead_tables_are_found(ratio, word):
 
 def test_one_axis_alone_is_named():
     response = np.diag([1.0, -1.0, 1.0])
-    assert proof(response, 1).faults == ("Y: the sign is turned over",)
+    assert proof(response, 1).faults == ("Y: the sign is reversed",)
 
 
 def test_noise_that_hides_the_step_proves_nothing():
@@ -170,7 +170,7 @@ def test_the_uncertainty_covers():
 def test_places_on_one_circle_are_refused():
     turn = np.linspace(0, 6, 12)
     flat = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    with pytest.raises(ValueError, match="six places or more"):
+    with pytest.raises(ValueError, match="six or more positions"):
         bar_shift(flat, turn, turn, turn, U)
 
 
@@ -185,5 +185,5 @@ def test_the_step_rises_from_the_reference_and_leaves_the_rest():
     assert made.correction_mm[1][0, 1] == 0.0
     assert none.correction_mm[1][:, 1].max() == 0.0
     for low, high in ((10.0, 400.0), (200.0, 700.0)):
-        with pytest.raises(ValueError, match="leaves no grid position"):
+        with pytest.raises(ValueError, match="must lie on the grid and leave one grid interval"):
             step_tables(none, 1, STEP, low, high)

@@ -268,7 +268,7 @@ def test_a_grid_that_cannot_be_is_refused(solved, sources):
     _, s = solved
     with pytest.raises(ValueError, match="at least 2"):
         grid_table(s, (1, 3, 3), sources=sources)
-    with pytest.raises(ValueError, match="mask of shape"):
+    with pytest.raises(ValueError, match="the mask has shape"):
         grid_table(s, (3, 3, 3), compensable=np.ones((3, 3), dtype=bool), sources=sources)
     for unit in (0.0, -1e-4, float("nan")):
         with pytest.raises(ValueError, match="controller's unit"):
