@@ -18,17 +18,17 @@ _RESET = struct.pack("ii", 1, 0)  # linger for 0 s: closing sends RST
 
 
 class ModbusProxy:
-    """Listens on 127.0.0.1 and passes on what comes.
+    """Listens on 127.0.0.1 and passes frames between host and device, with the faults of a scenario.
 
-    Besides the kinds of ``modbus_toxics`` it knows, counted by connections: ``accept_then_close`` (accepts and hangs up), ``one_socket``
-    (hangs up on a second one while there is a first), ``kick_oldest`` (hangs up on the first when a second comes).
+    Besides the kinds of ``modbus_toxics`` it plays three that count connections: ``accept_then_close`` (closes a connection after accepting
+    it), ``one_socket`` (does the same while another connection is open), ``kick_oldest`` (closes the older connections at a new one).
 
     Parameters
     ----------
     upstream : tuple of (str, int)
-        The device.
+        Host and port of the device.
     scenario : FaultScenario
-        May be exchanged while it runs (``play``).
+        ``play`` replaces it at run time.
     framing : str
         ``mbap`` or ``rtu``.
     """
@@ -49,7 +49,7 @@ class ModbusProxy:
         self.play(scenario or FaultScenario())
 
     def play(self, scenario: FaultScenario) -> None:
-        """Begin a scenario: requests and connections are counted anew, black holes open again."""
+        """Begin a scenario: count requests and connections from 0, and end a black hole."""
         self._of_connections = [fault for fault in scenario.faults if fault.kind in _CONNECTION_KINDS]
         rest = tuple(fault for fault in scenario.faults if fault.kind not in _CONNECTION_KINDS)
         self.toxics = Toxics(FaultScenario(scenario.name, scenario.seed, rest), self._framing, self.toxics.free_at_s)
@@ -57,17 +57,17 @@ class ModbusProxy:
 
     @property
     def url(self) -> str:
-        """What a host writes to reach the device through this proxy."""
+        """URL of the device through this proxy."""
         return f"modbus+tcp://127.0.0.1:{self.port}?unit=1"
 
     async def start(self, port: int = 0) -> int:
-        """Listen; gives the port."""
+        """Listen and return the port."""
         self._server = await asyncio.start_server(self._accepted, "127.0.0.1", port)
         self.port = int(self._server.sockets[0].getsockname()[1])
         return self.port
 
     async def stop(self) -> None:
-        """Hang up and listen no more; ``start(port)`` begins again."""
+        """Close all connections and stop listening; ``start(port)`` listens again."""
         if self._server is not None:
             self._server.close()
         for pair in list(self._pairs):
@@ -127,7 +127,7 @@ class _Pair:
         self._loop = asyncio.get_running_loop()
 
     async def upward(self, reader: asyncio.StreamReader) -> None:
-        """From the host to the device, until the host hangs up."""
+        """Pass requests from the host to the device until the host hangs up."""
         cutter = Cutter(self._framing, requests=True)
         with suppress(OSError):
             while data := await reader.read(4096):
@@ -140,7 +140,7 @@ class _Pair:
         self._device.close()
 
     async def downward(self, reader: asyncio.StreamReader) -> None:
-        """From the device to the host, until the device hangs up."""
+        """Pass replies from the device to the host until the device hangs up."""
         cutter = Cutter(self._framing, requests=False)
         with suppress(OSError):
             while data := await reader.read(4096):
@@ -172,16 +172,16 @@ class _Pair:
 
 
 def refusing(times: int = 0) -> FaultScenario:
-    """A device that accepts and hangs up, ``times`` in a row (0: always)."""
+    """Return a scenario in which the device closes a connection after accepting it, ``times`` in a row (0: always)."""
     return FaultScenario("accept then close", faults=(Fault("accept_then_close", times=times),))
 
 
 def main() -> None:
-    """Run a proxy until it is interrupted: ``python -m abbe.simulators.faults.modbus_proxy 127.0.0.1:15020 faults.toml``."""
+    """Run a proxy until Ctrl-C: ``python -m abbe.simulators.faults.modbus_proxy 127.0.0.1:15020 faults.toml``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("device", help="host:port of the Modbus device")
     parser.add_argument("scenario", type=Path, help="faults as TOML, see simulators/faults/scenario.py")
-    parser.add_argument("--port", type=int, default=0, help="port to listen on, on 127.0.0.1; default: any free one, printed")
+    parser.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 to listen on (default: any free port, printed at start)")
     parser.add_argument("--rtu", action="store_true", help="RTU frames over TCP, as from a serial device server")
     options = parser.parse_args()
     host, _, port = options.device.rpartition(":")

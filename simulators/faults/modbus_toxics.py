@@ -1,15 +1,15 @@
-"""Faults of Modbus requests and replies on their way, from a fault scenario. Pure: the carrier of the bytes calls it.
+"""Faults of Modbus requests and replies on the line, from a fault scenario. Pure: proxies and lines call it.
 
-Frames on TCP (MBAP) and RTU are cut out of a stream, taken apart, put together, and answered from a register map.
+It also cuts MBAP (TCP) and RTU frames out of a stream, decodes and encodes them, and answers requests from a register map.
 
-Kinds, with the keys of a fault that they use. They hit the request number ``at`` among those of the sort ``on`` (any, read, write), and
-its reply. ``on`` may name the first register too (``write 64``):
+A fault hits a request and its reply: the one with number ``at`` among the requests of the sort ``on`` (any, read, write). ``on`` may also
+name the first register (``write 64``). The kinds, and the keys of a fault that they use:
 
 ==================  ========================================================================================================
 drop_request        the device never sees it
 drop_reply          it is executed, the host gets no reply
 delay_reply         the answer comes ``seconds`` later, and all later ones after it, as from a device that does one thing at a time
-latency             the answer is ``seconds`` on its way, with a probability of ``value`` percent (0: always)
+latency             the answer takes ``seconds`` to arrive, with a probability of ``value`` percent (0: always)
 duplicate_reply     a copy follows after ``seconds``
 swap_replies        the answer comes after the next one
 twice               the answer and a copy of it in one segment
@@ -20,14 +20,14 @@ flip                bit ``value`` of the frame is flipped
 noise_before        ``data`` in front of it, in the same segment
 noise_after         ``data`` behind it
 echo                the request itself comes back first, as on a two-wire line
-instead             ``data`` as PDU in place of the answer's, in a good frame
+instead             the answer has the PDU ``data``, in a valid frame
 set_unit            ``value`` instead of the right unit; likewise set_tid, set_pid, set_length, set_function, set_byte_count,
                     set_address, set_count
-more_registers      ``value`` registers too many (below 0: too few) in a frame that is good in itself
+more_registers      ``value`` registers too many (below 0: too few) in an otherwise valid frame
 exception           exception code ``value`` instead of the answer; the device does not see the request
 exception_after     the same, but the device has executed the request
-black_hole          from here on nothing passes any more, and the connection stays
-fin, rst            the connection is closed, reset, instead of the answer; fin_before, rst_before: before the device sees the request
+black_hole          from here on nothing passes, but the connection stays open
+fin, rst            the connection is closed or reset instead of the answer; fin_before, rst_before: before the device sees the request
 ==================  ========================================================================================================
 """
 
@@ -47,7 +47,7 @@ _HEADER = 7
 
 
 def crc16(data: bytes) -> bytes:
-    """Check sum of an RTU frame, low byte first."""
+    """Return the check sum of an RTU frame, low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -58,7 +58,7 @@ def crc16(data: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame in parts. ``tid``, ``pid``, ``length``: of MBAP; a ``length`` of None is the right one."""
+    """The fields of a frame. ``tid``, ``pid``, ``length``: only MBAP; a ``length`` of None means the right one."""
 
     unit: int
     pdu: bytes
@@ -67,7 +67,7 @@ class Frame:
     length: int | None = None
 
     def bytes(self, framing: str) -> bytes:
-        """The frame on the wire."""
+        """Return the frame as bytes on the wire."""
         if framing == RTU:
             body = bytes([self.unit]) + self.pdu
             return body + crc16(body)
@@ -76,7 +76,7 @@ class Frame:
 
 
 def parts(data: bytes, framing: str) -> Frame:
-    """Take one whole frame apart."""
+    """Decode one whole frame into its fields."""
     if framing == RTU:
         return Frame(data[0], data[1:-2])
     tid, pid, length, unit = struct.unpack_from(">HHHB", data)
@@ -84,14 +84,14 @@ def parts(data: bytes, framing: str) -> Frame:
 
 
 class Cutter:
-    """Cuts a stream of good frames. ``requests``: which of the two directions, because RTU frames do not say how long they are."""
+    """Cuts a stream of valid frames. ``requests``: direction of the stream, because RTU frames do not state their length."""
 
     def __init__(self, framing: str, *, requests: bool) -> None:
         self._framing, self._requests = framing, requests
         self._held = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take bytes; gives the frames that are whole now."""
+        """Take bytes and return the frames that they complete."""
         self._held += data
         frames = []
         while (size := self._size()) and len(self._held) >= size:
@@ -100,7 +100,7 @@ class Cutter:
         return frames
 
     def _size(self) -> int:
-        """Length of the first frame, 0 while unknown."""
+        """Return the length of the first frame, 0 while unknown."""
         held = self._held
         if self._framing == MBAP:
             return 6 + int.from_bytes(held[4:6], "big") if len(held) >= _HEADER else 0
@@ -117,7 +117,7 @@ class Cutter:
 
 
 def answer(registers: RegisterMap, pdu: bytes) -> bytes:
-    """What a device with this register map answers to a request (functions 3, 4, 6, 16)."""
+    """Return the answer of a device with this register map to a request PDU (functions 3, 4, 6, 16)."""
     function, address, count = struct.unpack_from(">BHH", pdu)
     if function in (3, 4):
         words = registers.read(address, count) if 1 <= count <= 125 else None
@@ -137,7 +137,7 @@ _BEFORE = ("drop_request", "exception", "fin_before", "rst_before", "black_hole"
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """Something to send ``after_s`` from now, or an end of the connection (``fin``, ``rst``)."""
+    """Bytes to send to the host ``after_s`` from now, or how to end the connection (``fin``, ``rst``)."""
 
     data: bytes = b""
     after_s: float = 0.0
@@ -146,7 +146,7 @@ class Act:
 
 @dataclass(slots=True)
 class _Open:
-    """A request that the device has, and what shall become of its reply."""
+    """A request passed to the device, and the faults of its reply."""
 
     frame: bytes
     faults: list[Fault]
@@ -154,7 +154,7 @@ class _Open:
 
 @dataclass(slots=True)
 class Toxics:
-    """One conversation.
+    """The faults of one connection between host and device.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class Toxics:
     scenario: FaultScenario
     framing: str
     free_at_s: float = float("-inf")
-    """Loop time at which the device has finished its requests; the next scenario begins with the same device."""
+    """Loop time at which the device has finished its requests; the next scenario takes it over."""
     dead: bool = False
     requests: int = 0
     _seen: Counter[str] = field(default_factory=Counter)
@@ -181,7 +181,7 @@ class Toxics:
         self._draw = random.Random(self.scenario.seed)
 
     def request(self, frame: bytes) -> tuple[bytes, list[Act]]:
-        """A request came from the host: what the device gets (empty: nothing), and what the host gets at once."""
+        """Handle a request from the host: return the bytes for the device (empty: none), and what the host gets at once."""
         faults = self._hit(frame)
         self.requests += 1
         kinds = {fault.kind: fault for fault in faults}
@@ -198,7 +198,7 @@ class Toxics:
         return frame, [Act(frame)] if "echo" in kinds else []
 
     def reply(self, frame: bytes, now_s: float) -> list[Act]:
-        """A reply came from the device: what the host gets, and when."""
+        """Handle a reply from the device: return what the host gets, and when."""
         asked = self._open.popleft() if self._open else _Open(b"", [])
         kinds = {fault.kind: fault for fault in asked.faults}
         if self.dead or "drop_reply" in kinds:

@@ -12,18 +12,18 @@ BAUD = 115200
 
 
 class ToxicRtuLine:
-    """A register map at the end of a bad line. Like a device on a real line it does one thing at a time.
+    """A register map at the end of a bad line. Like a device on a real line it handles one request at a time.
 
     Parameters
     ----------
     registers : RegisterMap
-        What the device shows.
+        Registers of the device.
     scenario : FaultScenario
-        May be exchanged while it runs (``play``).
+        ``play`` replaces it at run time.
     link : Path, optional
         Stable path of the host's terminal.
     unit : int
-        Other units are not answered.
+        Unit number; requests to other units get no answer.
     """
 
     def __init__(self, registers: RegisterMap, scenario: FaultScenario | None = None, link: Path | None = None, unit: int = 1) -> None:
@@ -37,23 +37,23 @@ class ToxicRtuLine:
         self._toxics = Toxics(scenario or FaultScenario(), RTU)
 
     def play(self, scenario: FaultScenario) -> None:
-        """Begin a scenario: requests are counted anew."""
+        """Begin a scenario: count requests from 0."""
         self._toxics = Toxics(scenario, RTU, self._toxics.free_at_s)
 
     @property
     def url(self) -> str:
-        """What a host writes to reach the device."""
+        """URL of the device."""
         path = "" if self._host is None else self._host.path
         return f"modbus+rtu://{path}?baud={BAUD}&unit={self._unit}"
 
     def start(self) -> str:
-        """Open the line; gives the URL."""
+        """Open the line and return the URL."""
         self._cutter = Cutter(RTU, requests=True)
         self._host = PseudoSerial(self._received, self._link)
         return self.url
 
     def stop(self) -> None:
-        """Hang up; ``start`` begins again, maybe at another path."""
+        """Close the line; ``start`` opens it again, possibly at another path."""
         for timer in self._timers:
             timer.cancel()
         self._timers.clear()

@@ -1,4 +1,4 @@
-"""Which fault, when, how often: plain data, read from TOML or written in a test. Each player (a proxy, a line) knows its kinds.
+"""Fault scenarios: which fault, when, how often, as plain data from TOML or a test. Each player (a proxy or line) defines its kinds.
 
 .. code-block:: toml
 
@@ -41,20 +41,20 @@ class Fault:
     data: str = ""
 
     def hits(self, number: int) -> bool:
-        """Whether it hits the event of this number (from 0, counted among events of its sort)."""
+        """Whether the fault hits the event of this number (from 0, counted among events of its sort)."""
         return number >= self.at and (self.times == 0 or number < self.at + self.times)
 
 
 @dataclass(frozen=True, slots=True)
 class FaultScenario:
-    """Faults that are played together. ``seed``: of whatever a player draws."""
+    """Faults that are played together. ``seed``: of the player's random numbers."""
 
     name: str = ""
     seed: int = 1
     faults: tuple[Fault, ...] = ()
 
     def check(self, kinds: Collection[str], sorts: Collection[str] = ("any",)) -> None:
-        """Refuse what a player does not know.
+        """Check that a player supports all kinds and sorts of events.
 
         Raises
         ------
@@ -69,7 +69,7 @@ class FaultScenario:
 
 
 def scenario(*faults: Fault, name: str = "", seed: int = 1) -> FaultScenario:
-    """Write a scenario in one line of a test."""
+    """Return a scenario of these faults, for tests."""
     return FaultScenario(name, seed, faults)
 
 
@@ -89,7 +89,7 @@ def load(path: Path) -> FaultScenario:
 
 
 def from_dict(data: dict[str, Any]) -> FaultScenario:
-    """Build a scenario out of parsed TOML."""
+    """Build a scenario from parsed TOML."""
     if unknown := sorted(set(data) - {"name", "seed", "fault"}):
         raise FaultScenarioError(f"unknown key: {unknown[0]}")
     entries = data.get("fault", [])
@@ -97,7 +97,7 @@ def from_dict(data: dict[str, Any]) -> FaultScenario:
         raise FaultScenarioError("fault: a list of tables [[fault]] is expected")
     name, seed = data.get("name", ""), data.get("seed", 1)
     if not isinstance(name, str) or not isinstance(seed, int):
-        raise FaultScenarioError("name is a text, seed a whole number")
+        raise FaultScenarioError("name must be text, seed a whole number")
     return FaultScenario(name, seed, tuple(_fault(entry, number) for number, entry in enumerate(entries, 1)))
 
 
@@ -112,7 +112,7 @@ def _fault(entry: Any, number: int) -> Fault:
             raise FaultScenarioError(f"fault {number}: {key} = {value!r} is not of type {types[key]}")
     fault = Fault(**entry)
     if fault.at < 0 or fault.times < 0 or fault.seconds < 0:
-        raise FaultScenarioError(f"fault {number}: at, times and seconds are not below 0")
+        raise FaultScenarioError(f"fault {number}: at, times and seconds must not be below 0")
     try:
         bytes.fromhex(fault.data)
     except ValueError:

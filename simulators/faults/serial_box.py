@@ -1,4 +1,4 @@
-"""A ball-bar's box on a bad line, with its own time: tests advance it, and never wait for a clock."""
+"""A ball-bar's box on a bad line, with its own time, which tests advance instead of waiting."""
 
 import asyncio
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class Window:
     bits: int = OUT_OF_RANGE
 
     def applied(self, sample: Sample) -> Sample:
-        """The sample with the window's status bits if it lies inside the window."""
+        """Return the sample, with the window's status bits if it lies in the window."""
         if not self.begin <= sample.seq < self.end:
             return sample
         return replace(sample, status=sample.status | self.bits, reading_nm=0 if self.bits & NO_BAR else 1_000_000)
@@ -61,16 +61,16 @@ class _Tapped:
 
 
 class FaultyBox:
-    """The box.
+    """A ball-bar's box on a `FaultyLine`.
 
     Parameters
     ----------
     link : Path
-        Where the host finds it.
+        Stable path at which the host finds the line.
     serial_no, firmware, boot_id : int
-        Who it is.
+        Identity of the box.
     uart : Uart
-        Its baud rate and parity.
+        Baud rate and parity of the box.
     """
 
     def __init__(
@@ -92,10 +92,10 @@ class FaultyBox:
         self.windows: list[Window] = []
         self.rate_factor = 1.0
         self.ppm = 0.0
-        """How fast the box's clock is."""
+        """By how much the box's clock runs too fast, ppm."""
         self.on_start: Callable[[], None] = lambda: None
         self.before: Callable[[int], bool] = lambda kind: False
-        """Is asked with the type of every command; True: the box does not get it."""
+        """Called with the type of every command; if it returns True, the box does not get the command."""
         self._streams = 0
         self._late_us = self._taken = 0
         self._first_s = 0.0
@@ -106,7 +106,7 @@ class FaultyBox:
 
     @property
     def url(self) -> str:
-        """Where a host finds it."""
+        """URL at which a host reaches the box."""
         return self.line.url
 
     async def plug(self) -> None:
@@ -118,7 +118,7 @@ class FaultyBox:
         await self.line.close()
 
     async def run(self, samples: int) -> None:
-        """Let the box take samples as fast as the line accepts them; without effect when it is not streaming."""
+        """Let the box take samples as fast as the line accepts them; a box that does not stream only advances its time."""
         left = samples
         while left > 0:
             piece, left = min(left, _PIECE), left - _PIECE
@@ -131,7 +131,7 @@ class FaultyBox:
         """Advance the time by ``samples`` periods and send the samples."""
         rate_hz = self.world.ballbar.rate_hz
         self._taken += samples
-        # to the middle between two samples, so that rounding never decides
+        # to the middle between two samples, so that rounding cannot add or lose one
         until_s = self._first_s + (self._taken - 0.5) / rate_hz if rate_hz else self.world.time_s + samples * 1e-3
         self.world.advance(until_s)
         self._wire.flush()
@@ -148,7 +148,7 @@ class FaultyBox:
         self._late_us += round(seconds * 1e6)
 
     def reboot(self) -> None:
-        """Lose power for a moment: another boot id, nothing streaming, settings as from the factory."""
+        """Restart the box as after a loss of power: new boot id, no stream, factory settings."""
         self.boot_id += 1
         self._streams = self._late_us = 0
         self._wire.restart(self.boot_id)
@@ -186,5 +186,5 @@ class FaultyBox:
 
     @property
     def starts(self) -> int:
-        """How often a host started a stream."""
+        """Number of streams that a host started."""
         return self.commands.count(START)

@@ -14,7 +14,7 @@ _OVERHEAD = 6
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What is in a SAMPLE frame."""
+    """Content of a SAMPLE frame."""
 
     seq: int
     device_us: int
@@ -22,12 +22,12 @@ class Sample:
     status: int
 
     def frame(self) -> bytes:
-        """The sample as the bytes of a frame."""
+        """Return the sample as the bytes of a frame."""
         return encode(SAMPLE, _SAMPLE.pack(self.seq & 0xFFFFFFFF, self.device_us, self.reading_nm, self.status))
 
 
 def sample_of(frame: bytes) -> Sample | None:
-    """Content of a whole frame; None if it is not a SAMPLE."""
+    """Return the content of a whole frame; None if it is not a SAMPLE."""
     return Sample(*_SAMPLE.unpack_from(frame, 4)) if frame[2] == SAMPLE else None
 
 
@@ -42,7 +42,7 @@ def cut(data: bytes) -> list[bytes]:
 
 
 def garbage(kind: str, size: int, draw: random.Random) -> bytes:
-    """``size`` bytes that are not a frame: ``random``, all ``ones``, ``sync`` bytes or a ``header`` that announces the longest payload."""
+    """Return ``size`` bytes that are no frame: ``random``, all ``ones``, ``sync`` bytes or a ``header`` with payload length 255."""
     if kind == "random":
         return draw.randbytes(size)
     if kind == "ones":
@@ -53,7 +53,7 @@ def garbage(kind: str, size: int, draw: random.Random) -> bytes:
 
 
 def flipped(frame: bytes, *bits: int) -> bytes:
-    """The frame with these bits turned over (bit 0 is the lowest of the first byte)."""
+    """Return the frame with these bits flipped (bit 0 is the lowest of the first byte)."""
     damaged = bytearray(frame)
     for bit in bits:
         damaged[bit // 8] ^= 1 << bit % 8
@@ -61,7 +61,7 @@ def flipped(frame: bytes, *bits: int) -> bytes:
 
 
 def burst(frame: bytes, draw: random.Random) -> bytes:
-    """The frame after an electric burst: two to six bytes in a row are something else."""
+    """Return the frame after an electric burst: two to six bytes in a row are changed."""
     size = draw.randint(2, 6)
     at = draw.randrange(len(frame) - size)
     other = bytes(byte ^ draw.randint(1, 255) for byte in frame[at : at + size])
@@ -69,30 +69,30 @@ def burst(frame: bytes, draw: random.Random) -> bytes:
 
 
 def every_nth(frames: list[bytes], n: int, draw: random.Random) -> Iterator[bytes]:
-    """All frames, every n-th one (the n-th, the 2n-th ...) hit by a burst."""
+    """Yield all frames, every n-th of them (the n-th, the 2n-th ...) hit by a burst."""
     for number, frame in enumerate(frames, 1):
         yield burst(frame, draw) if number % n == 0 else frame
 
 
 def repeated(frames: list[bytes], at: int, count: int) -> list[bytes]:
-    """Frames ``at - count`` to ``at - 1`` come a second time before frame ``at``."""
+    """Return the frames with frames ``at - count`` to ``at - 1`` repeated before frame ``at``."""
     return frames[:at] + frames[max(0, at - count) : at] + frames[at:]
 
 
 def delayed(frames: list[bytes], at: int, by: int) -> list[bytes]:
-    """Frame ``at`` comes ``by`` places late."""
+    """Return the frames with frame ``at`` moved ``by`` places back."""
     rest = frames[:at] + frames[at + 1 :]
     return [*rest[: at + by], frames[at], *rest[at + by :]]
 
 
 def swapped(frames: list[bytes], at: int, distance: int) -> list[bytes]:
-    """Frames ``at`` and ``at + distance`` have changed places."""
+    """Return the frames with frames ``at`` and ``at + distance`` swapped."""
     out = list(frames)
     out[at], out[at + distance] = out[at + distance], out[at]
     return out
 
 
 def sliced(data: bytes, size: int) -> Iterator[bytes]:
-    """The bytes in pieces of ``size``."""
+    """Yield the bytes in pieces of ``size``."""
     for at in range(0, len(data), size):
         yield data[at : at + size]

@@ -1,6 +1,6 @@
 """A serial line that can be unplugged, stalled, slowed and corrupted, between a box and the host at the stable path.
 
-Also what a serial receiver makes of bytes that were sent with another baud rate or parity: bits on a line, sampled at the wrong instants.
+`heard` simulates a serial receiver whose baud rate or parity differs from the sender's: it samples the bits at wrong instants.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ class Uart:
 
 
 def heard(data: bytes, sender: Uart, receiver: Uart) -> bytes:
-    """What the receiver reads when the bytes come one straight after the other; a frame without a stop bit reads as 0, as under Linux."""
+    """Return what the receiver reads of bytes sent without pauses; a character without a stop bit reads as 0, as under Linux."""
     if sender == receiver:
         return data
     line = _bits(data, sender.parity)
@@ -36,14 +36,14 @@ def heard(data: bytes, sender: Uart, receiver: Uart) -> bytes:
     out = bytearray()
     at = 0.0
     while at < length:
-        if line[int(at * ratio)]:  # idle: look on in steps of a sixteenth of a bit, as receivers do
+        if line[int(at * ratio)]:  # idle: search for the start bit in steps of 1/16 bit, as receivers do
             at += 1.0 / 16.0
             continue
         taken = [_level(line, (at + k + 0.5) * ratio) for k in range(size)]
         out.append(sum(bit << k for k, bit in enumerate(taken[1:9])) if taken[-1] else 0)
         at += size - 0.5  # from the middle of the stop bit on, the next start bit may come
         while not taken[-1] and at < length and not line[int(at * ratio)]:
-            at += 1.0 / 16.0  # a broken frame: the line has to be idle before the next one
+            at += 1.0 / 16.0  # after a broken character the line must be idle before the next one
     return bytes(out)
 
 
@@ -68,10 +68,10 @@ _BAUD = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[
 
 
 class _Terminal(PseudoSerial):
-    """The pty with what a line needs: it goes on by itself when the host reads, and can be held."""
+    """A pty that sends its buffered bytes as soon as the host reads, and that can stop the host's output."""
 
     def pump(self) -> None:
-        """Pass on what waits, and come back when there is room."""
+        """Send the buffered bytes, and continue when there is room."""
         super().pump()
         loop = asyncio.get_running_loop()
         loop.remove_writer(self._master)
@@ -84,11 +84,11 @@ class _Terminal(PseudoSerial):
         super().close()
 
     def hold(self, held: bool) -> None:
-        """Take (or take again) bytes from the host, like a device that sent XOFF (XON)."""
+        """Stop the host's output if ``held``, else let it continue, like a device that sends XOFF or XON."""
         termios.tcflow(self._slave, termios.TCOOFF if held else termios.TCOON)
 
     def stuff(self) -> int:
-        """Fill what the terminal keeps for the device, which reads nothing any more; how many bytes it took."""
+        """Stop reading, fill the terminal's buffer towards the device, and return the number of bytes that it took."""
         asyncio.get_running_loop().remove_reader(self._master)
         taken = 0
         os.set_blocking(self._slave, False)
@@ -98,7 +98,7 @@ class _Terminal(PseudoSerial):
         return taken
 
     def unstuff(self) -> None:
-        """Let the device read again; the stuffing is thrown away."""
+        """Discard the bytes of `stuff` and let the device read again."""
         termios.tcflush(self._slave, termios.TCOFLUSH)
         with suppress(BlockingIOError):
             while os.read(self._master, 65536):
@@ -106,7 +106,7 @@ class _Terminal(PseudoSerial):
         asyncio.get_running_loop().add_reader(self._master, self._readable)
 
     def host_baud(self) -> int:
-        """What the host has set."""
+        """Return the baud rate that the host has set, 0 if it is not a standard one."""
         return _BAUD.get(termios.tcgetattr(self._slave)[5], 0)
 
 
@@ -116,8 +116,7 @@ class FaultyLine:
     Parameters
     ----------
     link : Path
-        Where the host finds it, whatever terminal it is.
-        It may be changed while the line is not plugged in: that is another socket of the computer.
+        Stable path at which the host finds the line. A change while the line is unplugged acts like another port of the computer.
     box : Uart
         Baud rate and parity of the box. The host's baud rate is read from the terminal; terminals store no parity, so the host's is set in
         ``host_parity``.
@@ -133,7 +132,7 @@ class FaultyLine:
 
     @property
     def url(self) -> str:
-        """Where a host finds it."""
+        """URL at which a host reaches the line."""
         return f"serial://{self.link.absolute()}?baud={self._box.baud}"
 
     @property
@@ -153,11 +152,11 @@ class FaultyLine:
         return 0 if self._terminal is None else max(0, BUFFER_BYTES - self._terminal.backlog)
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the host, after whatever the line does to them."""
+        """Send bytes to the host, as ``spoil`` and wrong settings of the host change them."""
         if self._terminal is None or not data:
             return
         for piece in self.spoil(data) if self.spoil is not None else (data,):
-            if self._terminal is None:  # pulled in the middle of it
+            if self._terminal is None:  # unplugged between two pieces
                 return
             arrives = heard(piece, self._box, self._host())
             if self._held_back is not None:
@@ -166,31 +165,31 @@ class FaultyLine:
                 self._terminal.send(arrives)
 
     def pump(self) -> None:
-        """Pass on what waits."""
+        """Send the buffered bytes, as far as the terminal accepts them."""
         if self._terminal is not None:
             self._terminal.pump()
 
     def stall(self) -> None:
-        """Let nothing arrive at the host until ``resume``; nothing is lost."""
+        """Hold back all bytes to the host until ``resume``; none is lost."""
         self._held_back = []
 
     def resume(self) -> None:
-        """Let everything arrive that was held back."""
+        """Send all bytes that were held back."""
         held, self._held_back = self._held_back or [], None
         if self._terminal is not None:
             self._terminal.send(b"".join(held))
 
     async def open(self, received: Received) -> None:
-        """Be plugged in: a new terminal, the same path."""
+        """Plug in: open a new terminal at the stable path."""
         self._received = received
         self._terminal = _Terminal(self._hear, self.link)
 
     async def close(self) -> None:
-        """Be pulled out."""
+        """Unplug."""
         self.pull()
 
     def pull(self) -> None:
-        """Pull the cable out, now: both ends of the terminal are closed, the path is gone."""
+        """Unplug at once: close both ends of the terminal and remove the path."""
         terminal, self._terminal, self._held_back = self._terminal, None, None
         if terminal is not None:
             terminal.close()

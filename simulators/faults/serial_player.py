@@ -4,14 +4,14 @@ from 0.
 ==========  ==========================================================================================
 kind        what happens at the frames that it hits
 ==========  ==========================================================================================
-garbage     ``value`` drawn bytes (or ``data``) come before the frame
+garbage     ``value`` random bytes (or ``data``) come before the frame
 truncate    only the first ``value`` bytes arrive
-flip        bit ``value`` is turned over
-burst       two to six bytes in a row are something else
+flip        bit ``value`` is flipped
+burst       two to six bytes in a row are changed
 drop        the frame does not arrive
 repeat      it arrives ``value`` times more
-stall       from it on nothing arrives for ``seconds``, then everything does
-unplug      the cable is pulled before it
+stall       this frame and all later bytes arrive together after ``seconds``
+unplug      the cable is pulled before the frame
 ==========  ==========================================================================================
 """
 
@@ -41,7 +41,7 @@ def play(line: FaultyLine, scenario: FaultScenario) -> None:
     Raises
     ------
     FaultScenarioError
-        A kind that a serial line does not know.
+        A kind that is not in the table above.
     """
     scenario.check(KINDS)
     draw, number = random.Random(scenario.seed), -1
@@ -62,6 +62,6 @@ def _changed(line: FaultyLine, frame: bytes, faults: list[Fault], draw: random.R
             asyncio.get_running_loop().call_later(fault.seconds, line.resume)
         elif fault.kind == "unplug":
             line.pull()
-        elif len(frame) > 8:  # what an earlier fault has left too short is spoilt enough
+        elif len(frame) > 8:  # an earlier fault may have left too few bytes for another
             frame = _CHANGES[fault.kind](frame, fault, draw)
     return frame

@@ -1,1 +1,1 @@
-"""Hidden effects: what a real machine does beyond its smooth error motions, with memory and clock, and suites of sealed cases with them."""
+"""Hidden effects: errors of a real machine that depend on its history and on time, and suites of sealed cases that contain them."""

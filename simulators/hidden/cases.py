@@ -1,4 +1,4 @@
-"""One sealed case: effects sized by how visible they are, runs with readings, and the truth that judges an answer."""
+"""One sealed case: effects sized by their visibility, runs with readings, and the truth by which an answer is judged."""
 
 from dataclasses import dataclass, replace
 
@@ -14,10 +14,10 @@ from abbe.simulators.hidden.rig import BentMachine, PerfectMachine, Rig
 from abbe.simulators.hidden.rivals import FittedRuns, indistinct
 
 ALL_EFFECTS = (drive, instrument, outside, structure, thermal)
-"""Imported so that they stand in the book."""
+"""Imported so that their effects are registered."""
 SNR_LOCAL = (0.6, 8.0)
 TOUCHED = 0.1
-"""A reading is touched when the separable, whitened effect exceeds this part of its largest value."""
+"""A reading is touched if what the model cannot absorb of the effect, over the noise, exceeds this fraction of its maximum."""
 ADDED = {
     "one_way": ["opposite_direction"], "one_feed": ["second_feed"], "one_radius": ["second_radius"], "ballbar": ["laser_diagonals"],
     "laser": ["ballbar"], "minimal": ["opposite_direction", "second_feed", "second_radius", "planar_circles", "laser_diagonals"],
@@ -27,7 +27,10 @@ BEYOND = ["second_tool_length", "single_axis_laser", "angular_interferometer", "
 
 @dataclass(frozen=True)
 class Visibility:
-    """How visible an effect is: µm, and standard deviations of one reading."""
+    """How visible an effect is: rms in µm, or (``snr_*``, ``left``) in standard deviations of one reading.
+
+    All but ``raw_rms_um`` count only the part that the present model cannot absorb.
+    """
 
     raw_rms_um: float
     separable_rms_um: float
@@ -39,7 +42,7 @@ class Visibility:
 
 @dataclass(frozen=True)
 class Case:
-    """A finished case: exact readings with and without the hidden effects, and the truth about each of these."""
+    """A finished case: noise-free readings with and without the hidden effects, and the facts about each effect."""
 
     name: str
     setting: Setting
@@ -52,7 +55,7 @@ class Case:
 
 
 def make_case(name: str, seed: int, kind: str, *, wild: bool = True) -> Case:
-    """Draw one case of a kind: single, double, null or unknown. Same seed and kind, same case."""
+    """Draw one case of a kind: single, double, null or unknown. Equal seed and kind give an equal case."""
     rng = np.random.default_rng([51, seed])
     for attempt in range(50):
         names = _names(rng, kind)
@@ -74,7 +77,7 @@ def _names(rng: np.random.Generator, kind: str) -> list[str]:
 
 
 def _filled(name: str, setting: Setting, runs: list[Run], names: list[str], rng: np.random.Generator, wild: bool) -> Case | None:
-    """The case with effects of these names; None if one of them leaves no trace in these runs."""
+    """Return the case with effects of these names; None if one of them leaves no trace in the runs."""
     perfect = PerfectMachine(setting.machine)
     fitted = [r for r in runs if r.role == "identify"]
     model_space = projector(perfect, fitted, setting.model, setting.noise.bar_mm, setting.noise.laser_mm) if names else None
@@ -97,7 +100,7 @@ def _filled(name: str, setting: Setting, runs: list[Run], names: list[str], rng:
 
 
 def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
-    """A local bump lies on the way of some run, a burst and a slip happen while the machine is measured."""
+    """Return the effect with its place or time, if it has one, within one of the runs, so that they can show it."""
     run = runs[int(rng.integers(len(runs)))]
     at = int(rng.integers(run.track.n // 10, run.track.n - run.track.n // 10))
     if e.name == "local_bump":
@@ -114,7 +117,7 @@ def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
 def _sized(
     e: Hidden, wanted: float, perfect: PerfectMachine, runs: list[Run], model_projector: Projector
 ) -> tuple[Hidden, Visibility] | None:
-    """The effect at the strength at which it has the wanted local visibility, within its physical limits; None: no trace at all."""
+    """Return the effect at the strength for the wanted ``snr_local``, within its physical limits; None if it leaves no trace at all."""
     low, high = (CATALOGUE | OUTSIDE)[e.name][3]
     seen = visibility(e, perfect, runs, model_projector)
     if seen.raw_rms_um < 1e-6:
@@ -127,9 +130,9 @@ def _sized(
 
 
 def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], model_projector: Projector) -> Visibility:
-    """Visibility of the part of an effect that the present model cannot absorb.
+    """Return the visibility of an effect, above all of the part that the present model cannot absorb.
 
-    ``snr_total``: length of what remains of its whitened trace over all identify runs; ``snr_local``: its rms over the touched readings.
+    ``snr_total``: norm of that part over all identify runs, over the noise; ``snr_local``: its rms over the touched readings.
     """
     without, with_it = Rig(perfect, ()), Rig(perfect, (e,))
     trace = np.concatenate([with_it.reading(r) - without.reading(r) for r in runs])
@@ -144,7 +147,7 @@ def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], model_projec
 def _fact(
     e: Hidden, seen: Visibility, setting: Setting, perfect: PerfectMachine, runs: list[Run], model_projector: Projector
 ) -> dict[str, object]:
-    """Entry of the sealed file for one effect."""
+    """Return the entry of the sealed file for one effect."""
     fitted = FittedRuns(perfect, runs, setting.model)
     known = e.name in CATALOGUE
     alike = [] if e.name in RANDOM else indistinct(fitted, model_projector, seen.left, e.label)
@@ -159,7 +162,7 @@ def _fact(
 
 
 def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: list[str]) -> dict[str, list[str]]:
-    """Additions that would separate each alias: those of plan full, if they suffice; else those that no plan here has."""
+    """Return the additional measurements that would separate each alias: those of plan full if they suffice, else `BEYOND`."""
     if not aliases:
         return {}
     still: list[str] = aliases
@@ -172,7 +175,7 @@ def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: li
 
 
 def where(e: Hidden, setting: Setting) -> dict[str, object]:
-    """Axis, time or place to which an effect outside of the catalogue is confined."""
+    """Return the axis, time or place to which an effect outside the catalogue is confined."""
     p = e.parameters
     if e.name in ("clamp_slip", "encoder_count_loss"):
         axis: dict[str, object] = {"axis": e.key} if e.key else {}

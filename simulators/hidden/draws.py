@@ -1,4 +1,4 @@
-"""What a case draws: the machine, how it was set up and measured, and which effects are hidden in it."""
+"""Random draws of a case: the machine, how it was set up and measured, and which effects are hidden in it."""
 
 from dataclasses import dataclass, replace
 
@@ -91,7 +91,7 @@ ONE_SIGN = RANDOM | {"reversal_spike", "cyclic_error", "contour_lag", "ram_sag",
 
 @dataclass(frozen=True)
 class Setting:
-    """All about a case but its hidden effects: plan and model, the machine and its nominal document, set-up terms, noise."""
+    """A case without its hidden effects: plan, present model, true machine, its nominal geometry (``document``), set-up terms, noise."""
 
     seed: int
     kind: str
@@ -108,7 +108,7 @@ class Setting:
 
 
 def draw_setting(seed: int, kind: str, forbidden: frozenset[str]) -> Setting:
-    """Draw a case's surroundings; ``forbidden``: set-up terms that the present model must not know, because they are what is hidden."""
+    """Draw the setting of a case; ``forbidden``: set-up terms that the present model must not include, because they are hidden effects."""
     rng = np.random.default_rng([50, seed])
     plan = str(rng.choice(list(PLAN_WEIGHTS), p=np.array(list(PLAN_WEIGHTS.values())) / sum(PLAN_WEIGHTS.values())))
     level = "rigid21" if rng.random() < 0.62 else "rigid6"
@@ -140,13 +140,13 @@ def draw_setting(seed: int, kind: str, forbidden: frozenset[str]) -> Setting:
 
 
 def config_of(chain: str) -> tuple[MachineConfig, str]:
-    """Nominal machine of a chain and its vertical axis."""
+    """Return the nominal machine of a chain and its vertical axis."""
     stroke_x, pivots, vertical = CHAINS[chain]
     return MachineConfig(chain, Strokes((0.0, stroke_x), (0.0, 500.0), (0.0, 450.0)), Pivots(**pivots), (0.0, 0.0, 0.0)), vertical
 
 
 def true_machine(seed: int, config: MachineConfig, level: str, size: float) -> Machine:
-    """A machine as it really is, its error motions ``size`` times as large as a worn machine's; ``rigid6``: scales and squareness only."""
+    """Draw a true machine with error motions ``size`` times the default `Magnitudes`; level ``rigid6``: scales and squareness only."""
     usual = Magnitudes()
     if level == "rigid6":
         size = 0.0
@@ -161,7 +161,7 @@ def _times(pair: Pair, factor: float) -> Pair:
 
 
 def draw_hidden(rng: np.random.Generator, name: str, setting: Setting, span_s: Pair, wild: bool) -> Hidden:
-    """One effect at its first guess of strength."""
+    """Draw one effect, with the first guess of its strength."""
     keys, _, guess, _ = (CATALOGUE | OUTSIDE)[name]
     key = str(rng.choice(list(keys)))
     sign = 1.0 if name in ONE_SIGN or rng.random() < 0.5 else -1.0
@@ -173,7 +173,7 @@ def draw_hidden(rng: np.random.Generator, name: str, setting: Setting, span_s: P
 
 
 def _parameters(rng: np.random.Generator, name: str, key: str, setting: Setting, span_s: Pair) -> dict[str, float]:
-    """What an effect needs beside its strength: drawn from `RANGES`, or a choice."""
+    """Draw the parameters of an effect besides its strength."""
     out = {p: float(rng.uniform(*limits)) for p, limits in RANGES.get(name, {}).items()}
     if name == "backlash_position_dependent":
         out["k"] *= float(rng.choice([-1.0, 1.0]))

@@ -1,4 +1,7 @@
-"""Effects of the drives: lost motion, quadrant glitches, cyclic errors, servo lag, friction, vibration."""
+"""Effects of the drives: lost motion, quadrant glitches, cyclic errors, servo lag, friction, vibration.
+
+In the docstrings of effects, "wild" is the departure from the textbook form if `Hidden.wild` is not 0.
+"""
 
 import numpy as np
 
@@ -30,16 +33,16 @@ def backlash_position_dependent(e: Hidden, track: Track, out: Bend) -> None:
 
 
 def wind_up(track: Track, axis: int, width_mm: float | F, over_mm: float) -> F:
-    """Elastic lag behind the motion: it changes sides over a travel of ``over_mm`` after each turn, (n,) mm."""
+    """Return the elastic lag behind the motion, (n,) mm; it changes sign over a travel of ``over_mm`` after each reversal."""
     rest = np.exp(-np.minimum(track.since_mm[:, axis] / over_mm, 60.0))
     return np.asarray(-0.5 * width_mm * track.sign[:, axis] * (1.0 - 2.0 * rest))
 
 
 @effect("reversal_spike")
 def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
-    """Friction holds the axis back after a turn: height ``strength`` um at 1000 mm/min, growing as feed^p, given up within d0_mm.
+    """Friction holds the axis back after a reversal: by ``strength`` um at 1000 mm/min, growing as feed^p, decaying within d0_mm.
 
-    The friction state rises to its full size within a small part of d0 and decays; wild: one side is higher, the decay has a tail.
+    The lag rises to its full size within a small part of d0_mm; wild: it differs between the two directions, and its decay has a tail.
     """
     if not track.moving:
         return
@@ -54,7 +57,7 @@ def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("cyclic_error")
 def cyclic_error(e: Hidden, track: Track, out: Bend) -> None:
-    """Waves with the pitch and half of it; wild: amplitude and phase wander along the screw, a third harmonic."""
+    """Waves with the pitch and half of it; wild: amplitude and phase vary along the screw, and there is a third harmonic."""
     a = e.axis
     x, place = track.q_mm[:, a], middle(track, a)
     angle = 2.0 * np.pi * x / e["pitch_mm"] + e.freedom(0.2, 1.0, 1, signed=True) * np.sin(2.0 * place + e.freedom(0.0, 6.0, 2))
@@ -67,9 +70,10 @@ NODES, WEIGHTS = np.polynomial.laguerre.laggauss(10)
 
 
 def lagging(track: Track, lag_s: float, second: float) -> F:
-    """Where a second-order loop with time constants lag_s and second * lag_s leaves the axes, minus where they were sent, (n, 3) mm.
+    """Return actual minus commanded axis positions behind a second-order loop, (n, 3) mm.
 
-    The commanded course folded with the loop's answer to an impulse, (exp(-s/a) - exp(-s/b)) / (a - b), by Gauss-Laguerre sums.
+    Its time constants are a = lag_s (1 - second) and b = lag_s second. The commanded course is convolved with the impulse response
+    (exp(-s/a) - exp(-s/b)) / (a - b) by Gauss-Laguerre quadrature.
     """
     if track.course is None or lag_s == 0.0:
         return np.zeros((track.n, 3))
@@ -86,13 +90,13 @@ def lagging(track: Track, lag_s: float, second: float) -> F:
 def contour_lag(e: Hidden, track: Track, out: Bend) -> None:
     """All axes trail by ``strength`` ms; wild: a second, faster lag of the current loop takes part of it."""
     second = e.freedom(0.05, 0.25, 1)
-    # what pulls a circle inwards is the second moment of the answer to an impulse: it is what strength states
+    # a circle shrinks with the second moment of the impulse response: this scaling keeps it at 2 strength^2
     out.drive += lagging(track, e["strength"] * MS / np.sqrt(1.0 - second + second * second), second)
 
 
 @effect("servo_mismatch")
 def servo_mismatch(e: Hidden, track: Track, out: Bend) -> None:
-    """One axis trails the others by ``strength`` ms (negative: it leads); wild: its loop stiffens with speed."""
+    """One axis trails the others by ``strength`` ms (negative: it leads); wild: the lag depends on speed."""
     a = e.axis
     stiff = e.freedom(0.05, 0.25, 1, signed=True)
     lag = lagging(track, e["strength"] * MS, e.freedom(0.0, 0.2, 2))[:, a]
@@ -101,11 +105,10 @@ def servo_mismatch(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("stick_slip")
 def stick_slip(e: Hidden, track: Track, out: Bend) -> None:
-    """Well below the speed v_c (mm/s) the axis sticks and jumps: a saw-tooth of amplitude strength every period_mm of travel.
+    """Well below the speed v_c (mm/s) the axis sticks and jumps: a saw-tooth of amplitude ``strength`` um every period_mm of travel.
 
-    The faster, the less, exp(-(v / v_c)^2), as friction falls with speed (Stribeck); standing, it rests.
-
-    The state is the travel itself, with an unknown initial phase; wild: teeth of unequal length.
+    The amplitude falls with speed as exp(-(v / v_c)^2) (Stribeck friction) and is 0 at standstill. The phase follows the travel, from a
+    random start; wild: teeth of unequal length.
     """
     if not track.moving:
         return
@@ -120,7 +123,7 @@ def stick_slip(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("vibration")
 def vibration(e: Hidden, track: Track, out: Bend) -> None:
-    """The axis swings at f_hz while it moves, with another phase in every run; wild: the amplitude breathes."""
+    """The axis vibrates at f_hz while the machine moves, with another phase in every run; wild: the amplitude varies slowly."""
     if not track.moving:
         return
     rng = e.rng(7, track.number)

@@ -1,4 +1,4 @@
-"""What a hidden effect does to a run, and the book of all of them."""
+"""A hidden effect, what it changes in a run, and the registry of all effects."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,11 +15,11 @@ STREAM_WILD = 41
 
 @dataclass(slots=True)
 class Bend:
-    """How a run differs from the machine without the effect.
+    """What an effect changes in a run.
 
-    ``drive`` (n, 3) mm: the axes stand elsewhere than commanded. ``shift`` (3, n, 3) mm, ``angle`` (3, n, 3) rad: additional error motions
-    of carriages X, Y, Z. ``reading`` (n,) mm: of the instrument alone. ``beam`` and ``tilt`` (2,) rad: laser and mirror askew, across the
-    nominal beam.
+    ``drive`` (n, 3) mm: axis positions minus commanded ones. ``shift`` (3, n, 3) mm, ``angle`` (3, n, 3) rad: additional error motions of
+    carriages X, Y, Z. ``reading`` (n,) mm: error of the instrument itself. ``beam``, ``tilt`` (2,) rad: misalignment of laser beam and
+    mirror, in the two directions across the nominal beam.
     """
 
     drive: F
@@ -31,11 +31,11 @@ class Bend:
 
     @classmethod
     def none(cls, n: int) -> "Bend":
-        """No difference at n readings."""
+        """Return a bend without any change of n readings."""
         return cls(np.zeros((n, 3)), np.zeros((3, n, 3)), np.zeros((3, n, 3)), np.zeros(n), np.zeros(2), np.zeros(2))
 
     def add(self, other: "Bend") -> "Bend":
-        """Both together."""
+        """Return the sum of two bends."""
         return Bend(*(getattr(self, name) + getattr(other, name) for name in Bend.__slots__))
 
 
@@ -43,9 +43,9 @@ class Bend:
 class Hidden:
     """One effect of one machine.
 
-    ``name``, ``key`` as in the exchange files; ``parameters``: ``strength`` in the unit of the exchange files and what else it needs;
-    ``wild``: seed of how it departs from the textbook, 0 for the textbook itself; ``bent``: how far, 1 is usual; ``stream``: seed of what
-    is random about it anyway (phases, directions of a set-up).
+    ``name`` and ``key`` as in the effect catalogue; ``parameters``: ``strength`` in the effect's unit, and further ones that it needs;
+    ``wild``: seed of its departures from the textbook form, 0: none; ``bent``: factor of their size, usually 1; ``stream``: seed of its
+    other random values (phases, directions of a set-up).
     """
 
     name: str
@@ -61,7 +61,7 @@ class Hidden:
         return f"{self.name}:{self.key}" if self.key else self.name
 
     def __getitem__(self, name: str) -> float:
-        """One parameter."""
+        """Return the parameter of this name."""
         return float(self.parameters[name])
 
     @property
@@ -75,16 +75,16 @@ class Hidden:
         return "XYZ".index(self.key[1]) if self.key[1] in "XYZ" else "ABC".index(self.key[1])
 
     def rng(self, *stream: int) -> np.random.Generator:
-        """Random generator of the effect: its phases, directions of a set-up.
+        """Return a random generator for phases or directions of a set-up.
 
-        ``stream``: numbers that set apart what is drawn (which quantity, run, set-up); the same ones always give the same sequence.
+        ``stream``: numbers that distinguish the draws (quantity, run, set-up); equal numbers give equal sequences.
         """
         return np.random.default_rng([STREAM_WILD, self.stream, *stream])
 
     def freedom(self, low: float, high: float, which: int, *, signed: bool = False) -> float:
-        """A departure from the textbook, drawn between ``low`` and ``high`` times ``bent``; 0 for the textbook itself.
+        """Return a departure from the textbook form, drawn between ``low`` and ``high`` times ``bent``; 0 if the effect is not wild.
 
-        ``which``: number of the departure, different for each of one effect. ``signed``: half of them are negative.
+        ``which``: number of the departure, unique within the effect. ``signed``: it is negative in half of the cases.
         """
         if not self.wild:
             return 0.0
@@ -93,23 +93,23 @@ class Hidden:
         return -size if signed and rng.random() < 0.5 else size
 
     def bend(self, track: Track) -> Bend:
-        """What it does to a run."""
+        """Return what the effect changes in a run."""
         out = Bend.none(track.n)
         BOOK[self.name](self, track, out)
         return out
 
     def scaled(self, strength: float) -> "Hidden":
-        """The same effect at another strength."""
+        """Return the same effect at another strength."""
         return replace(self, parameters={**self.parameters, "strength": strength})
 
 
 Act = Callable[[Hidden, Track, Bend], None]
-"""Puts an effect into a `Bend`."""
+"""Writes what an effect changes in a run into a `Bend` of zeros."""
 BOOK: dict[str, Act] = {}
 
 
 def effect(name: str) -> Callable[[Act], Act]:
-    """Enter a function into the book of effects."""
+    """Register a function as the effect of this name."""
 
     def enter(act: Act) -> Act:
         BOOK[name] = act
@@ -119,11 +119,11 @@ def effect(name: str) -> Callable[[Act], Act]:
 
 
 def effect_names() -> frozenset[str]:
-    """Names of all effects that were entered."""
+    """Return the names of all registered effects."""
     return frozenset(BOOK)
 
 
 def middle(track: Track, axis: int) -> F:
-    """Position along the stroke, -1 to 1, (n,)."""
+    """Return the position along the stroke as -1 to 1, (n,)."""
     low, high = track.low_mm[axis], track.high_mm[axis]
     return np.asarray((2.0 * track.q_mm[:, axis] - low - high) / (high - low))

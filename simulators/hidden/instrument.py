@@ -1,4 +1,4 @@
-"""Effects of the instruments and of how they were set up."""
+"""Effects of the instruments and their set-up ("wild": the departure from the textbook form if `Hidden.wild` is not 0)."""
 
 import numpy as np
 
@@ -7,27 +7,27 @@ from abbe.simulators.hidden.effect import MRAD, PPM, UM, URAD, Bend, Hidden, eff
 from abbe.simulators.hidden.track import Track
 
 AIR_PPM_PER_K = -0.93
-"""Warmer air is thinner: the wavelength exceeds the laser's assumed one, and it counts fewer waves on the same path."""
+"""Warmer air is thinner: the wavelength is longer than the laser assumes, and the laser counts fewer waves on the same path."""
 DEAD_PATH_MM = 900.0
 
 
 @effect("bar_length_error")
 def bar_length_error(e: Hidden, track: Track, out: Bend) -> None:
-    """Every bar reads ``strength`` um too much; wild: bars of other lengths are not off by quite the same."""
+    """Every bar reads ``strength`` um too much; wild: the error varies slightly with the bar's length."""
     if track.kind == "bar":
         out.reading += e["strength"] * UM * (1.0 + e.freedom(0.02, 0.15, 1, signed=True) * (track.radius_mm / 150.0 - 1.0))
 
 
 @effect("mirror_tilt")
 def mirror_tilt(e: Hidden, track: Track, out: Bend) -> None:
-    """The mirror was put on askew, by about ``strength`` urad, otherwise in every set-up."""
+    """The mirror is tilted by about ``strength`` urad, differently in every set-up."""
     if track.kind == "laser":
         out.tilt += e["strength"] * URAD * per_setup(e, track.setup)
 
 
 @effect("laser_cosine")
 def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
-    """The beam is ``strength`` mrad off its direction; to where differs from set-up to set-up, wild: how far, too."""
+    """The beam is misaligned by ``strength`` mrad, in another direction in every set-up; wild: by another angle, too."""
     if track.kind == "laser":
         aside = per_setup(e, track.setup)
         size = 1.0 + e.freedom(0.02, 0.12, 1) * float(np.sin(7.0 * aside[0]))
@@ -36,40 +36,40 @@ def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("setup_centre_offset")
 def setup_centre_offset(e: Hidden, track: Track, out: Bend) -> None:
-    """The cup stands beside where the spindle was by ``strength`` um, otherwise in every set-up: the tool is elsewhere for the bar."""
+    """The cup is offset from the spindle's position by ``strength`` um, in another direction in every set-up; written as a tool shift."""
     if track.kind == "bar" and track.number >= 0:
         away = e.rng(21, zlib_of(track.setup)).normal(size=3)
         out.shift[2] -= e["strength"] * UM * away / np.linalg.norm(away)
 
 
 def per_setup(e: Hidden, setup: str) -> F:
-    """Two numbers of a set-up, (2,), with about unit length."""
+    """Return a random vector of a set-up, (2,), with a length of 0.6 to 1.3."""
     rng = e.rng(22, zlib_of(setup))
     angle, length = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.6, 1.3)
     return length * np.array([np.cos(angle), np.sin(angle)])
 
 
 def zlib_of(text: str) -> int:
-    """A number of a name, the same in every process."""
+    """Return a number for a name, the same in every process."""
     return int.from_bytes(text.encode()[:8], "big")
 
 
 def air_rise(e: Hidden, t_s: F) -> F:
-    """How much warmer than compensated the air is, K, (n,): amplitude ``strength``, one period; wild: a second, quicker wave."""
+    """Return how much warmer the air is than the laser assumes, K, (n,): a wave of amplitude ``strength``; wild: a second, faster wave."""
     wave = np.sin(2.0 * np.pi * t_s / e["period_s"] + e["phase"])
     return np.asarray(e["strength"] * (wave + e.freedom(0.05, 0.25, 1) * np.sin(2.0 * np.pi * t_s / (0.31 * e["period_s"]) + e["phase"])))
 
 
 @effect("air_refraction")
 def air_refraction(e: Hidden, track: Track, out: Bend) -> None:
-    """The measured path counts too short in warm air."""
+    """The measured path reads too short in warm air."""
     if track.kind == "laser":
         out.reading += AIR_PPM_PER_K * PPM * air_rise(e, track.t_s) * track.reach_mm
 
 
 @effect("dead_path")
 def dead_path(e: Hidden, track: Track, out: Bend) -> None:
-    """The path before the zero lies in air that warms by ``strength`` K/h; wild: not evenly."""
+    """The dead path, from laser to zero position, lies in air that warms by ``strength`` K/h; wild: unevenly."""
     if track.kind == "laser":
         hours = (track.t_s - track.t_s[0]) / 3600.0
         uneven = hours * (1.0 + e.freedom(0.1, 0.4, 1, signed=True) * (hours / 0.1 - 0.5))
@@ -78,7 +78,7 @@ def dead_path(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("beam_outliers")
 def beam_outliers(e: Hidden, track: Track, out: Bend) -> None:
-    """A share ``rate`` of the laser's readings is off by about ``strength`` um, either way."""
+    """A share ``rate`` of the laser's readings is wrong by about ``strength`` um, with either sign."""
     if track.kind == "laser":
         rng = e.rng(23, track.number)
         hit = rng.random(track.n) < e["rate"]

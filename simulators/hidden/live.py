@@ -1,4 +1,4 @@
-"""A hidden effect in the world of the devices: the axes and the tool move on by real samples, with the world's own clock."""
+"""A hidden effect in the simulated world of the devices, followed sample by sample on the world's clock."""
 
 from dataclasses import asdict, dataclass
 
@@ -26,19 +26,19 @@ NEEDED = {
     "squareness_thermal": ("tau_s",), "local_bump": ("cx", "cy", "cz", "w_mm"), "counterbalance_surge": ("period_s", "phase"),
     "encoder_count_loss": ("t0_s",), "air_refraction": ("period_s", "phase"), "bar_thermal": ("tau_s",),
 }  # fmt: skip
-"""Parameters beside ``strength``."""
+"""Parameters that an effect needs besides ``strength``."""
 VERTICAL = 2
 PARTS = (drive, outside, structure, thermal)
-"""Imported so that their effects stand in the book."""
+"""Imported so that their effects are registered."""
 
 
 def live_of(config: HiddenConfig, low_mm: F, high_mm: F) -> "Live | None":
-    """The hidden effect of a scenario, None without one.
+    """Return the hidden effect of a scenario, or None.
 
     Raises
     ------
     ScenarioError
-        Unknown effect or key, or a parameter is lacking.
+        The effect or its key is unknown, or a parameter is missing.
     """
     if not config.name:
         return None
@@ -50,9 +50,9 @@ def live_of(config: HiddenConfig, low_mm: F, high_mm: F) -> "Live | None":
 
 
 def problem(e: Hidden) -> str | None:
-    """What is wrong with a hidden effect of a scenario, in one line; None: nothing."""
+    """Return in one line what is wrong with the hidden effect of a scenario, or None."""
     if e.name not in MOVES | READS:
-        known = "unknown effect" if e.name not in effect_names() else "devices do not know this effect"
+        known = "unknown effect" if e.name not in effect_names() else "the simulated devices do not support this effect"
         return f"hidden.name: {e.name!r}: {known}; choose one of {', '.join(sorted(MOVES | READS))}"
     lacking = [p for p in ("strength", *NEEDED.get(e.name, ())) if p not in e.parameters]
     if lacking:
@@ -67,7 +67,7 @@ def problem(e: Hidden) -> str | None:
 
 @dataclass
 class Live:
-    """One effect that follows the machine sample by sample; it remembers directions, turns, travel, and where lost motion left the axis."""
+    """One effect that follows the machine sample by sample: it remembers directions, reversals, travel and the state of lost motion."""
 
     effect: Hidden
     low_mm: F
@@ -82,7 +82,7 @@ class Live:
         self._carriage_mm: float | None = None
 
     def displacement(self, times_s: F, driven_mm: F) -> F:
-        """Displacement of the tool by the effect, (n, 3) mm, at n later times with the drives at (n, 3) mm."""
+        """Return the displacement of the tool by the effect, (n, 3) mm, at n later times with the drives at (n, 3) mm."""
         if self.effect.name not in MOVES:
             return np.zeros(driven_mm.shape)
         track = self._track(times_s, driven_mm)
@@ -114,7 +114,7 @@ class Live:
         )  # fmt: skip
 
     def _lost(self, driven_mm: F) -> F:
-        """Lost motion whose width grows along the axis: where the carriage stands, minus the drive, (n,) mm."""
+        """Return carriage minus drive position, (n,) mm, for lost motion whose width varies along the axis."""
         e, a = self.effect, self.effect.axis
         low, high = self.low_mm[a], self.high_mm[a]
         half = 0.5 * e["strength"] * UM * (1.0 + e["k"] * (2.0 * driven_mm - low - high) / (high - low))
@@ -127,7 +127,7 @@ class Live:
         return out
 
     def laser_mm(self, time_s: float, since_zero_s: float, path_mm: float) -> float:
-        """What the laser reads too much at an instant, with the zero so long ago and a measured path, mm."""
+        """Return the error of a laser reading, mm, at an instant; ``since_zero_s``: time since the zero; ``path_mm``: measured path."""
         e = self.effect
         if e.name == "air_refraction":
             return float(AIR_PPM_PER_K * 1e-6 * air_rise(e, np.array([time_s]))[0] * path_mm)
@@ -136,7 +136,7 @@ class Live:
         return 0.0
 
     def bar_mm(self, times_s: F, hung_in_s: float, radius_mm: float) -> F:
-        """What the ball-bar reads too much at n instants, with this bar hung in at ``hung_in_s``, (n,) mm."""
+        """Return the error of the ball-bar's readings at n instants, (n,) mm, for a bar mounted at ``hung_in_s``."""
         n = len(times_s)
         if self.effect.name != "bar_thermal":
             return np.zeros(n)
@@ -148,6 +148,6 @@ class Live:
         return self.effect.bend(track).reading
 
     def describe(self) -> dict[str, object]:
-        """Name, key and parameters, for the truth report."""
+        """Return name, key, parameters and ``wild`` of the effect, for the truth report."""
         whole = asdict(self.effect)
         return {name: whole[name] for name in ("name", "key", "parameters", "wild")}

@@ -17,7 +17,7 @@ PLANES = {"XY": (0, 1), "YZ": (1, 2), "ZX": (2, 0)}
 
 @dataclass(frozen=True)
 class Run:
-    """One run as written into its file: ``test``, ``role``, ``setup`` object of the exchange format, and its track."""
+    """One run: ``test``, ``role`` and ``setup`` as in its abbe-run/1 file, and its track."""
 
     run_id: str
     test: str
@@ -30,7 +30,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Machinery:
-    """What a plan needs to know of the machine: strokes (3,) mm, the vertical axis, and which way each axis leans while it stands."""
+    """What a plan needs to know of the machine: strokes (3,) mm, vertical axis, and ``rest`` (3,), +-1: direction of each last motion."""
 
     low_mm: F
     high_mm: F
@@ -39,13 +39,13 @@ class Machinery:
 
     @property
     def middle_x(self) -> float:
-        """Where the work is: middle of the X stroke."""
+        """Middle of the X stroke, mm, where the set-ups are."""
         return float(0.5 * (self.low_mm[0] + self.high_mm[0]))
 
 
 @dataclass
 class _Clock:
-    """Runs made so far and the time."""
+    """The runs so far, and the time after them."""
 
     machine: Machinery
     t_s: float = POWER_ON_S
@@ -61,7 +61,7 @@ class _Clock:
         self.set_s, self.last = self.t_s, kind
 
     def later(self) -> None:
-        """The cup again, after a break."""
+        """Set up the cup again after a break."""
         self.mount("bar", later=True)
 
     def bar(self, setup: dict[str, object], shape: str, role: str, feed: float, direction: int) -> None:
@@ -79,7 +79,7 @@ class _Clock:
 
 
 def runs_of(plan: str, machine: Machinery) -> list[Run]:
-    """All runs of a plan, in order."""
+    """Return all runs of a plan, in order."""
     clock = _Clock(machine)
     for do, *what in _orders(plan, machine.middle_x):
         getattr(clock, str(do))(*what)
@@ -120,7 +120,7 @@ def _orders(plan: str, x: float) -> Iterator[tuple[object, ...]]:
 
 
 def shape_points(shape: str, part: F) -> F:
-    """Points of a helix over the upper half sphere or of a circle, radius 1, at parts 0..1 of the way (and a little beyond), (n, 3)."""
+    """Return points of a helix over the upper half sphere or of a circle, radius 1, (n, 3); ``part``: 0 to 1 and slightly beyond."""
     if shape == "helix":
         around, up = 2.0 * np.pi * TURNS * part, TILT * 0.5 * np.pi * part
         return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=1)
@@ -131,7 +131,7 @@ def shape_points(shape: str, part: F) -> F:
 
 
 def bar_track(clock: _Clock, setup: dict[str, object], shape: str, feed: float, direction: int) -> tuple[Track, dict[str, object]]:
-    """A ball-bar run at constant feed along its curve, sampled evenly."""
+    """Return the track and set-up of a ball-bar run at constant feed, sampled evenly."""
     n = HELIX_N if shape == "helix" else CIRCLE_N
     radius, centre = float(str(setup["radius_mm"])), np.array(setup["centre_mm"], dtype=np.float64)
     fine = np.linspace(-0.1, 1.1, 60001)
@@ -161,7 +161,7 @@ def bar_track(clock: _Clock, setup: dict[str, object], shape: str, feed: float, 
 
 
 def laser_track(clock: _Clock, diagonal: str) -> tuple[Track, dict[str, object], F]:
-    """A diagonal out in steps X, Y, Z and back in steps Z, Y, X, with a rest after every move."""
+    """Return track, set-up and directions of a diagonal: out in steps X, Y, Z, back in steps Z, Y, X, with a dwell after every move."""
     ways = np.array([1.0 if s == "p" else -1.0 for s in diagonal])
     low, high = clock.machine.low_mm + EDGE_MM, clock.machine.high_mm - EDGE_MM
     start, step = np.where(ways > 0, low, high), ways * (high - low) / STEPS
@@ -192,7 +192,7 @@ def _remembering(track: Track, dense_mm: F, at: np.ndarray, rest: F) -> Track:
 
 
 def standing(track: Track, centre_mm: F) -> Track:
-    """The moment at which a set-up's cup was put where the spindle stood."""
+    """Return the track of the one instant at which the cup of a set-up was placed at the spindle."""
     zero, one = np.zeros((1, 3)), np.array([track.set_s])
     return Track(
         "bar", track.setup, centre_mm[None], one, zero, zero, zero, zero + 1e9, zero, zero, np.zeros(1), track.set_s, track.set_s,

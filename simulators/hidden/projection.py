@@ -1,4 +1,4 @@
-"""How much of a hidden effect's trace the present model cannot take in: columns by finite differences of the simulated machine."""
+"""The part of a hidden effect's trace that the present model cannot absorb, by finite differences of the simulated machine."""
 
 from dataclasses import dataclass
 
@@ -16,14 +16,14 @@ TINY = 1e-11
 
 @dataclass(frozen=True)
 class Model:
-    """What the present simulation knows: ``level`` rigid6 or rigid21 and the set-up terms it fits."""
+    """The present model, in which the effect is missing: ``level`` rigid6 or rigid21, and the set-up terms that it fits."""
 
     level: str
     terms: frozenset[str]
 
 
 def splines(position_mm: F, low_mm: float, high_mm: float, count: int = SPLINES) -> F:
-    """Cubic B-splines on even knots over a stroke, (n, count)."""
+    """Return the values of cubic B-splines on even knots over a stroke, (n, count)."""
     cells = count - 3
     at = np.clip((position_mm - low_mm) / (high_mm - low_mm) * cells, 0.0, cells - 1e-9)
     cell = at.astype(int)
@@ -36,7 +36,7 @@ def splines(position_mm: F, low_mm: float, high_mm: float, count: int = SPLINES)
 
 
 def pushed(machine: PerfectMachine, q_mm: F, carriage: int, component: int) -> F:
-    """Where the tool goes per unit of an error motion (mm per mm, or mm per rad), (n, 3)."""
+    """Return the displacement of the tool per unit of an error motion (mm per mm, or mm per rad), (n, 3)."""
     bend = Bend.none(len(q_mm))
     target = bend.shift if component < 3 else bend.angle
     target[carriage, :, component % 3] = STEP
@@ -44,7 +44,10 @@ def pushed(machine: PerfectMachine, q_mm: F, carriage: int, component: int) -> F
 
 
 def motion_columns(machine: PerfectMachine, run: Run, carriage: int, component: int, at: F, at_reference: F) -> F:
-    """Readings of a run per unit of k functions of one error motion, given their values (n, k) on the run and (k,) at its reference."""
+    """Return the readings of a run per unit of k functions of one error motion, (n, k).
+
+    ``at`` (n, k): values of the functions on the run; ``at_reference`` (k,): at its `reference_mm`.
+    """
     track = run.track
     moved = np.einsum("ij,ij->i", track.look, pushed(machine, track.q_mm, carriage, component))
     if track.kind == "bar":
@@ -59,12 +62,12 @@ def motion_columns(machine: PerfectMachine, run: Run, carriage: int, component: 
 
 
 def reference_mm(run: Run) -> F:
-    """Where the machine stood when the reading was zeroed, (3,)."""
+    """Return the position of the machine when the reading was zeroed, (3,) mm."""
     return np.array(run.setup["centre_mm"], dtype=np.float64) if run.track.kind == "bar" else run.track.q_mm[0]
 
 
 def smooth_columns(machine: PerfectMachine, run: Run, level: str) -> F:
-    """Readings of a run per unit of each error motion's coefficients, mm per mm or mm per rad, shape (n, k).
+    """Return the readings of a run per unit of each coefficient of the error motions, mm per mm or mm per rad, shape (n, k).
 
     ``level``: rigid21 (six motions per axis, as splines) or rigid6 (scales and squareness).
     """
@@ -84,7 +87,7 @@ def smooth_columns(machine: PerfectMachine, run: Run, level: str) -> F:
 
 
 def setup_columns(runs: list[Run], terms: frozenset[str]) -> F:
-    """Readings of all runs per unit of each set-up term, mm per mm or mm per rad.
+    """Return the readings of all runs per unit of each set-up term, mm per mm or mm per rad.
 
     Terms: centre per bar set-up, bar length, mirror tilt per laser set-up, a zero per laser run.
     """
@@ -111,28 +114,28 @@ def setup_columns(runs: list[Run], terms: frozenset[str]) -> F:
 
 
 def tilt_columns(run: Run) -> F:
-    """Reading per rad of mirror tilt, (n, 2)."""
+    """Return the readings per rad of mirror tilt, mm, (n, 2)."""
     first, second = across(run.track.look[0])
     return np.asarray((run.track.q_mm - run.track.q_mm[0]) @ np.stack([first, second], axis=1))
 
 
 @dataclass(frozen=True)
 class Projector:
-    """Whitened columns of the present model over all fitted runs, and the inverse of their products."""
+    """Columns of the present model over all fitted runs, divided by the noise, and the inverse of their products."""
 
     columns: F
     inverse: F
     weight: F
 
     def left(self, signal_mm: F) -> F:
-        """What remains of signals (n, k) mm, over one reading's noise."""
+        """Return what the model cannot absorb of signals (n, k) mm, in standard deviations of one reading."""
         white = signal_mm * self.weight[:, None]
         out = white - self.columns @ (self.inverse @ (self.columns.T @ white))
         return np.asarray(out - self.columns @ (self.inverse @ (self.columns.T @ out)))
 
 
 def projector(machine: PerfectMachine, runs: list[Run], model: Model, bar_mm: float, laser_mm: float) -> Projector:
-    """The present model's tangent space on the runs it may be fitted to."""
+    """Return the projector of the present model on the runs to which it may be fitted."""
     smooth = np.vstack([smooth_columns(machine, r, model.level) for r in runs])
     columns = np.hstack([smooth, setup_columns(runs, model.terms)])
     weight = np.concatenate([np.full(r.track.n, 1.0 / (bar_mm if r.track.kind == "bar" else laser_mm)) for r in runs])

@@ -20,7 +20,7 @@ class BentMachine:
         self.machine = machine
 
     def locate(self, q_mm: F, bend: Bend) -> tuple[F, F]:
-        """Where the tool is in workpiece coordinates, (n, 3) mm, and how it is turned against the workpiece, (n, 3) rad."""
+        """Return the tool's position in workpiece coordinates, (n, 3) mm, and its rotation against the workpiece, (n, 3) rad."""
         geometry, axes = self.machine.geometry, q_mm + bend.drive
         point = np.broadcast_to(geometry.tool_mm, axes.shape)
         turned = np.zeros(axes.shape)
@@ -40,7 +40,7 @@ class BentMachine:
 
 
 class PerfectMachine(BentMachine):
-    """The same kinematics without any error motion: quick, for the trace that one effect leaves."""
+    """The same kinematics without error motions, to compute the trace of one effect quickly."""
 
     def _motions(self, axis: int, position_mm: F) -> tuple[F, F]:
         return np.zeros((len(position_mm), 3)), np.zeros((len(position_mm), 3))
@@ -48,24 +48,24 @@ class PerfectMachine(BentMachine):
 
 @dataclass(frozen=True)
 class Rig:
-    """A machine and the effects that act on it; set-up terms are effects, too."""
+    """A machine and the effects that act on it, including set-up terms."""
 
     machine: BentMachine
     effects: tuple[Hidden, ...]
 
     def bend(self, track: Track) -> Bend:
-        """All effects together on one run."""
+        """Return the sum of all effects on one run."""
         out = Bend.none(track.n)
         for e in self.effects:
             out = out.add(e.bend(track))
         return out
 
     def reading(self, run: Run) -> F:
-        """What the instrument would show without noise, mm, (n,)."""
+        """Return the noise-free readings of a run, (n,) mm."""
         return self.bar(run) if run.track.kind == "bar" else self.laser(run)
 
     def bar(self, run: Run) -> F:
-        """Distance from the cup, which was set with the spindle, minus the nominal radius, plus what the bar itself adds."""
+        """Return the distance from the cup, which was set with the spindle, minus the nominal radius, plus errors of the bar, (n,) mm."""
         bend = self.bend(run.track)
         centre = np.array(run.setup["centre_mm"], dtype=np.float64)
         still = standing(run.track, centre)
@@ -74,10 +74,10 @@ class Rig:
         return np.asarray(np.linalg.norm(tool - cup, axis=1) - run.track.radius_mm + bend.reading)
 
     def laser(self, run: Run) -> F:
-        """Growth of the path to where the mirror's plane meets the beam, minus the nominal one.
+        """Return the growth of the path to the point where the beam meets the mirror plane, minus the nominal growth, (n,) mm.
 
-        The mirror is square to the beam where nothing turns the tool, as the maker's reference has it; how it turns with the tool counts in
-        full. Who lines it up where the run begins has put it askew by what the tool is turned there: that is a tilt.
+        The mirror is square to the beam where the tool is not rotated, and rotates with the tool. A mirror aligned at the start of the run
+        instead differs by the tool's rotation there; this difference is a mirror tilt.
         """
         track = run.track
         bend = self.bend(track)
@@ -93,7 +93,7 @@ class Rig:
 
 
 def across(direction: F) -> tuple[F, F]:
-    """Two unit vectors across a unit vector, (3,) each."""
+    """Return two unit vectors perpendicular to a unit vector and to each other, (3,) each."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = np.cross(direction, helper)
     first /= np.linalg.norm(first)
@@ -102,7 +102,10 @@ def across(direction: F) -> tuple[F, F]:
 
 @dataclass(frozen=True)
 class Noise:
-    """Of the instruments: standard deviation of one reading, share of it that is coloured, and its memory from reading to reading."""
+    """Noise of the instruments: standard deviation of one reading, and ``*_step_mm``, its resolution.
+
+    ``coloured``: coloured share of the standard deviation; ``memory``: correlation of this share between successive readings.
+    """
 
     bar_mm: float
     laser_mm: float
@@ -112,13 +115,13 @@ class Noise:
     laser_step_mm: float = 1e-5
 
     def put(self, exact_mm: F, run: Run, seed: int) -> F:
-        """Readings of a run: white and coloured noise, the laser's zero, and the display's steps, (n,) mm."""
+        """Return the readings of a run with white and coloured noise, the laser's zero, and the resolution, (n,) mm."""
         rng = np.random.default_rng([STREAM_NOISE, seed, run.track.number])
         n, bar = len(exact_mm), run.track.kind == "bar"
         size, step = (self.bar_mm, self.bar_step_mm) if bar else (self.laser_mm, self.laser_step_mm)
         white = rng.normal(scale=np.sqrt(1.0 - self.coloured**2), size=n)
         if not bar:
-            white -= white[0]  # the first record is made the zero, with whatever noise it has
+            white -= white[0]  # the laser is zeroed at the first record, including its noise
         drive = rng.normal(scale=self.coloured * np.sqrt(1.0 - self.memory**2), size=n)
         state = float(rng.normal(scale=self.coloured))
         for i, kick in enumerate(drive.tolist()):

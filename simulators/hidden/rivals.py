@@ -18,7 +18,7 @@ INDISTINCT = 20.0
 COMPONENTS = "XYZABC"
 DRIFT_S = (1500.0, 3000.0, 6000.0)
 Function = Callable[[Track], F]
-"""Value of some quantity of the machine at every reading of a run, (n,)."""
+"""Returns the value of some quantity at every reading of a run, (n,)."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +34,20 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Readings when the tool is displaced along one direction by functions that are zero while the cup is set."""
+        """Return the readings when the tool is displaced along one axis by functions that are zero while the cup is set."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:
-        """Readings when a displacement, arm of the position (n, 3), sets in like 1 - exp(-t / tau)."""
+        """Yield, for each tau (s), the readings of a displacement along one axis: ``arm(position (n, 3))`` times 1 - exp(-t / tau)."""
         for tau in taus:
             yield self.stack(lambda r, tau=tau: _warm(r, direction, arm, tau))  # type: ignore[misc]
 
     def of_instruments(self, bar: Function | None, laser: Function | None) -> F:
-        """Readings of an effect of the instruments themselves."""
+        """Return the readings of an effect of the instruments themselves; None: this instrument has none."""
         return self.stack(lambda r: _instrument(r, bar if r.track.kind == "bar" else laser))
 
     def motion(self, carriage: int, component: int) -> F:
-        """Readings of a free smooth error motion: Legendre polynomials 2 to 5 of the position."""
+        """Return the readings of a smooth error motion: one column for each Legendre polynomial 2 to 5 of the position."""
         return self.stack(lambda r: self._motion(r, carriage, component))
 
     def _motion(self, run: Run, carriage: int, component: int) -> F:
@@ -85,7 +85,7 @@ def _fraction(track: Track, axis: int) -> F:
 
 
 def traces(fitted: FittedRuns) -> Iterator[tuple[str, F]]:
-    """Label and columns of one trace of every named effect that is not part of the present model; several traces share a label."""
+    """Yield label and columns of the traces of all predictable effects that the present model lacks; traces may share a label."""
     low, high = fitted.runs[0].track.low_mm, fitted.runs[0].track.high_mm
     for a, axis in enumerate(AXES):
         yield from _drive(fitted, a, axis)
@@ -214,12 +214,12 @@ def _per_setup(fitted: FittedRuns, kind: str) -> F:
 
 
 def indistinct(fitted: FittedRuns, projector: Projector, left: F, own: str) -> list[str]:
-    """Labels of rivals whose best trace falls short of an effect's remainder ``left`` (n,) by less than `INDISTINCT`."""
+    """Return the labels of rivals that leave less than `INDISTINCT` of the chi-square of an effect's remainder ``left`` (n,)."""
     labels, blocks = zip(*traces(fitted), strict=True)
     raw = np.hstack(blocks) * projector.weight[:, None]
     kept = projector.columns.T @ raw
     products = raw.T @ raw - kept.T @ (projector.inverse @ kept)
-    with_effect = raw.T @ left  # the remainder is orthogonal to the present model already
+    with_effect = raw.T @ left  # ``left`` is already orthogonal to the present model
     size = np.einsum("ij,ij->j", raw, raw)
     edges = np.cumsum([0, *(b.shape[1] for b in blocks)])
     out: list[str] = []

@@ -1,4 +1,7 @@
-"""Effects of slides, bed and ram: play across the travel, a bed that bends, sag, error motions beyond the present model."""
+"""Effects of slides, bed and ram: play across the travel, a bed that bends, sag, error motions beyond the present model.
+
+In the docstrings of effects, "wild" is the departure from the textbook form if `Hidden.wild` is not 0.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +14,7 @@ from abbe.simulators.hidden.track import Track
 
 @effect("lateral_play")
 def lateral_play(e: Hidden, track: Track, out: Bend) -> None:
-    """A carriage steps across by ``strength`` um when it turns; wild: it needs some travel, and more at one end of the guide."""
+    """A carriage steps sideways by ``strength`` um when it reverses; wild: over some travel, and more at one end of the guide."""
     a = e.axis
     half = 0.5 * e["strength"] * UM * (1.0 + e.freedom(0.05, 0.3, 1, signed=True) * middle(track, a))
     over = e.freedom(0.02, 0.4, 2) or 1e-9
@@ -21,7 +24,7 @@ def lateral_play(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("nonrigid_bed")
 def nonrigid_bed(e: Hidden, track: Track, out: Bend) -> None:
-    """Straightness that changes sign across the ``other`` axis: A sin(pi x / L)(2 y / L_y - 1); wild: lopsided and bent."""
+    """A straightness error that changes sign along the ``other`` axis: A sin(pi x / L)(2 y / L_y - 1); wild: asymmetric in both axes."""
     a, other = e.axis, int(e["other"])
     x = 0.5 * (middle(track, a) + 1.0)
     across = middle(track, other)
@@ -32,9 +35,9 @@ def nonrigid_bed(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("ram_sag")
 def ram_sag(e: Hidden, track: Track, out: Bend) -> None:
-    """The ram (axis Z) sinks as it comes out, strength um over the full stroke, more or less with the height: -A z^2 (1 + beta y).
+    """The ram (axis Z) sinks as it extends: -A z^2 (1 + beta y), z = 0 to 1, y = -1 to 1 (height), A = ``strength`` um.
 
-    It sinks along gravity and tilts by the slope of its own curve; wild: a cubic part. Not on a machine whose Z is vertical.
+    It sinks along gravity and tilts by the slope of this curve; wild: with a cubic part. No effect on a machine whose Z is vertical.
     """
     if track.vertical == 2:
         return
@@ -53,14 +56,14 @@ WAVES = 6
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One smooth function of a position, rms 1 about its mean over the stroke, from the seed of an effect: a few long waves."""
+    """A smooth function of position, drawn from a seed as a sum of long waves, with rms 1 about its mean over the stroke."""
 
     seed: int
     low_mm: float
     high_mm: float
 
     def __call__(self, position_mm: F) -> F:
-        """Values at n positions, (n,)."""
+        """Return the values at n positions, (n,)."""
         rng = np.random.default_rng([43, self.seed])
         length = np.exp(rng.uniform(np.log(0.8), np.log(4.0), WAVES))
         size, phase = rng.normal(size=WAVES) * np.minimum(length, 2.0), rng.uniform(0.0, 2.0 * np.pi, WAVES)
@@ -73,24 +76,24 @@ class Curve:
 
 
 def curve(e: Hidden, track: Track) -> F:
-    """The effect's smooth function along its axis, (n,)."""
+    """Return the effect's smooth function along its axis, (n,)."""
     a = e.axis
     return Curve(int(e["seed"]), float(track.low_mm[a]), float(track.high_mm[a]))(track.q_mm[:, a])
 
 
 @effect("straightness")
 def straightness(e: Hidden, track: Track, out: Bend) -> None:
-    """A carriage runs off its line: strength um rms over the stroke."""
+    """A carriage deviates from a straight line by ``strength`` um rms over the stroke."""
     out.shift[e.axis, :, e.component] = e["strength"] * UM * curve(e, track)
 
 
 @effect("positioning_nonlinear")
 def positioning_nonlinear(e: Hidden, track: Track, out: Bend) -> None:
-    """An axis' scale is not a straight line: strength um rms over the stroke."""
+    """The positioning error of an axis is not linear: ``strength`` um rms over the stroke."""
     out.drive[:, e.axis] = e["strength"] * UM * curve(e, track)
 
 
 @effect("angular_error")
 def angular_error(e: Hidden, track: Track, out: Bend) -> None:
-    """A carriage pitches, rolls or yaws: strength urad rms over the stroke, a finite rotation about the carriage's pivot."""
+    """A carriage pitches, rolls or yaws about its pivot by ``strength`` urad rms over the stroke."""
     out.angle[e.axis, :, e.component] = e["strength"] * URAD * curve(e, track)

@@ -22,14 +22,14 @@ STREAM_PICK = 61
 
 
 def packaged() -> list[Path]:
-    """Scenarios that keep a secret, and the one in which nothing is hidden, by name."""
+    """Return the packaged scenarios with a hidden effect, and the one without, sorted by name."""
     return sorted(DEFAULT_PATH.parent.glob("hidden-*.toml"))
 
 
 def picked(seed: int) -> Scenario:
-    """The scenario of a seed; the machine is drawn by the same seed.
+    """Return the packaged scenario that a seed picks (see `winner`), with its machine drawn from the same seed.
 
-    Every scenario draws its own number and the highest wins: an added scenario takes over the seeds that it wins and changes no other.
+    Adding a scenario changes the pick only of those seeds that it wins.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def picked(seed: int) -> Scenario:
 
 
 def winner(seed: int, paths: list[Path]) -> Path:
-    """The scenario that this seed picks at random: each file draws a number, the highest wins."""
+    """Return the file that a seed picks: each file draws a random number, and the highest wins."""
 
     def lot(path: Path) -> float:
         return float(np.random.default_rng([STREAM_PICK, abs(seed), zlib.crc32(path.name.encode())]).random())
@@ -53,7 +53,7 @@ SENSORS = ("x", "y", "z", "spindle", "air")
 
 
 def temperatures(effects: tuple[Hidden, ...], seed: int, t_s: F) -> dict[str, F]:
-    """What the sensors at the axes, the spindle and in the air really have, degree C, (n,) each: everything warms up, guilty or not."""
+    """Return the true temperatures at the sensors of axes, spindle and air, degree C, (n,) each; all vary, even if they cause no effect."""
     rng = np.random.default_rng([44, seed])
     out: dict[str, F] = {}
     for i, name in enumerate(SENSORS[:4]):
@@ -72,7 +72,7 @@ SENSOR_NOISE_C = 0.03
 
 
 def kinds_of(count: int, kinds: Sequence[str], first: int) -> list[str]:
-    """Kinds of the cases of a suite in practice's proportions, shuffled by the seed."""
+    """Return the kinds of the cases of a suite, in the proportions of `KINDS`, shuffled by the seed ``first``."""
     shares = np.array([KINDS[k] for k in kinds], dtype=np.float64)
     wanted = count * shares / shares.sum()
     numbers = np.floor(wanted).astype(int)
@@ -84,7 +84,7 @@ def kinds_of(count: int, kinds: Sequence[str], first: int) -> list[str]:
 
 
 def make_suite(first: int, count: int, kinds: Sequence[str] = tuple(KINDS), *, wild: bool = True) -> Iterator[Case]:
-    """Cases with the seeds first, first + 1, ..., one after another."""
+    """Yield cases with the seeds ``first``, ``first + 1``, ..."""
     for i, kind in enumerate(kinds_of(count, kinds, first)):
         yield make_case(f"case{i:04d}", first + i, kind, wild=wild)
 
@@ -106,7 +106,7 @@ def _write(path: Path, data: dict[str, object]) -> None:
 
 
 def campaign(case: Case) -> dict[str, object]:
-    """The ``abbe-campaign/1`` object."""
+    """Return the ``abbe-campaign/1`` object of a case."""
     setups = {r.track.setup: {"kind": "ballbar" if r.track.kind == "bar" else "laser", "t_set_s": r.track.set_s} for r in case.runs}
     noise = case.setting.noise
     return {
@@ -121,7 +121,7 @@ def campaign(case: Case) -> dict[str, object]:
 
 
 def run_file(case: Case, run: Run, reading_mm: F) -> dict[str, object]:
-    """One ``abbe-run/1`` object."""
+    """Return the ``abbe-run/1`` object of one run."""
     track = run.track
     columns: dict[str, object] = {"t_s": _short(track.t_s, 4)}
     for a, name in enumerate(("x_mm", "y_mm", "z_mm")):
@@ -144,7 +144,7 @@ def _short(values: F, digits: int) -> list[float]:
 
 
 def sealed(case: Case, readings: dict[str, F]) -> dict[str, object]:
-    """The truth of a case, by which an answer is judged."""
+    """Return the truth of a case, by which an answer is judged."""
     noise = case.setting.noise
     seen = {r.track.setup for r in case.runs if r.role == "identify"}
     runs = {}
@@ -171,12 +171,14 @@ def _wild(effects: tuple[Hidden, ...]) -> bool:
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command line of a suite; gives the exit code."""
-    parser = argparse.ArgumentParser(prog="simulators hidden-suite", description="Sealed cases: campaigns in which effects are hidden.")
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="simulators hidden-suite", description="Write sealed cases: campaigns with hidden effects, and the truth about them."
+    )
     parser.add_argument("--first", type=int, required=True, help="seed of the first case")
-    parser.add_argument("--cases", type=int, required=True, help="how many")
-    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds, separated by commas, in practice's proportions")
-    parser.add_argument("--textbook", action="store_true", help="effects that follow the textbook exactly")
+    parser.add_argument("--cases", type=int, required=True, help="number of cases")
+    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of cases, separated by commas (default: %(default)s)")
+    parser.add_argument("--textbook", action="store_true", help="let effects follow the textbook form exactly")
     parser.add_argument("--out", type=Path, required=True, help="directory to write public/ and sealed/ into")
     options = parser.parse_args(argv)
     kinds = options.kinds.split(",")

@@ -1,4 +1,7 @@
-"""Thermal effects: states that warm up with the campaign clock (the machine was switched on at its zero) and what they move."""
+"""Thermal effects: bodies that warm up from power-on (time 0 of the campaign clock), and what they move.
+
+In the docstrings of effects, "wild" is the departure from the textbook form if `Hidden.wild` is not 0.
+"""
 
 import numpy as np
 
@@ -10,10 +13,9 @@ STEEL_PPM = 11.5
 
 
 def warmth(t_s: F, tau_s: float, *, slow_share: float = 0.0, slow_s: float = 1.0) -> F:
-    """Rise of a body heated evenly since switched on, as a part of its final rise, (n,).
+    """Return the temperature rise of a body under constant heat since power-on, as a fraction of its final rise, (n,).
 
-    Integrated from instant to instant, exactly for constant heat: each of two bodies (one with ``slow_share`` of the rise and time
-    constant ``slow_s``) goes towards 1 from where it was.
+    It is the sum of two exponential rises: one with time constant ``tau_s``, one with share ``slow_share`` and time constant ``slow_s``.
     """
     order = np.argsort(t_s, kind="stable")
     out = np.empty(len(t_s))
@@ -28,14 +30,14 @@ def warmth(t_s: F, tau_s: float, *, slow_share: float = 0.0, slow_s: float = 1.0
 
 
 def rise(e: Hidden, t_s: F) -> F:
-    """Rise of an effect's body over its final one; wild: part of it is a heavier or lighter body with another time constant."""
+    """Return the temperature rise of an effect's body as a fraction of its final rise; wild: part of it has another time constant."""
     ratio = float(np.exp(e.freedom(0.6, 1.4, 11, signed=True)))
     return warmth(t_s, e["tau_s"], slow_share=e.freedom(0.15, 0.6, 12), slow_s=e["tau_s"] * ratio)
 
 
 @effect("axis_thermal_growth")
 def axis_thermal_growth(e: Hidden, track: Track, out: Bend) -> None:
-    """The screw grows from x_fixed, final rise ``strength`` K; wild: hotter where the nut works, so the strain bends along the screw."""
+    """The screw grows from x_fixed, finally by ``strength`` K; wild: warmer where the nut works, so that the strain is uneven."""
     a = e.axis
     x = track.q_mm[:, a]
     span = track.high_mm[a] - track.low_mm[a]
@@ -46,7 +48,7 @@ def axis_thermal_growth(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("spindle_thermal_drift")
 def spindle_thermal_drift(e: Hidden, track: Track, out: Bend) -> None:
-    """Spindle and head move the tool along one direction, finally by ``strength`` um."""
+    """Spindle and head displace the tool along one axis, finally by ``strength`` um."""
     out.shift[2, :, e.axis] = e["strength"] * UM * rise(e, track.t_s)
 
 
@@ -62,7 +64,10 @@ def squareness_thermal(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("bar_thermal")
 def bar_thermal(e: Hidden, track: Track, out: Bend) -> None:
-    """The bar is ``strength`` K warm from the hand when a set-up begins: longer, so pushed in; wild: not alike every time, two bodies."""
+    """The bar is ``strength`` K too warm from the hand when a set-up begins, so it is longer and reads too little.
+
+    wild: the excess varies from set-up to set-up, and two time constants act.
+    """
     if track.kind != "bar":
         return
     hand = 1.0 + e.freedom(0.02, 0.15, 1, signed=True) * float(np.sin(track.set_s))

@@ -9,25 +9,25 @@ import numpy as np
 from abbe.simulators.arrays import F
 
 Course = Callable[[F], F]
-"""Campaign clock (n,) s to commanded positions (n, 3) mm; also a little before the start and after the end."""
+"""Maps campaign times (n,) s to commanded positions (n, 3) mm, also slightly before the start and after the end of a run."""
 DENSE_MM = 0.12
-"""Between two instants at which the motion is followed the machine moves no farther than this."""
+"""Largest travel between two instants at which the motion is followed."""
 RUN_IN_MM = 3.0
-"""A run is entered from this far ahead of its first sample, on its own course: a ball-bar has an angular overshoot."""
+"""Length of the course before the first sample of a run: a ball-bar run has an angular overshoot."""
 NEVER_MM = 1e9
 STILL_MM = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """One run, or one moment of standing.
+    """One run, or one instant at standstill.
 
     Attributes: ``kind`` "bar" or "laser"; ``setup``; ``q_mm`` (n, 3) commanded; ``t_s`` (n,); ``v_mm_s`` and ``a_mm_s2`` (n, 3);
     ``sign`` (n, 3) direction of each axis' last motion (0: standing for an unknown time); ``since_mm`` (n, 3) travel since the last
-    turn (`NEVER_MM` before the first); ``travelled_mm`` (n, 3) travel of each axis in the run; ``look`` (n, 3) unit vector that the
-    instrument looks along; ``reach_mm`` (n,) laser: nominal path since the first record, bar: zeros; ``start_s`` of the run;
-    ``set_s`` of the set-up; ``low_mm``, ``high_mm`` (3,) stroke; ``number`` of the run; ``radius_mm`` of the bar;
-    ``course`` of a moving run.
+    reversal (`NEVER_MM` before the first); ``travelled_mm`` (n, 3) travel of each axis in the run; ``look`` (n, 3) unit vector of the
+    measuring direction; ``reach_mm`` (n,) laser: nominal path since the first record, bar: zeros; ``start_s`` of the run; ``set_s`` of
+    the set-up; ``low_mm``, ``high_mm`` (3,) stroke; ``vertical`` axis; ``number`` of the run, -1 for the setting of a cup; ``radius_mm``
+    of the bar; ``course`` of a moving run.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Track:
 
     @property
     def moving(self) -> bool:
-        """Whether the machine moves while it is read: a ball-bar run or the world of the devices, not a laser that dwells."""
+        """Whether the machine moves during readings: a ball-bar run or the live world of the devices, but no laser run, which dwells."""
         return self.course is not None or self.kind == "live"
 
     @property
@@ -62,13 +62,13 @@ class Track:
         return len(self.t_s)
 
     def zeros(self) -> F:
-        """One zero per reading."""
+        """Return one zero per reading."""
         return np.zeros(self.n)
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """State of an axis at n times, from its motion up to each of them: the arrays that `Track` has under the same names."""
+    """State of the axes at n times, which their motion up to each time determines; arrays as in `Track`."""
 
     sign: F
     since_mm: F
@@ -76,9 +76,9 @@ class History:
 
 
 def history(dense_mm: F, at: np.ndarray, rest: F) -> History:
-    """Follow a dense course (m, 3) and look at its instants ``at`` (n,).
+    """Follow a dense course (m, 3) mm and return the state at its indices ``at`` (n,).
 
-    Before an axis moves it counts as going the way it will go; one that stands all the time still leans the way ``rest`` (3,) it came.
+    Before its first motion an axis has the direction of that motion; an axis that never moves has the direction ``rest`` (3,).
     """
     step = np.diff(dense_mm, axis=0)
     sign, since, travelled = (np.zeros((len(at), 3)) for _ in range(3))
@@ -90,7 +90,7 @@ def history(dense_mm: F, at: np.ndarray, rest: F) -> History:
 
 
 def _axis(step_mm: F, rest: float) -> tuple[F, F, F]:
-    """Direction, travel and travel at the last turn after each of the m - 1 steps (m values; the first is the start)."""
+    """Return direction, travel, and travel at the last reversal, at the start and after each of the m - 1 steps, (m,) each."""
     way = np.where(np.abs(step_mm) > 1e-9, np.sign(step_mm), 0.0)
     moved = np.flatnonzero(way)
     walked = np.concatenate([[0.0], np.cumsum(np.abs(step_mm))])
@@ -106,10 +106,10 @@ def _axis(step_mm: F, rest: float) -> tuple[F, F, F]:
 
 
 def follow(drive_mm: F, half_mm: F) -> F:
-    """Play operator along one axis: drive positions (m,), half widths (m,) mm; where the carriage stands (m,) mm.
+    """Return the carriage positions (m,) mm of one axis with play, from drive positions (m,) and half widths (m,) of the play, mm.
 
-    The carriage starts out pushed by the first motion. Between two turns of the drive it is either left where it is or pushed along:
-    going up it stands at the larger of where it was and drive - half, going down at the smaller of where it was and drive + half.
+    The first motion pushes the carriage from the start. Between two reversals of the drive the carriage rests or is pushed along: upwards
+    it is at the larger of its last position and drive - half, downwards at the smaller of its last position and drive + half.
     """
     step = np.diff(drive_mm)
     moved = np.flatnonzero(np.abs(step) > 1e-9)
@@ -132,7 +132,7 @@ def follow(drive_mm: F, half_mm: F) -> F:
 
 
 def dense_times(track: Track) -> tuple[F, np.ndarray]:
-    """Instants at which a moving run is followed, from ahead of its start, and the index of each sample among them."""
+    """Return the instants at which a moving run is followed, from `RUN_IN_MM` before its start, and the index of each sample in them."""
     feed = track.feed_mm_min / 60.0
     step_s = float(np.median(np.diff(track.t_s)))
     parts = max(1, int(np.ceil(step_s * feed / DENSE_MM)))
@@ -142,7 +142,7 @@ def dense_times(track: Track) -> tuple[F, np.ndarray]:
 
 
 def carriage_mm(track: Track, axis: int, half: Callable[[F], F]) -> F:
-    """Where lost motion leaves an axis, minus where it was sent, (n,) mm; ``half``: half width as a function of the position."""
+    """Return the displacement of an axis by lost motion, (n,) mm; ``half``: half width of the play as a function of the position."""
     if track.course is None:
         if track.kind == "bar":
             return np.zeros(track.n)  # one instant: the approach is unknown

@@ -1,1 +1,1 @@
-"""Packaged scenarios (TOML): which machine stands there, how wrong it may be, and how it is reached."""
+"""Packaged scenarios (TOML): the machine, how large its errors may be, and how its devices are reached."""

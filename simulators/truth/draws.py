@@ -1,4 +1,4 @@
-"""The seeded draw of everything that is fixed for one machine and one set of instruments.
+"""Seeded random draw of all parameters that are fixed for one machine and one set of instruments.
 
 Error motions are smooth random functions of one axis position: cosines of incommensurable wavelengths plus a few Gaussian bumps, neither
 polynomials nor splines, so that no identification whose basis is one of those can be exactly right.
@@ -23,7 +23,7 @@ class FunctionSet:
     """Several smooth functions of one position, evaluated together.
 
     Attributes: ``amplitude``, ``wavenumber`` (rad/mm), ``phase`` of shape (m, FEATURES); ``height``, ``centre_mm``,
-    ``width_mm`` of shape (m, BUMPS); ``offset`` and ``slope_per_mm`` of shape (m,), a line added on top, about ``start_mm``.
+    ``width_mm`` of shape (m, BUMPS); ``offset`` and ``slope_per_mm`` of shape (m,): a line added to them, with its origin at ``start_mm``.
     """
 
     amplitude: F
@@ -51,8 +51,8 @@ class FunctionSet:
 def draw(rng: np.random.Generator, stroke_mm: tuple[float, float], rms: F, slope_per_mm: F) -> FunctionSet:
     """Draw m functions over a stroke.
 
-    ``rms`` (m,) is the root mean square of each over the stroke after its own least-squares line is removed;
-    ``slope_per_mm`` (m,) the slope of a line then added (zero at the start of the stroke). Units of the result are those of ``rms``.
+    ``rms`` (m,): root mean square of each over the stroke after removal of its own least-squares line; ``slope_per_mm`` (m,): slope of a
+    line then added, zero at the start of the stroke. The functions have the unit of ``rms``.
     """
     low, high = stroke_mm
     span = high - low
@@ -73,7 +73,7 @@ def draw(rng: np.random.Generator, stroke_mm: tuple[float, float], rms: F, slope
 
 
 def _normalised(raw: FunctionSet, grid_mm: F, rms: F, slope_per_mm: F) -> FunctionSet:
-    """Scale each function to its rms about its own line, take that line away and add the wanted slope."""
+    """Scale each function to its rms about its own least-squares line, remove that line and add the wanted slope."""
     values = raw(grid_mm)
     design = np.stack([np.ones_like(grid_mm), grid_mm - raw.start_mm], axis=1)
     line, *_ = np.linalg.lstsq(design, values, rcond=None)
@@ -99,7 +99,7 @@ STREAM_TRUTH, STREAM_CUP, STREAM_BAR_NOISE, STREAM_MIRROR, STREAM_LASER_NOISE, S
 
 
 def generator(seed: int, *stream: int) -> np.random.Generator:
-    """Return the generator of one purpose (and, with more numbers, of one event of it)."""
+    """Return the random generator of one purpose, ``stream[0]``, and, with more numbers, of one event of that purpose."""
     return np.random.default_rng([seed, *stream])
 
 
@@ -107,8 +107,8 @@ def generator(seed: int, *stream: int) -> np.random.Generator:
 class Draws:
     """The machine's and the instruments' true parameters: mm, rad, s.
 
-    ``motions`` holds per carriage X, Y, Z a set of six functions of its position: EX, EY, EZ (mm), EA, EB, EC (rad); scale is in
-    the positioning function, squareness is not in the straightness functions. ``squareness`` = C0Y, B0Z, A0Z.
+    ``motions`` holds per carriage X, Y, Z a set of six functions of its position: EX, EY, EZ (mm), EA, EB, EC (rad). The positioning
+    function includes the scale; the straightness functions do not include squareness. ``squareness`` = C0Y, B0Z, A0Z.
     """
 
     seed: int
@@ -195,7 +195,7 @@ def describe(draws: Draws) -> dict[str, object]:
 
 
 def _named(values: F, unit: float, kinds: str, *, skip_own: bool = False) -> dict[str, float]:
-    """Name a (3, 3) block as E + kind + axis."""
+    """Return the values of a (3, 3) block (axis, kind) by names E + kind + axis, in ``unit``."""
     return {
         f"E{kind}{axis}": round(float(values[a, k]) / unit, 4)
         for a, axis in enumerate(AXES)

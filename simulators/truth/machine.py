@@ -11,7 +11,7 @@ from abbe.simulators.truth.draws import Draws
 
 
 class Geometry:
-    """The nominal machine as arrays: ``low_mm``, ``high_mm``, ``tool_mm`` (3,), ``pivots_mm`` (3, 3), sides as axis indices."""
+    """The nominal machine: ``low_mm``, ``high_mm``, ``tool_mm`` (3,), ``pivots_mm`` (3, 3); axes of ``work_side`` and ``tool_side``."""
 
     def __init__(self, config: MachineConfig) -> None:
         self.work_side, self.tool_side = parse_chain(config.chain)
@@ -23,7 +23,7 @@ class Geometry:
 
 
 class Machine:
-    """How the machine really stands: position of the tool in workpiece coordinates as a function of the axis positions."""
+    """The true machine: actual position of the tool in workpiece coordinates as a function of the axis positions."""
 
     def __init__(self, geometry: Geometry, draws: Draws) -> None:
         self.geometry = geometry
@@ -33,7 +33,7 @@ class Machine:
 
     def motions(self, axis: int, position_mm: F) -> tuple[F, F]:
         """Translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""
-        new = np.diff(position_mm, prepend=np.nan) != 0.0  # an axis that stands, sample for sample, is worked out once
+        new = np.diff(position_mm, prepend=np.nan) != 0.0  # evaluate repeated positions of a resting axis once
         values = self.draws.motions[axis](position_mm[new])[np.cumsum(new) - 1]
         shift = values[:, :3].copy()
         shift[:, axis] += self.extra_scale[axis] * (position_mm - self.geometry.low_mm[axis])
@@ -66,7 +66,7 @@ class Machine:
 
 
 def rotate(angle_rad: F, vector: F) -> F:
-    """Turn n vectors by n rotation vectors (right-handed, Rodrigues): both (n, 3)."""
+    """Rotate n vectors by n rotation vectors (right-handed, Rodrigues): both (n, 3)."""
     square = np.einsum("ij,ij->i", angle_rad, angle_rad)
     first, second = _factors(square)
     once = _cross(angle_rad, vector)
@@ -75,7 +75,7 @@ def rotate(angle_rad: F, vector: F) -> F:
 
 
 def _factors(square: F) -> tuple[F, F]:
-    """sin(theta) / theta and (1 - cos(theta)) / theta^2 from theta^2; three terms of their series hold all digits below 0.01 rad."""
+    """Return sin(theta) / theta and (1 - cos(theta)) / theta^2 from theta^2; below 0.01 rad three terms of the series are exact."""
     if square.size and square.max() < 1e-4:
         return 1.0 - square / 6.0 * (1.0 - square / 20.0), 0.5 - square / 24.0 * (1.0 - square / 30.0)
     theta = np.sqrt(square)
@@ -83,7 +83,7 @@ def _factors(square: F) -> tuple[F, F]:
 
 
 def _cross(a: F, b: F) -> F:
-    """Cross product of rows; numpy's own is several times slower on short arrays."""
+    """Return the cross product of rows; numpy's own function is several times slower on short arrays."""
     out = np.empty(b.shape)
     out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
@@ -94,8 +94,8 @@ def _cross(a: F, b: F) -> F:
 class Play:
     """Three independent play operators with memory.
 
-    An axis with lost motion B, moving in direction s, stands at drive position - s B/2; after a reversal it rests until the drive
-    has taken up the whole of B.
+    An axis with lost motion B that moves in direction s is at drive position - s B/2; after a reversal it rests until the drive has
+    travelled B.
     """
 
     def __init__(self, backlash_mm: F, start_mm: F) -> None:
@@ -113,7 +113,7 @@ class Play:
 
     @staticmethod
     def _run_axis(drive_mm: F, half_mm: float, start_mm: float) -> F | float:
-        """One axis; a drive that stays within the play leaves the axis where it is."""
+        """Follow the drive of one axis; while the drive stays within the play, the axis rests."""
         if float(drive_mm.max()) - half_mm <= start_mm <= float(drive_mm.min()) + half_mm:
             return start_mm
         position = start_mm

@@ -1,4 +1,4 @@
-"""What changes by itself with time: thermal drift of the machine and the air the laser measures in."""
+"""What changes with time: thermal drift of the machine, and the air in which the laser measures."""
 
 from dataclasses import dataclass
 
@@ -35,10 +35,10 @@ class Air:
         self._period_s = 60.0 * rng.uniform(20.0, 90.0, 3)
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 3)
         self.warmer_c = 0.0
-        """Added to the temperature: the gate of the shop was opened."""
+        """K, added to the temperature, e.g. after the shop gate was opened."""
 
     def at(self, time_s: float) -> AirState:
-        """State of the air; refractivity by the shop-floor form of the Edlén equation (NIST, engineering metrology toolbox)."""
+        """Return the state of the air; refractivity by the shop-floor form of the Edlén equation (NIST, engineering metrology toolbox)."""
         angle = 2.0 * np.pi * time_s / self._period_s + self._phase
         temperature, pressure, humidity = (float(v) for v in self._middle + self._swing * np.sin(angle))
         temperature += self.warmer_c

@@ -207,7 +207,7 @@ def test_one_more_scenario_changes_only_the_seeds_that_it_wins() -> None:
     ("table", "said"),
     [
         ({"name": "gremlins"}, "hidden.name: 'gremlins': unknown effect"),
-        ({"name": "clamp_slip", "parameters": {"strength": 3.0}}, "devices do not know"),
+        ({"name": "clamp_slip", "parameters": {"strength": 3.0}}, "simulated devices do not support"),
         ({"name": "lateral_play", "key": "EYX"}, "needs strength"),
         ({"name": "lateral_play", "key": "Q", "parameters": {"strength": 3.0}}, "'Q' is not a key of lateral_play"),
         ({"name": "lateral_play", "parameters": {"strength": "much"}}, "hidden.parameters"),
