@@ -72,7 +72,7 @@ async def test_a_run_that_was_cut_off_before_and_after_the_recovery(url: str) ->
         recover_segments(store, SMALL)
     (told,) = json.loads(tell("runs", "--db", url, "--json"))
     assert told["status"] == "interrupted"
-    assert "recorded to its end (complete), but the process ended before the database knew" in told["reason"]
+    assert "recorded to its end (complete), but the process ended before the database was updated" in told["reason"]
     assert "samples 50 to 59" in tell("show", "r01", "--db", url)
 
 

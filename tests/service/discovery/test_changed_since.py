@@ -133,7 +133,7 @@ def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(s
     gap = found.gap
     assert gap is not None
     assert gap.after_um < gap.floor_um + 0.1 * (gap.before_um - gap.floor_um)
-    assert any("on runs that did not choose it the gap shrinks from" in line for line in changed_lines(found))
+    assert any("on runs that did not choose the change the gap shrinks from" in line for line in changed_lines(found))
 
 
 def test_without_a_change_what_could_hide_is_told(store: Store, tmp_path: Path) -> None:

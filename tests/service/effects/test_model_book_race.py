@@ -215,7 +215,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, url: str, monkeypatch: 
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert len(lines) == 1
     assert lines[0].startswith("error DIS-004: discovery 1: machine 'VMC-1' has model version 1 now")
-    assert lines[0].endswith("what was found stays in discovery 1")
+    assert lines[0].endswith("the finding stays in discovery 1")
 
 
 def test_a_book_of_another_geometry_is_not_used_and_yet_it_is_what_a_version_comes_after(tmp_path: Path, pair: tuple[Store, Store]) -> None:
