@@ -51,14 +51,14 @@ TIME_UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
 
 
 def time_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Flags of runs whose clocks disagree, whose t_s does not fit their feed, or which overlap other runs."""
+    """Return flags of runs whose clocks disagree, whose t_s does not fit their feed, or which overlap other runs."""
     out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
     known = {f.run for f in out}
     return out + _overlaps([r for r in runs if r.run_id not in known])
 
 
 def _clocks(run: Run) -> list[CampaignIssue]:
-    """The disagreement of a run's clocks, if any (`abbe.service.runs.sample_columns`)."""
+    """Return the disagreement of a run's clocks, if any (`abbe.service.runs.sample_columns`)."""
     trouble = run.timing.trouble
     return [CampaignIssue(run.run_id, trouble, "look at the sync cable and the links, then measure it again", False)] if trouble else []
 
@@ -82,7 +82,7 @@ def _against_feed(run: Run) -> list[CampaignIssue]:
 
 
 def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Runs whose times overlap; the run with the most overlaps is flagged and removed until none remains."""
+    """Flag runs whose times overlap: repeatedly the run with the most overlaps, which is then left out, until none remains."""
     spans = {r.run_id: (float(r.columns.t_s[0]), float(r.columns.t_s[-1])) for r in runs if len(r.columns)}
     spans = {k: v for k, v in spans.items() if np.isfinite(v).all()}
     meets = {k: [m for m in spans if m != k and _share(spans[k], spans[m]) > OVERLAP] for k in spans}
@@ -100,7 +100,7 @@ def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
 
 
 def _share(a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Common time of two spans as a share of the shorter one."""
+    """Return the common time of two spans as a share of the shorter one."""
     shorter = min(a[1] - a[0], b[1] - b[0])
     return (min(a[1], b[1]) - max(a[0], b[0])) / shorter if shorter > 0.0 else 0.0
 
@@ -117,7 +117,7 @@ NOTHING_MM = 1e-9
 
 
 def copy_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Issues of runs whose readings occur in an earlier run, regardless of their labels.
+    """Return issues of runs whose readings occur in an earlier run, regardless of their labels.
 
     If the readings show noise, equal readings are a copy whatever their times. Repeats with a coarse sensor can be equal without noise:
     there a copy must also have the same times.
@@ -134,13 +134,13 @@ def copy_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
 
 
 def _copied(one: Counter[Any], other: Counter[Any]) -> bool:
-    """Whether nearly all rows of the shorter one occur in the other, equally often."""
+    """Whether nearly all rows of the shorter run occur in the other, equally often."""
     shorter = min(one.total(), other.total())
     return shorter > 0 and (one & other).total() >= COPIED_SHARE * shorter
 
 
 def _rows(run: Run) -> Counter[Any]:
-    """Position and deviation of every reading, in 10 nm and 0.01 nm; empty for a run with constant deviations."""
+    """Count the readings by position and deviation, in steps of 10 nm and 0.01 nm; empty for a run with constant deviations."""
     y = run.columns.readings_mm
     if y.size == 0 or not np.isfinite(y).all() or float(np.ptp(y)) == 0.0:
         return Counter()
@@ -149,7 +149,7 @@ def _rows(run: Run) -> Counter[Any]:
 
 
 def _timed(run: Run, rows: Counter[Any]) -> Counter[Any]:
-    """Time, ms, and deviation of every reading."""
+    """Count the readings by time, ms, and deviation."""
     columns = run.columns
     return Counter(zip(np.rint(columns.t_s * 1e3).tolist(), columns.readings_mm.tolist(), strict=True)) if rows else rows
 
@@ -210,7 +210,7 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
 
 
 def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Issues that need no model: machine, geometry, units, times, copies, too few readings.
+    """Return issues that need no model: machine, geometry, units, times, copies, too few readings.
 
     ``machine``: the campaign's machine object; ``runs``: with readings.
     """
@@ -222,7 +222,7 @@ def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
 
 
 def _nothing_measured(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Runs with constant readings: refused if all runs are constant, otherwise flagged."""
+    """Return issues of runs with constant readings: refused if all runs are constant, otherwise flagged."""
     still = [r.run_id for r in runs if _constant(r)]
     if not still:
         return []
@@ -238,7 +238,7 @@ def _constant(run: Run) -> bool:
 
 
 def geometry_issues(machine: Doc, run: Run) -> list[CampaignIssue]:
-    """Issues of a run whose points do not lie where its set-up says, or not inside the strokes."""
+    """Return the issues of a run whose points do not lie where its set-up says, or outside the strokes."""
     what = geometry_mistake(machine, run)
     return [CampaignIssue(run.run_id, what.text, what.remedy, what.refuse)] if what else []
 
@@ -277,7 +277,7 @@ def _short(value: Any) -> str:
 
 
 def _readings(run: Run) -> list[CampaignIssue]:
-    """Issues of times, size and number of one run's readings."""
+    """Return the issues of times, size and number of one run's readings."""
     label, y, t, valid = run.run_id, run.columns.readings_mm, run.columns.t_s, run.columns.valid
     if not (np.isfinite(y[valid]).all() and np.isfinite(t).all()):
         return [
@@ -292,7 +292,7 @@ def _readings(run: Run) -> list[CampaignIssue]:
 
 
 def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[CampaignIssue]:
-    """Impossible deviations: most of them mean another unit, some a lost beam or bar; robust weights handle single ones."""
+    """Return the issue of too large deviations: many mean another unit, some a lost beam or bar; robust weights handle single ones."""
     size = np.where(valid, np.abs(y), 0.0)
     count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
     if largest > NO_READING_MM:
@@ -306,7 +306,7 @@ def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> 
         return [CampaignIssue(label, f"deviations up to {largest:.3g} mm: they look like µm", "write deviation_mm in mm", True)]
     if count > max(SPIKES * of, 1):
         what = f"{count} of {of} readings are beyond {LARGEST_MM:g} mm, up to {largest:.3g} mm: µm, or the bar or the beam was lost"
-        return [CampaignIssue(label, what, "write deviation_mm in mm, or mark what was lost with valid 0", True)]
+        return [CampaignIssue(label, what, "write deviation_mm in mm, or mark the lost readings with valid 0", True)]
     return []
 
 
@@ -319,13 +319,14 @@ def _too_few(run: Run, count: int) -> list[CampaignIssue]:
     if not 10 <= count < wanted:
         return []
     what = (
-        f"only {count} valid readings on {turns:g} turns: cup, bar length and lost motion take most of what they tell ({wanted} are needed)"
+        f"only {count} valid readings on {turns:g} turns ({wanted} are needed): "
+        "cup, bar length and lost motion use up most of their information"
     )
     return [CampaignIssue(run.run_id, what, "measure it again with a higher rate", False)]
 
 
 def check_readings(machine: Machine, data: Sequence[RunData]) -> list[CampaignIssue]:
-    """Issues of runs whose readings contradict the other runs (`abbe.models.solvers.plausibility.suspects`)."""
+    """Return issues of runs whose readings contradict the other runs (`abbe.models.solvers.plausibility.suspects`)."""
     found = suspects(machine, data)
     return [_suspect(s, single=len(found) == 1) for s in found]
 
@@ -341,7 +342,7 @@ def _suspect(s: SuspectRun, *, single: bool) -> CampaignIssue:
     if single and gross:
         what = f"fits none of the other runs ({_misfit(s)}), which fit each other: another machine, tool or table"
         return CampaignIssue(s.run, what, "leave it out (--without), or measure it again", True)
-    what = f"does not fit the other runs ({_misfit(s)}): the machine changed, or its set-up or tool is not what it says"
+    what = f"does not fit the other runs ({_misfit(s)}): the machine changed, or its set-up or tool is not as stated"
     return CampaignIssue(s.run, what, "look at its residuals; measure it again, or leave it out (--without)", False)
 
 

@@ -1,4 +1,4 @@
-"""Load a campaign from the store, or from a folder with campaign.json, which is read, checked and, on request, stored."""
+"""Load a campaign from the store, or read and check a folder with campaign.json; store its solutions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Campaign:
     removed: TableRemoval | None = None
 
     def without(self, labels: list[str]) -> Campaign:
-        """The campaign without the named runs.
+        """Return the campaign without the named runs.
 
         Raises
         ------
@@ -58,14 +58,14 @@ def from_folder(folder: Path) -> Campaign:
     Raises
     ------
     FileFormatError
-        For the first mistake in any file.
+        A file has a mistake; the first one is reported.
     """
     content = read_folder(folder)
     return _campaign(content.campaign["campaign"], content.campaign, content.runs, folder)
 
 
 def from_store(store: Store, name: str) -> Campaign:
-    """A campaign of the store with its complete runs.
+    """Return a campaign of the store with its complete runs.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
 
 
 def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: dict[str, int]) -> None:
-    """Refuse unless the stored campaign has the same machine, readings and set-ups: solutions refer to its runs."""
+    """Refuse unless the stored campaign has the same machine, readings and set-ups, because solutions refer to its runs."""
     differs = None
     there = {r.run_id: r for r in with_earliest_mounting([load_run(store, number) for number in ids.values()])}
     if machine_digest(machine_from_doc(machine)) != machine_digest(campaign.site.machine):
@@ -145,5 +145,5 @@ def _check_same(store: Store, campaign: Campaign, machine: dict[str, Any], ids: 
     if differs is not None:
         what = differs if differs.endswith("there") else f"{differs} differs"
         raise CampaignRefused(
-            f"the store has another campaign {campaign.name!r}: {what}", "rename the folder's campaign, or use another --db"
+            f"the store has a different campaign {campaign.name!r}: {what}", "rename the folder's campaign, or use another --db"
         )

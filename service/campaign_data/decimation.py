@@ -15,13 +15,13 @@ MOST_READINGS = 20000
 FEWEST = 3
 """A run of fewer blocks stays unchanged: one or two values would not describe its path."""
 GAP = 1.5
-"""Ratio of a block's duration to the median from which readings are missing."""
+"""A block that lasts longer than this multiple of the median duration lacks readings."""
 STILL_MM = 1e-6
 """An axis that moves less than this from one reading to the next stands still."""
 
 
 def lines_of(made: FoundThinning) -> tuple[str, ...]:
-    """Lines about the decimation: what was done, what it hides, and the remedy."""
+    """Describe the decimation: what was done, what it hides, and the remedy."""
     each, means = made.readings_per_value, made.how == "means"
     became = f"every {each} of them were averaged" if means else f"one of every {each} was used, unaveraged"
     done = f"{made.readings} ball-bar readings are too many to search one by one: {became}, {made.kept} values in all"
@@ -30,28 +30,28 @@ def lines_of(made: FoundThinning) -> tuple[str, ...]:
 
 
 def _unobservable(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
-    """What the decimated runs cannot show, one sentence each.
+    """Tell what the decimated runs cannot show, one sentence each.
 
-    ``each``: readings per value; ``interval_s``: from value to value; ``turning``: number of values in whose readings an axis reverses.
+    ``each``: readings per value; ``interval_s``: time between values; ``turning``: number of values in whose readings an axis reverses.
     """
     highest_hz = 0.5 / interval_s  # Nyquist
     if means:
         # A spike as long as one interval usually spans two values; one as long as two intervals fills a value wherever it begins.
-        spikes = f"a spike at a reversal keeps its height from {2.0 * interval_s:.2g} s on, one of a single reading is 1/{each} as high"
-        sides = f"in {turning} means an axis reverses, and both sides of its lost motion are mixed there"
+        spikes = f"a spike at a reversal keeps its height if it lasts {2.0 * interval_s:.2g} s, one of a single reading is 1/{each} as high"
+        sides = f"{turning} means span a reversal of an axis and mix both sides of its lost motion"
         fast = f"vibration above {highest_hz:.2g} Hz is averaged down, or looks like a slower one"
     else:
         spikes = f"a spike at a reversal that lasts less than {interval_s:.2g} s may lie between two values"
-        sides = f"{turning} values stand for readings in which an axis reverses; its lost motion there is not seen"
+        sides = f"{turning} values replace readings in which an axis reverses; the lost motion there is not seen"
         fast = f"vibration above {highest_hz:.2g} Hz looks like a slower one, or like noise"
     return [spikes, sides, fast]
 
 
-REMEDY = f"to see it, search fewer runs (--without RUN): up to {MOST_READINGS} ball-bar readings are searched as they were read"
+REMEDY = f"to see them, search fewer runs (--without RUN): up to {MOST_READINGS} ball-bar readings are searched without averaging"
 
 
 def thinning(before: list[Run], after: list[Run]) -> FoundThinning | None:
-    """The effect of `thinned` or `picked` on runs, given the same runs in the same order before and after; None if unchanged."""
+    """Describe the effect of `thinned` or `picked`, given the same runs in the same order before and after; None if unchanged."""
     pairs = [(b, a) for b, a in zip(before, after, strict=True) if _measured_bar(b)]
     changed = [(b, a) for b, a in pairs if len(a.columns) < len(b.columns)]
     if not changed:
@@ -74,19 +74,19 @@ def thinning(before: list[Run], after: list[Run]) -> FoundThinning | None:
 
 
 def _step(before: Run, after: Run) -> int:
-    """Number of readings from one picked value to the next."""
+    """Return the number of readings from one picked value to the next."""
     first, second = np.searchsorted(before.columns.t_s, after.columns.t_s[:2])
     return int(second - first)
 
 
 def _finite(run: Run) -> F1:
-    """The finite readings; a flagged one may be NaN."""
+    """Return the finite readings; a flagged reading may be NaN."""
     values = run.columns.readings_mm
     return np.asarray(values[np.isfinite(values)])
 
 
 def _turning(run: Run, each: int) -> int:
-    """Number of blocks of ``each`` readings inside which an axis reverses."""
+    """Return the number of blocks of ``each`` readings inside which an axis reverses."""
     inside: set[int] = set()
     for step in np.diff(run.columns.q_mm, axis=0).T:
         moving = np.flatnonzero(np.abs(step) > STILL_MM)
@@ -96,7 +96,7 @@ def _turning(run: Run, each: int) -> int:
 
 
 def thinned(runs: list[Run]) -> list[Run]:
-    """Runs with as many ball-bar readings as a search can process.
+    """Average the runs so that a search can process their ball-bar readings.
 
     Every measured ball-bar run is averaged over the same number of neighbours, so that the noise of a value is the same in all of them.
     Laser runs have one reading per position and stay unchanged. So do sealed runs, because each of their readings is predicted. An
@@ -109,7 +109,7 @@ def thinned(runs: list[Run]) -> list[Run]:
 
 
 def picked(runs: list[Run], most: int) -> list[Run]:
-    """Runs with about ``most`` measured ball-bar readings: the middle reading of every block, unchanged.
+    """Pick about ``most`` measured ball-bar readings: the middle one of every block, unchanged.
 
     Means have less noise, but a mean over a reversal mixes both sides, and lost motion or friction well above the noise then matches no
     formula. A run shorter than `FEWEST` blocks stays unchanged.
@@ -130,9 +130,9 @@ def _measured_bar(run: Run) -> bool:
 
 
 def _means(run: Run, block: int) -> Run:
-    """One value per block at its middle reading: the mean of the readings minus their nominal values, plus the nominal value there.
+    """Average each block to one value at its middle reading: the mean deviation from the nominal readings, plus the nominal reading there.
 
-    Without the nominal values, the mean of points on a sphere would lie inside it. A block with a gap in time is dropped.
+    Without the nominal readings, the mean of points on a sphere would lie inside it. A block with a gap in time is dropped.
     """
     columns = run.columns
     count = len(columns) // block
@@ -154,6 +154,6 @@ def _means(run: Run, block: int) -> Run:
 
 
 def _nominal_mm(run: Run) -> F1:
-    """Reading of the bar on a perfect machine at the commanded points, mm: a path of chords runs slightly inside its sphere."""
+    """Return the readings of the bar on a perfect machine, mm: not zero, because a path of chords runs slightly inside its sphere."""
     away = np.linalg.norm(run.columns.q_mm - run.bar.centre_mm, axis=1)
     return np.asarray(away - run.bar.radius_mm)

@@ -24,7 +24,7 @@ SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
 
 
 def run_digest(run: Run) -> str:
-    """SHA-256 of test, set-up and the columns that a solution uses; label and campaign do not count."""
+    """Return the SHA-256 of test, set-up and the columns that a solution uses; label and campaign do not count."""
     out = hashlib.sha256(json.dumps([run.test, run.setup.document], sort_keys=True).encode())
     columns = run.columns.by_name()
     for name in SETUP_OF_DATA:
@@ -35,26 +35,26 @@ def run_digest(run: Run) -> str:
 
 
 def with_changed_readings(run: Run, deviation_mm: F1, removed: str) -> Run:
-    """The run with new readings, the digest of its measured data, and a description of what was subtracted."""
+    """Return the run with new readings, the digest of its measured data, and a description of what was subtracted."""
     changed = run.with_readings(deviation_mm)
     return replace(changed, measured_digest=measured_digest(run), subtracted=(*run.subtracted, removed))
 
 
 def measured_digest(run: Run) -> str:
-    """`run_digest` of the measured data, before any subtraction."""
+    """Return the `run_digest` of the measured data, before any subtraction."""
     return run.measured_digest or run_digest(run)
 
 
 def removals_of(runs: list[Run]) -> list[str]:
-    """Descriptions of everything that was subtracted from the readings, without duplicates."""
+    """Describe everything that was subtracted from the readings, without duplicates."""
     return sorted({text for run in runs for text in run.subtracted})
 
 
 def whole_run_digest(run: Run) -> str:
-    """SHA-256 of everything that a search can use of a run: label, test, role, machine, set-up and all columns.
+    """Return the SHA-256 of everything that a search can use of a run: label, test, role, machine, set-up and all columns.
 
-    For changed readings the digest of the measured ones and the descriptions of what was subtracted count, because the subtracted values
-    may differ in the last digit between computers.
+    Changed readings enter by the digest of the measured ones and the descriptions of what was subtracted, because the subtracted values may
+    differ in the last digit between computers.
     """
     out = hashlib.sha256(json.dumps([run.run_id, run.test, run.role, run.machine, run.setup.document], sort_keys=True).encode())
     if run.measured_digest:
@@ -66,7 +66,7 @@ def whole_run_digest(run: Run) -> str:
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """SHA-256 of the file that defines a function, so that an edited plug-in counts as another one; of the module name without a file."""
+    """Return the SHA-256 of a function's file, so that an edited plug-in counts as another one; without a file, of its module name."""
     inner = getattr(function, "func", function)  # functools.partial
     name = str(getattr(inner, "__module__", type(inner).__module__))
     file = getattr(sys.modules.get(name), "__file__", None)
@@ -74,7 +74,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def machine_digest(machine: Machine) -> str:
-    """SHA-256 of the geometry: chain, strokes, pivots, tool. The machine's name does not count."""
+    """Return the SHA-256 of the geometry: chain, strokes, pivots, tool. The machine's name does not count."""
     out = hashlib.sha256(machine.chain.encode())
     for values in (machine.stroke_mm, machine.pivots_mm, machine.tool_mm):
         out.update((np.asarray(values, dtype="<f8") + 0.0).tobytes())  # + 0.0: minus zero is zero
@@ -82,12 +82,12 @@ def machine_digest(machine: Machine) -> str:
 
 
 def campaign_digest(digests: dict[str, str], model: str, machine: str) -> str:
-    """SHA-256 of all runs in any order, the model, and the machine (`machine_digest`); equal for repeated solutions of a campaign."""
+    """Return the SHA-256 of all runs in any order, the model and the machine's digest; equal for repeated solutions of a campaign."""
     return hashlib.sha256("\n".join([model, machine, *sorted(digests.values())]).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
-    """Versions of Abbe, NumPy and SciPy, and Abbe's revision if known."""
+    """Return the versions of Abbe, NumPy and SciPy, and Abbe's revision if known."""
     out = {name: _version(name) for name in ("abbe", "numpy", "scipy")}
     found = revision()
     return out if found is None else out | {"revision": found}
@@ -100,7 +100,7 @@ def _version(package: str) -> str:
 
 @cache
 def revision() -> str | None:
-    """Commit of the sources, installed from a repository or in a work tree; None for a plain package. Git is asked once per process.
+    """Return the commit of the sources, installed from a repository or in a work tree; None for a plain package. Cached per process.
 
     The suffix ``+changes`` marks a work tree whose program differs from its commit.
     """

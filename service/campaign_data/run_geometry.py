@@ -1,6 +1,6 @@
 """Check that the commanded positions of a run lie where its set-up says: on the sphere, in the plane, on the line, inside the strokes.
 
-If not, the usual mistakes are tried (inches, micrometres, metres, exchanged columns), and the one that explains the positions is named.
+If not, the check tries the usual mistakes (inches, micrometres, metres, exchanged columns) and names the one that explains the positions.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class GeometryMistake:
 
 
 def geometry_mistake(machine: Doc, run: Run) -> GeometryMistake | None:
-    """The first mistake in the geometry of a run; None without one. Missing keys are not checked."""
+    """Return the first mistake in the geometry of a run, or None. Missing keys are not checked."""
     points, setup = run.columns.q_mm, run.setup
     if not np.isfinite(points).all():
         return GeometryMistake("a position is not a finite number", "correct x_mm, y_mm, z_mm")
@@ -115,7 +115,9 @@ def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None
         return GeometryMistake(f"axis is {setup.axis}, but start_mm and end_mm differ in {moved}", "correct axis, start_mm or end_mm")
     letters = setup.diagonal if test == "laser_diagonal" else ""
     if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True) if s):  # a face diagonal leaves one axis alone
-        return GeometryMistake(f"diagonal is {letters}, but start_mm and end_mm run otherwise", "correct diagonal, start_mm or end_mm")
+        return GeometryMistake(
+            f"diagonal is {letters}, but the line from start_mm to end_mm is another", "correct diagonal, start_mm or end_mm"
+        )
     step, count = setup.increment_mm, setup.steps
     allowed = TOLERANCE_MM + 2.0 * setup.overrun_mm  # the ends are the turning points
     if step is not None and step.ndim and count and float(np.abs(step * count - span).max()) > allowed:
@@ -166,9 +168,11 @@ def _explained(points: F2, place: str, off: Distance) -> GeometryMistake | None:
     for order in permutations(range(3)):
         if order != (0, 1, 2) and off(points[:, order]) < TOLERANCE_MM:
             moved = [f"{AXES[k]}_mm" for k in range(3) if order[k] != k]
-            return GeometryMistake(f"{place}: columns {' and '.join(moved)} are exchanged", "put the columns right")
+            return GeometryMistake(f"{place}: columns {' and '.join(moved)} are exchanged", "correct the order of the columns")
     return None
 
 
 def _unexplained(place: str, keys: str) -> GeometryMistake:
-    return GeometryMistake(f"{place}: {keys} or the positions are not of this run", "correct the set-up, or leave the run out (--without)")
+    return GeometryMistake(
+        f"{place}: {keys} or the positions do not belong to this run", "correct the set-up, or leave the run out (--without)"
+    )

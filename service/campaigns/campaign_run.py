@@ -98,7 +98,7 @@ async def _nothing_read(_: str, __: int) -> ReadProgress | None:
 
 
 def plan_hash(plan: CampaignPlan) -> str:
-    """Hash of a campaign's tests; another recipe, or a version that computes another path, has another hash."""
+    """Return the hash of a campaign's tests; another recipe, or a version that computes another path, has another hash."""
     return hashlib.sha256(repr(plan.tests).encode()).hexdigest()
 
 

@@ -259,7 +259,7 @@ async def _campaign_run(
 
 
 def planned_seconds(test: TestPlan) -> float:
-    """Planned machine time of a test, s."""
+    """Return the planned machine time of a test, s."""
     seconds, here = 0.0, None
     for step in test.steps:
         if not (isinstance(step, MoveTo) and here == step.target_mm):

@@ -38,12 +38,12 @@ class SampleGap:
         return 0 if self.last is None else self.last - self.first + 1
 
     def doc(self) -> dict[str, Any]:
-        """As JSON object."""
+        """Return the gap as JSON object."""
         return asdict(self)
 
     @staticmethod
     def of(doc: dict[str, Any]) -> SampleGap:
-        """From a JSON object."""
+        """Return the gap in a JSON object."""
         return SampleGap(*(doc[name] for name in SampleGap.__dataclass_fields__))
 
 
@@ -83,11 +83,11 @@ class Ledger:
         return sum(last - first + 1 for spans in self._stored.values() for first, last in spans)
 
     def stored_spans(self, stream: int = 0) -> list[tuple[int, int]]:
-        """First and last number of every contiguous part of a stream."""
+        """Return the first and last number of every contiguous part of a stream."""
         return [(first, last) for first, last in sorted(self._stored.get(stream, []))]
 
     def unaccounted(self) -> list[tuple[int, int, int]]:
-        """Stream, first and last number of every range that neither a sample nor a gap covers, up to the highest known number."""
+        """Return stream, first and last number of every range that neither a sample nor a gap covers, up to the highest known number."""
         found = []
         for stream in sorted({*self._stored, *(gap.stream for gap in self.gaps)}):
             at = 0
@@ -98,12 +98,12 @@ class Ledger:
         return found
 
     def ends(self) -> dict[int, int]:
-        """For each stream the number after the highest known one."""
+        """Return the number after the highest known one of each stream."""
         streams = sorted({*self._stored, *(gap.stream for gap in self.gaps)})
         return {stream: max((last + 1 for _, last in self._covered(stream)), default=0) for stream in streams}
 
     def duplicates(self) -> int:
-        """Number of entries in excess of one per sequence number."""
+        """Return the number of entries in excess of one per sequence number."""
         count = 0
         for stream in sorted({*self._stored, *(gap.stream for gap in self.gaps)}):
             at = 0
@@ -113,7 +113,7 @@ class Ledger:
         return count
 
     def doc(self) -> dict[str, Any]:
-        """Totals as JSON object."""
+        """Return the totals as JSON object."""
         return {
             "stored_valid": self.stored - self.invalid,
             "stored_flagged": self.invalid,
@@ -161,7 +161,7 @@ class Drafter:
         return self._stream.next_seq - 1
 
     def mark(self) -> object:
-        """State of the numbering, for `reset`."""
+        """Return the state of the numbering, for `reset`."""
         return dict(self._numbers), dict(self._counts), replace(self._stream)
 
     def reset(self, mark: object) -> None:
@@ -319,7 +319,7 @@ def ledger_of(chunks: list[ChunkRecord], streams: dict[int, int] | None = None) 
 
 
 def streams_doc(records: Iterable[Record]) -> list[list[int]]:
-    """Streams of the ball-bar's chunks, for the run's account: first chunk, last chunk and stream of every contiguous part."""
+    """Return the streams of the ball-bar's chunks, for the run's account: first chunk, last chunk and stream of every contiguous part."""
     return joined([], [[one.chunk_no, one.chunk_no, one.stream] for one in records if one.kind == CHUNK and one.channel == BAR])
 
 
@@ -335,7 +335,7 @@ def joined(spans: list[list[int]], more: list[list[int]]) -> list[list[int]]:
 
 
 def streams_from_end_doc(end_doc: dict[str, Any] | None) -> dict[int, int] | None:
-    """Stream of every chunk by its number, from the run's end document; None if that has none (open run, or older version)."""
+    """Return the stream of every chunk by its number, from the run's end document; None if that has none (open run, or older version)."""
     spans = ((end_doc or {}).get("capture") or {}).get("streams")
     if spans is None:
         return None

@@ -403,7 +403,7 @@ def scan(data: bytes | memoryview) -> Scan:
 
 
 def _next_good(data: bytes | memoryview, at: int) -> int:
-    """Offset of the next undamaged record, or -1."""
+    """Return the offset of the next undamaged record, or -1."""
     rest = bytes(data[at:])
     found = rest.find(MAGIC)
     while found >= 0:

@@ -83,7 +83,7 @@ def _combined(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, 
 
 
 def _scatter(case: Case) -> _Scatter | None:
-    """Scatter of the fitted runs; None if no place was visited twice or all visits are equal."""
+    """Return the scatter of the fitted runs; None if no place was visited twice or all visits are equal."""
     runs = case.of("identify")
     if len(runs) < 2:
         return None
@@ -100,7 +100,7 @@ def _scatter(case: Case) -> _Scatter | None:
 
 
 def _stacked(case: Case) -> tuple[F1, F1, F1]:
-    """Place, value and run number of all valid readings of the fitted runs."""
+    """Return the place, value and run number of all valid readings of the fitted runs."""
     runs = case.of("identify")
     data = [(places_of(r)[r.valid], r.data().deviation_mm[r.valid]) for r in runs]
     number = np.concatenate([np.full(len(p), float(k)) for k, (p, _) in enumerate(data)])

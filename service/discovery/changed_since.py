@@ -76,7 +76,7 @@ def reference_solution(store: Store, campaign: Campaign) -> ReferenceSolution | 
 
 
 def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
-    """Solutions for all 21 motions from this machine's earlier campaigns, newest first."""
+    """Return the solutions for all 21 motions from this machine's earlier campaigns, newest first."""
     numbers = {m.id for m in store.machines.all() if m.name == campaign.site.name}
     mine = [c for c in store.campaigns.all() if c.machine_id in numbers]
     at = next((c.id for c in mine if c.name == campaign.name), 0)
@@ -100,7 +100,7 @@ def _before_of(store: Store, record: SolutionRecord) -> _Before:
 
 
 def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
-    """Table of each run of a solution; those of the solution itself if its runs have none."""
+    """Return the table of each run of a solution; those of the solution itself if its runs have none."""
     used = set(record.run_ids)
     tables = [r.start.table for r in store.runs.all(record.campaign_id) if r.id in used]
     return (
@@ -111,7 +111,7 @@ def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
 
 
 def _acting(tables: Sequence[RunTable]) -> int | None:
-    """CRC of the table that acted in all runs, given the table of each; None if none acted in any.
+    """Return the CRC of the table that acted in all runs, given the table of each; None if none acted in any.
 
     Raises
     ------

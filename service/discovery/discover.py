@@ -136,7 +136,7 @@ def prepare(
 
 
 def _difference_mm(measured: list[Run], corrected: list[Run]) -> dict[str, F1]:
-    """Measured minus corrected readings of each run, mm."""
+    """Return measured minus corrected readings of each run, mm."""
     pairs = [(before, after) for before, after in zip(measured, corrected, strict=True) if not before.is_sealed]
     return {before.run_id: before.columns.readings_mm - after.columns.readings_mm for before, after in pairs}
 

@@ -151,7 +151,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
 
 
 def _last_s(campaign: Campaign) -> float:
-    """Time of a campaign's last reading, s of its clock."""
+    """Return the time of a campaign's last reading, s of its clock."""
     return max((float(run.columns.t_s[-1]) for run in campaign.runs), default=0.0)
 
 

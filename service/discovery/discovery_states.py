@@ -100,7 +100,7 @@ def with_proof(finding: Finding) -> Finding:
 
 
 def _names(finding: Finding) -> tuple[EffectFound, ...]:
-    """The named effects, or those that `with_proof` turned into suspects."""
+    """Return the named effects, or those that `with_proof` turned into suspects."""
     return finding.effects or finding.suspects
 
 

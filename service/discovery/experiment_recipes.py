@@ -131,7 +131,7 @@ def _is_helix(runs: list[Run], about: Localization) -> bool:
 
 
 def _repeats_first(runs: list[Run], about: Localization) -> list[Run]:
-    """All runs, those to repeat first."""
+    """Return all runs, those to repeat first."""
     return sorted(runs, key=lambda run: run.run_id not in about.runs)
 
 
@@ -157,7 +157,7 @@ def _through(place: tuple[float, float, float] | None, like: Helix, name: str) -
 
 
 def _repeats(like: Helix, name: str) -> list[Recipe]:
-    """Three runs in alternating direction in one set-up; each starts where the previous one ends."""
+    """Return three runs in alternating direction in one set-up; each starts where the previous one ends."""
     ways: tuple[Literal[1, -1], ...] = (1, -1, 1) if like.direction > 0 else (-1, 1, -1)
     last = len(ways) - 1
     return [

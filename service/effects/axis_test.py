@@ -19,7 +19,7 @@ NEAR_MM = 0.05
 
 
 def _no_columns(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """No columns: only repeats judge this effect, and it contributes nothing to other campaigns."""
+    """Return no columns: only repeats show this effect, and it contributes nothing to other campaigns."""
     return [np.zeros((p.n, 0)) for p in paths]
 
 
@@ -41,7 +41,7 @@ SLOW_DRIFT = Effect(
     needs="a positioning test of one axis with each position visited three times or more from the same side",
     signature="every position reads a little less (or more) at each visit, all alike, whatever the direction",
     remedy="warm up or sensor",
-    remedy_text="warm up axis and sensor until repeats stay, mount the sensor short and stiff, then test again; no table can hold it",
+    remedy_text="warm up axis and sensor until repeats agree, mount the sensor short and stiff, then test again; no table can correct it",
     source="ISO 230-2 (repeatability); ISO 230-3 (thermal drift)",
     separated_by={"dead_path": ("reference_length",), "axis_thermal_growth": ("longer_session",)},
 )
@@ -93,14 +93,14 @@ def axis_drift(case: Case) -> Discovery | None:
 
 
 def drift_at(case: Case) -> dict[str, F1]:
-    """Drift named by `axis_drift` at every reading of every run, mm, by run label; extrapolated linearly beyond the fitted runs."""
+    """Return the drift found by `axis_drift` at every reading of each run, mm, by run label; linearly extrapolated after fitted runs."""
     place, t, reading = _identify_readings(case)
     drift = repeat_drift(place, t, reading)
     return {} if drift is None else {r.path.label: _extrapolated(_drift_at(drift, t), r.path.at.t_s) for r in case.runs}
 
 
 def _identify_readings(case: Case) -> tuple[F1, F1, F1]:
-    """Place, time and reading of the identify runs in chronological order."""
+    """Return the place, time and reading of the identify runs in chronological order."""
     runs = sorted(case.of("identify"), key=lambda r: float(r.path.at.t_s[0]))
     place, t, reading = (np.concatenate(v) for v in zip(*(_valid(r) for r in runs), strict=True))
     return place, t, reading
@@ -115,30 +115,30 @@ def _named(drift: RepeatDrift, axis: str, location: Localization) -> NamedEffect
 
 
 def _next(axis: str) -> NextTest:
-    why = "a fixed reference read by the same sensor tells whether sensor or axis drifts; a late repeat, whether it has come to an end"
+    why = "a fixed reference read by the same sensor tells whether sensor or axis drifts; a late repeat tells whether the drift has ended"
     return NextTest(("reference_length", "longer_session"), (f"spindle_thermal_drift:{axis}", "dead_path"), None, 30.0, why)
 
 
 def _valid(run: CaseRun) -> tuple[F1, F1, F1]:
-    """Place, time and value of the valid readings."""
+    """Return the place, time and value of the valid readings."""
     assert run.deviation_mm is not None
     return places_of(run)[run.valid], run.path.at.t_s[run.valid], run.deviation_mm[run.valid]
 
 
 def places_of(run: CaseRun) -> F1:
-    """A number per reading that encodes its position and its side of approach, shape (n,)."""
+    """Return a number per reading that encodes its position and its side of approach, shape (n,)."""
     position = np.round(run.path.at.q_mm @ run.path.look[0] / NEAR_MM) * NEAR_MM
     return np.asarray(position + 1e6 * run.path.direction)
 
 
 def _drift_at(drift: RepeatDrift, t_s: F1) -> tuple[F1, F1]:
-    """Times and drift of the fitted readings in chronological order."""
+    """Return the times and drift of the fitted readings in chronological order."""
     order = np.argsort(t_s, kind="stable")
     return t_s[order], drift.drift_mm[order]
 
 
 def _predicted(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
-    """Mean of the same place in the fitted runs plus the drift, if any, extrapolated linearly beyond them."""
+    """Return the mean at the same place in the fitted runs plus the drift, if any, extrapolated linearly after them."""
     means = {p: float(level[place == p].mean()) for p in np.unique(place)}
     fallback = float(level.mean())
     out = np.array([means.get(p, fallback) for p in places_of(run)])

@@ -29,18 +29,18 @@ class Plugins:
 
 
 def catalogue() -> tuple[Effect, ...]:
-    """All named effects: the built-in ones, then the plug-ins that passed the self-test."""
+    """Return all named effects: the built-in ones, then the plug-ins that passed the self-test."""
     return CATALOGUE + plugins().effects
 
 
 @cache
 def plugins() -> Plugins:
-    """Plug-in effects, looked up once per process, and the rejected plug-ins."""
+    """Return the plug-in effects, looked up once per process, and the rejected plug-ins."""
     return installed(e.name for e in CATALOGUE)
 
 
 def effect_named(name: str) -> Effect:
-    """One effect of the catalogue.
+    """Return one effect of the catalogue.
 
     Raises
     ------
@@ -57,10 +57,10 @@ def effect_named(name: str) -> Effect:
 
 
 def installed(known: Iterable[str]) -> Plugins:
-    """All effects that installed packages offer; ``known``: names that the catalogue already uses.
+    """Return the effects that installed packages offer; ``known``: names that the catalogue already uses.
 
-    A faulty plug-in never raises. One that cannot be imported, is no `Effect`, reuses a name or fails the self-test
-    (`abbe.models.effects.self_test`) is left out, and one error names it.
+    Never raises. A plug-in that cannot be imported, is no `Effect`, reuses a name or fails the self-test
+    (`abbe.models.effects.self_test`) is left out, and an error names it.
     """
     taken, effects, broken = set(known), [], []
     for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value)):
@@ -83,19 +83,19 @@ def _load(entry: EntryPoint) -> list[Effect]:
     found = list(thing) if isinstance(thing, tuple | list) else [thing]
     for effect in found:
         if not isinstance(effect, Effect):
-            raise _left_out(entry, f"an Effect or a tuple of them expected, got {type(effect).__name__}")
+            raise _left_out(entry, f"expected an Effect or a tuple of Effects, got {type(effect).__name__}")
     if not found:
         raise _left_out(entry, "it offers no effect")
     return found
 
 
 def checked(effects: tuple[Effect, ...], taken: Iterable[str]) -> tuple[Effect, ...]:
-    """Effects that a caller supplies, after the same self-test as plug-ins.
+    """Return the effects that a caller supplies, after the same self-test as plug-ins.
 
     Raises
     ------
     EffectPluginBroken
-        One breaks a rule, or reuses a name.
+        An effect breaks a rule, or reuses a name.
     """
     fault = _fault(list(effects), set(taken))
     if fault:
@@ -110,7 +110,7 @@ def _check(entry: EntryPoint, found: list[Effect], taken: set[str]) -> None:
 
 
 def _fault(found: list[Effect], taken: set[str]) -> str:
-    """The first rule that an effect breaks; empty if none."""
+    """Return the first rule that an effect breaks; empty if none."""
     names = [e.name for e in found]
     for effect in found:
         if effect.name in taken or names.count(effect.name) > 1:
@@ -129,5 +129,5 @@ def _left_out(entry: EntryPoint, why: str) -> EffectPluginBroken:
     package = entry.dist.name if entry.dist is not None else entry.module
     return EffectPluginBroken(
         f"plug-in {entry.name} of {package} ({entry.value}) is left out: {why}",
-        "repair or uninstall the package; docs/how-to/own-effect.md",
+        "repair or uninstall the package; docs/how-to/own-effect.md lists the rules",
     )

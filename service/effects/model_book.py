@@ -1,6 +1,6 @@
 """The model book: versions of a machine's effects beyond its 21 error motions, the origin of each effect, and reverting.
 
-`readings_of`: what the effects that a model already contains contribute to the readings of a campaign.
+`readings_of` gives the contribution of the effects in the book to the readings of a campaign.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ def applies(entry: BookEffect, campaign: str) -> bool:
 
 
 def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case: Case) -> dict[str, F1]:
-    """Contribution of known effects to the readings of every run, mm, by run label in the order of the case.
+    """Return the contribution of known effects to the readings of every run, mm, by run label in the order of the case.
 
     Raises
     ------
     ModelUnknown
-        The catalogue no longer has the effect, or the effect has another number of coefficients.
+        The catalogue no longer has an effect, or has it with another number of coefficients.
     """
     total = {r.path.label: np.zeros(r.path.n) for r in case.runs}
     paths = tuple(r.path for r in case.runs)
@@ -48,8 +48,8 @@ def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case
         effect = by_name.get(entry.name)
         if effect is None:
             raise ModelUnknown(
-                f"the model knows {entry.label}, the catalogue does not",
-                "install the plug-in it came from, or go back: abbe model revert",
+                f"the model contains {entry.label}, which is not in the catalogue",
+                "install its plug-in, or go back to an older version: abbe model revert",
             )
         coefficients = np.asarray(entry.coefficients, dtype=np.float64)
         found = _columns(effect, entry, paths)
@@ -59,14 +59,14 @@ def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case
             if np.count_nonzero(shown) != coefficients.size:
                 raise ModelUnknown(
                     f"{entry.label} has {coefficients.size} coefficients in the model and {columns.shape[1]} in this catalogue",
-                    "run abbe discover again with this version, or go back: abbe model revert",
+                    "run abbe discover again with this version of Abbe, or go back to an older version of the model: abbe model revert",
                 )
             total[path.label] += columns[:, shown] @ coefficients + usual * columns[:, ~shown].sum(axis=1)
     return total
 
 
 def _shown(columns: list[F2], count: int, fitted: Sequence[bool]) -> Mask:
-    """Mask of the columns that the coefficients belong to, shape (k,): all of them, or those that a fitted run excites."""
+    """Return a mask of the columns that the coefficients belong to, shape (k,): all columns, or those that a fitted run excites."""
     everything = np.ones(columns[0].shape[1], dtype=bool)
     if everything.size == count:
         return everything
@@ -75,7 +75,7 @@ def _shown(columns: list[F2], count: int, fitted: Sequence[bool]) -> Mask:
 
 
 def _usual(entry: EffectSize, coefficients: F1) -> float:
-    """Expected coefficient of an instrument's new set-up: the mean of the known ones if all have one sign, else zero."""
+    """Return the expected coefficient for a new set-up of an instrument: the mean of the known ones if all have one sign, else zero."""
     alike = len(coefficients) > 1 and bool(np.all(coefficients > 0.0) or np.all(coefficients < 0.0))
     return float(np.mean(coefficients)) if entry.family == "instrument" and alike and not entry.forms else 0.0
 
@@ -89,7 +89,7 @@ def _columns(effect: Effect, entry: EffectSize, paths: tuple[Path, ...]) -> list
 
 
 def without(case: Case, known_mm: dict[str, F1]) -> Case:
-    """The case with the known contributions, mm by run label, subtracted from its readings."""
+    """Return the case with the known contributions, mm by run label, subtracted from its readings."""
     runs = tuple(r if r.deviation_mm is None else replace(r, deviation_mm=r.deviation_mm - known_mm[r.path.label]) for r in case.runs)
     return replace(case, runs=runs)
 
@@ -97,10 +97,10 @@ def without(case: Case, known_mm: dict[str, F1]) -> Case:
 ALIKE = 2.0
 """Non-linear values that differ by fewer standard uncertainties than this count as equal, so their columns are the same."""
 OPPOSITE = -0.8
-"""Below this cosine between two findings' coefficients the later finding reverses the earlier one; above it, it is another change."""
+"""Below this cosine between two findings' coefficients the later finding reverses the earlier one; otherwise it is another change."""
 FORM = 0.1
-"""Relative standard uncertainty of coefficients because no machine follows a formula exactly, as for the strength of a geometry effect."""
-LOOK = "`abbe model list MACHINE` shows what there is"
+"""Relative standard uncertainty of coefficients, because no machine follows a formula exactly."""
+LOOK = "`abbe model list MACHINE` shows all versions"
 REMEDIES = {
     "table": "compensation tables",
     "control parameter": "a parameter of the control",
@@ -140,10 +140,10 @@ class Difference:
 
 
 def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
-    """Total size of several entries of one label: coefficients add up, unsigned sizes (an rms, a length) do not.
+    """Return the total size of several entries of one label: coefficients add up, unsigned sizes (an rms, a length) do not.
 
-    If the non-linear values agree and no form was needed, the strength of the summed coefficients, scaled to the whole strength that the
-    entries state (`Effect.unseen`). Otherwise, and for an effect that is not in the catalogue, the sum of the strengths.
+    If the non-linear values agree and no form was needed, this is the strength of the summed coefficients, scaled to the whole strength
+    that the entries state (`Effect.unseen`). Otherwise, and for an effect that is not in the catalogue, it is the sum of the strengths.
     """
     u, unit = float(np.hypot.reduce([e.u_strength for e in entries])), entries[-1].unit
     if effect is None or len(entries) == 1 or entries[0].forms or not _addable(entries):
@@ -156,10 +156,10 @@ def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
 
 
 def cancels(entries: Sequence[EffectSize], by_name: Mapping[str, Effect]) -> bool:
-    """Whether the entries of a label add up to zero within their uncertainty, that is, the cause was repaired.
+    """Whether the entries of a label add up to zero within their uncertainty, because the cause was repaired.
 
-    Signed strengths cancel as numbers. Unsigned sizes never do, however uncertain; they cancel if their coefficients have opposite
-    directions and the remainder does not exceed the noise.
+    Signed strengths cancel as numbers. Entries with unsigned sizes cancel only if their coefficients have opposite directions and the
+    remainder does not exceed the noise.
     """
     strengths = [e.strength for e in entries]
     if min(strengths) < 0.0 < max(strengths):
@@ -197,7 +197,7 @@ def _coefficients(entry: EffectSize) -> F1:
 
 
 def versions(store: Store, machine: str | None = None) -> list[ModelVersion]:
-    """All versions of one machine's model, or of all machines' models, oldest first."""
+    """Return all versions of one machine's model, or of all machines' models, oldest first."""
     return [_parsed(one) for one in store.models.all(machine)]
 
 
@@ -207,13 +207,13 @@ def _parsed(one: ModelRecord) -> ModelVersion:
 
 
 def current(store: Store, machine: str) -> ModelVersion | None:
-    """The newest version of a machine's model; None without any."""
+    """Return the newest version of a machine's model; None without any."""
     found = store.models.all(machine)
     return _parsed(found[-1]) if found else None
 
 
 def version(store: Store, machine: str, number: int) -> ModelVersion:
-    """One version of a machine's model.
+    """Return one version of a machine's model.
 
     Raises
     ------
@@ -231,17 +231,17 @@ def version(store: Store, machine: str, number: int) -> ModelVersion:
 def extended_book(
     base: ModelVersion | None, finding: Finding, source: FindingSource, discovery: int | None, effects: tuple[Effect, ...] = ()
 ) -> ModelBook:
-    """The book after a finding: the known effects and the new ones, each with its provenance.
+    """Return the book after a finding: the known effects and the new ones, each with its provenance.
 
     An effect that was subtracted from the readings stays, and the finding is added to it. A thermal or instrument effect replaces its older
-    entry. A label whose entries cancel within their uncertainty was repaired and leaves the book.
+    entry. A label whose entries cancel within their uncertainty leaves the book: its cause was repaired.
 
     Parameters
     ----------
     discovery : int, optional
         Number of the discovery that made the finding.
     effects : tuple of Effect
-        The catalogue, which defines the size of several findings of one label (`total`).
+        The catalogue, for adding up several findings of one label (`total`).
     """
     origin = Origin(campaign=source.campaign, discovery=discovery)
     new = [_entry(e, origin) for e in finding.effects]
@@ -266,7 +266,7 @@ def _entry(effect: EffectFound, origin: Origin) -> BookEffect:
 
 
 def _without_repaired(entries: list[BookEffect], effects: tuple[Effect, ...]) -> tuple[tuple[BookEffect, ...], tuple[str, ...]]:
-    """Entries without the repaired labels (`cancels`), and these labels."""
+    """Return the entries without the repaired labels (`cancels`), and these labels."""
     by_name = {e.name: e for e in effects}
     labels = dict.fromkeys(e.label for e in entries)
     gone = tuple(label for label in labels if cancels([e for e in entries if e.label == label], by_name))
@@ -291,7 +291,7 @@ def revert(store: Store, machine: str, number: int) -> int:
 
 
 def differences(first: ModelVersion, second: ModelVersion, effects: tuple[Effect, ...] = ()) -> list[Difference]:
-    """Labels that the second version adds, drops or resizes; strengths in the effect's unit."""
+    """Return the labels that the second version adds, drops or resizes; strengths in the effect's unit."""
     by_name = {e.name: e for e in effects}
     before, after = _sizes(first, by_name), _sizes(second, by_name)
     found = [Difference(label=label, before=before.get(label), after=after.get(label)) for label in dict.fromkeys((*before, *after))]
@@ -299,7 +299,7 @@ def differences(first: ModelVersion, second: ModelVersion, effects: tuple[Effect
 
 
 def _sizes(one: ModelVersion, by_name: dict[str, Effect]) -> dict[str, LabelSize]:
-    """Total size by label."""
+    """Return the total size by label."""
     same: dict[str, list[BookEffect]] = {}
     for e in one.book.effects:
         same.setdefault(e.label, []).append(e)
@@ -307,7 +307,7 @@ def _sizes(one: ModelVersion, by_name: dict[str, Effect]) -> dict[str, LabelSize
 
 
 def no_table_lines(known: ModelVersion | None) -> list[str]:
-    """One line for each effect of the current model that no static table corrects, with its remedy."""
+    """Return one line for each effect of the current model that no static table corrects, with its remedy."""
     if known is None:
         return []
     return [

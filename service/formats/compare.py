@@ -36,7 +36,7 @@ class FormatDifference:
 
 
 def places_mm(*parts: Compensation) -> F2:
-    """Positions of the comparison, shape (n, 3): all points of the tables along each axis, and random points of their box."""
+    """Return the positions of the comparison, shape (n, 3): all points of the tables along each axis, and random points of their box."""
     axes: list[list[F1]] = [[], [], []]
     for comp in parts:
         for t in comp.tables:
@@ -56,7 +56,7 @@ def places_mm(*parts: Compensation) -> F2:
 
 
 def differences(found: Compensation, expected: Compensation) -> tuple[FormatDifference, ...]:
-    """Largest difference per axis, over both directions."""
+    """Return the largest difference per axis, over both directions."""
     p = places_mm(found, expected)
     out = []
     for a, axis in enumerate(AXES):

@@ -90,7 +90,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def _node(table: AxisTable, reference_mm: tuple[float, float, float]) -> int:
-    """Index of the point at the reference position."""
+    """Return the index of the point at the reference position."""
     reference = reference_mm[AXES.index(table.axis)]
     at = int(np.argmin(np.abs(table.position_mm - reference)))
     if abs(table.position_mm[at] - reference) > 1e-6:

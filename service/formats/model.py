@@ -31,7 +31,7 @@ class AxisCurve:
     value: F1
 
     def at(self, axes_mm: F2) -> F1:
-        """Values at positions, shape (n, 3) -> (n,)."""
+        """Return the values at positions, shape (n, 3) -> (n,)."""
         return np.interp(axes_mm[:, AXES.index(self.axis)], self.position_mm, self.value)
 
 
@@ -61,7 +61,7 @@ class AxisTable:
         return not np.array_equal(self.forward_mm, self.backward_mm)
 
     def at(self, axes_mm: F2, direction: F2) -> F1:
-        """Correction at positions for a ``direction`` of motion (+1, −1; 0: the mean of both), shape (n, 3) each -> (n,)."""
+        """Return the correction at positions for a ``direction`` of motion (+1, −1; 0: the mean of both), shape (n, 3) each -> (n,)."""
         a = AXES.index(self.axis)
         there = np.interp(axes_mm[:, a], self.position_mm, self.forward_mm)
         back = np.interp(axes_mm[:, a], self.position_mm, self.backward_mm)

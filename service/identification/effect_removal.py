@@ -50,8 +50,8 @@ class RemovedEffects:
 def remove_effects(store: Store, campaign: Campaign, table: CampaignTable, effects: tuple[Effect, ...] | None = None) -> RemovedEffects:
     """Subtract from a campaign's readings what tables cannot correct.
 
-    That is the effect of ``table``, active during the measurement, beyond smooth corrections, and the lasting effects of the
-    machine's current model whose remedy is not a table.
+    These are the effect of ``table``, active during the measurement, beyond smooth corrections, and the effects of the machine's current
+    model that apply to this campaign and whose remedy is not a table.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def _without_book_effects(store: Store, campaign: Campaign, effects: tuple[Effec
     if record is None:
         return RemovedEffects(campaign, (), (), None)
     if record.book.machine_digest != machine_digest(campaign.site.machine):
-        line = f"model version {record.version} of {campaign.site.name} is of another geometry and was not used"
+        line = f"model version {record.version} of {campaign.site.name} is for another geometry and was not used"
         return RemovedEffects(campaign, (), (line,), record.version)
     chosen = [e for e in record.book.effects if e.remedy != "table" and applies(e, campaign.name)]
     lines = tuple(no_table_lines(record))
@@ -85,7 +85,7 @@ def subtract_effects(campaign: Campaign, entries: Sequence[EffectSize], origin: 
     Raises
     ------
     ModelUnknown
-        One of them is not in the catalogue.
+        An effect is not in the catalogue.
     """
     if not entries:
         return campaign

@@ -29,7 +29,7 @@ class Executor(Protocol):
     """Runs jobs. The function must belong to a module, and jobs and results must be plain values, because other processes receive them."""
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
-        """Results in the order of the jobs. The error of a job is raised in place of its result."""
+        """Return the results in the order of the jobs. The error of a job is raised in place of its result."""
         ...
 
 
@@ -37,7 +37,7 @@ class SerialExecutor:
     """Runs jobs one after the other in this process."""
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
-        """Results in the order of the jobs."""
+        """Return the results in the order of the jobs."""
         return map(work, jobs)
 
 
@@ -48,7 +48,7 @@ class ProcessExecutor:
         self._workers = workers
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
-        """Results in the order of the jobs."""
+        """Return the results in the order of the jobs."""
         with started_safely():  # all processes start here; creating the pool starts the resource tracker
             pool = ProcessPoolExecutor(self._workers, mp_context=get_context("spawn"))
             found = pool.map(work, jobs)
@@ -81,7 +81,7 @@ class DaskExecutor:
             ) from None
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
-        """Results in the order of the jobs."""
+        """Return the results in the order of the jobs."""
         with closing(self._client) as client:
             # pure=False: Dask computes equal jobs again, like the other executors.
             for future in client.map(work, list(jobs), pure=False):
@@ -123,7 +123,7 @@ def solve_task(task: ReanalysisTask) -> ReanalysisResult:
 
 
 def tasks_of(store: Store, url: str, pattern: str, model: Model) -> list[ReanalysisTask]:
-    """One task for each campaign whose name matches the pattern (``june-*``), in order of their numbers."""
+    """Return one task for each campaign whose name matches the pattern (``june-*``), in order of their numbers."""
     return [ReanalysisTask(url, one.name, model) for one in store.campaigns.all() if fnmatchcase(one.name, pattern)]
 
 
@@ -143,7 +143,7 @@ def solve_all(tasks: Sequence[ReanalysisTask], executor: Executor, store: Store 
 
 
 def row(answer: ReanalysisResult) -> tuple[str, str, str, str]:
-    """Cells of `HEADINGS`."""
+    """Return the cells of one result under `HEADINGS`."""
     if answer.doc is None:
         return (answer.campaign, "", "refused", answer.refused)
     solution = SolutionFile.read(answer.doc)

@@ -41,7 +41,7 @@ class StoredField:
         return list(dict.fromkeys(t.motion for t in self.known.terms))
 
     def observable_motions(self, motions: Iterable[str]) -> list[str]:
-        """Chosen motions in the model's order, each checked to be observable separately.
+        """Return the chosen motions in the model's order, each checked to be observable separately.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class NodeMap:
 
 
 def stored_field(store: Store, record: SolutionRecord) -> StoredField:
-    """The field of a stored solution.
+    """Return the field of a stored solution.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
 
 
 def node_map(stored: StoredField, nodes: int, motions: Sequence[str] = ()) -> NodeMap:
-    """Deviation and uncertainty on a grid of ``nodes`` points per axis over the strokes, of the given motions or of all together.
+    """Map deviation and uncertainty on a grid of ``nodes`` points per axis over the strokes, for the given motions or all together.
 
     Raises
     ------

@@ -40,12 +40,12 @@ PER_UNKNOWN = 2
 SIX, TWENTY_ONE = 6 + 3, 21 + 3 + 18 + 3
 """Unknowns of the smallest model of each kind: six, or 21 motions with slope and curvature, each with the lost motion of three axes."""
 HELIX_NOTE = (
-    "Ten-parameter figures describe the machine about that sphere only, from that run alone; over the volume the joint solution is the one "
-    "to use."
+    "Ten-parameter figures describe the machine on the sphere of their run only, from that run alone. "
+    "For the volume use the joint solution."
 )
 STEP_NOTE = (
-    "Step-diagonal figures are the paper's, for comparison: their uncertainty holds reading noise and the laser's wavelength only. Tilt of "
-    "the mirrors and angular errors of the axes bias them and are not in it; the joint solution knows both and is the one to use."
+    "Step-diagonal figures follow the papers, for comparison. Their uncertainty covers only reading noise and the laser's wavelength, not "
+    "mirror tilt and angular errors of the axes, which bias them. Use the joint solution, which includes both."
 )
 ProgressText = Callable[[str], None]
 STEP_PLACE_MM = 0.1
@@ -108,7 +108,7 @@ def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", 
 
 
 def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
-    """First and last row of the run's file, from 1, that each value was made of, by run label, shape (values, 2).
+    """Return the first and last row of the run's file, from 1, that each value was made of, by run label, shape (values, 2).
 
     Long runs are averaged in blocks. A row belongs to the value with the nearest mean time; invalid rows belong to none.
     """
@@ -129,7 +129,7 @@ def _silent(_: str) -> None:
 
 
 def check_campaign(site: Site, used: list[Run], others: list[Run], model: Model) -> list[CampaignIssue]:
-    """Flags of the runs to solve; ``others`` are only checked for copies.
+    """Return the flags of the runs to solve; ``others`` are only checked for copies.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def _unknowns(data: list[RunData], model: Model) -> int:
 
 
 def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
-    """The largest model that the readings support, and a flag if it is not rigid21."""
+    """Return the largest model that the readings support, and a flag if it is not rigid21."""
     count, wanted = sum(r.deviation_mm.size for r in data), PER_UNKNOWN * _unknowns(data, "rigid21")
     if count >= wanted:
         return "rigid21", []
@@ -199,7 +199,7 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[C
 
 
 def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> CampaignIssue:
-    """Flag for a set-up error that is unusually large but possible."""
+    """Return a flag for a set-up error that is unusually large but possible."""
     title, remedy = next(
         (entry for prefix, entry in UNUSUAL.items() if name.startswith(prefix)), (name.replace("_", " "), "look at that set-up")
     )
@@ -212,15 +212,15 @@ def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> CampaignIssu
 
 
 def _longest_contained(names: list[str], unknown: str) -> str | None:
-    """The longest of the names that occurs in ``unknown`` as a whole word between underscores: B1 does not occur in cup_B12_x."""
+    """Return the longest of the names that occurs in ``unknown`` as a whole word between underscores: B1 does not occur in cup_B12_x."""
     found = [n for n in names if re.search(rf"_{re.escape(n)}(_|$)", unknown)]
     return max(found, key=len) if found else None
 
 
 def step_diagonals(runs: list[Run]) -> dict[str, dict[str, float]]:
-    """The papers' step-diagonal results by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
+    """Return the papers' step-diagonal results by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
 
-    End errors of the nine curves (um), largest closure (um, with the u of one closure), squareness contrasts (urad).
+    These are the end errors of the nine curves (um), the largest closure (um, with the u of one closure) and squareness contrasts (urad).
     """
     out = {}
     for order in ("XYZ", "ZYX"):
@@ -232,7 +232,7 @@ def step_diagonals(runs: list[Run]) -> dict[str, dict[str, float]]:
 
 
 def _whole_way_out(run: Run, order: str) -> bool:
-    """Whether the first 3 n + 1 rows are valid and at the ends of the steps in this order; otherwise later rows belong to other steps."""
+    """Whether the first 3 n + 1 rows are valid and at the ends of the steps in this order."""
     setup, n = run.laser, run.laser.steps
     first = run.columns.rows(slice(3 * n + 1))
     points = first.q_mm
@@ -264,7 +264,7 @@ def _step_figures(found: dict[str, Run], order: str) -> dict[str, float]:
 
 
 def helix_misfit(solved: Solved, run: Run) -> float:
-    """Rms residual of a held-out ball-bar run after refitting cup and length, mm."""
+    """Return the rms residual of a held-out ball-bar run after refitting cup and length, mm."""
     data = run_data(run)
     n = bar_normals(data)
     lost = -0.5 * data.sign * np.array([v for v, _ in solved.joint.backlash_mm().values()])

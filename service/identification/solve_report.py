@@ -73,7 +73,7 @@ class Verdict:
 def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0) -> Verdict:
     """Judge what a solution can be used for.
 
-    The layout limits the verdict. If the model does not fit, the reached uncertainty far exceeds that limit, and counts.
+    The layout of the campaign limits the verdict. If the model does not fit, the larger uncertainty that was reached limits it further.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
     reached = number.before_mm / u if u > 0.0 else np.inf
     level, reasons = VERDICTS.index(number.verdict), []
     if level < VERDICTS.index("good"):
-        reasons.append(f"the layout of the campaign allows no more than {number.value:.1f} times")
+        reasons.append(f"the layout of the campaign can make a typical machine's error at most {number.value:.1f} times smaller")
     if reached < GOOD:
         level = min(level, 1 if reached >= USABLE else 0)
         reasons.append(f"the uncertainty that was reached makes a typical machine's error only {reached:.1f} times smaller")
@@ -111,7 +111,7 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
 
 
 def layout_line(number: Number) -> str:
-    """The observability number as text: a property of the layout, not of the readings."""
+    """Return the observability number as text: a property of the campaign's layout, not of the readings."""
     return "What the layout of the campaign allows, if the model fits: " + number.text.replace(f" ({number.verdict})", "")
 
 
@@ -142,7 +142,7 @@ class Assessment:
         return self.solved.joint
 
     def predict(self, points_mm: F2) -> Prediction:
-        """Deviation and uncertainty at other points, shape (n, 3), in the same frame."""
+        """Return the deviation and uncertainty at other points, shape (n, 3), in the same frame."""
         return predict_deviation(self.sources, points_mm, frame=volume_frame(self.joint.machine))
 
 
@@ -163,19 +163,19 @@ def assess(solved: Solved) -> Assessment:
 
 
 def model_key(joint: JointSolution) -> str:
-    """Which model was fitted and who chose its order, e.g. ``rigid21/legendre7+order-by-heldout``."""
+    """Return the fitted model and how its order was chosen, e.g. ``rigid21/legendre7+order-by-heldout``."""
     if joint.model == "rigid6":
         return "rigid6" + ("+by-heldout" if joint.order_choice else "")
     return f"{joint.model}/legendre{joint.order}" + ("+order-by-heldout" if joint.order_choice else "+order-given")
 
 
 def not_observable(found: Assessment) -> list[str]:
-    """What the runs cannot separate, why, and which measurement would."""
+    """Tell what the runs cannot separate, why, and which measurement would."""
     return [g.text for g in found.observability.hidden]
 
 
 def solution_of(solved: Solved | Assessment) -> SolutionFile:
-    """The solution as stored: parameters with uncertainty, unobservable motions, residual tests, versions, digests."""
+    """Return the solution as stored: parameters with uncertainty, unobservable motions, residual tests, versions, digests."""
     found = solved if isinstance(solved, Assessment) else assess(solved)
     joint, o, e = found.joint, found.observability, found.joint.estimate
     key = model_key(joint)
@@ -220,17 +220,17 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
 
 
 def solution_doc(solved: Solved | Assessment) -> Doc:
-    """`solution_of` as JSON."""
+    """Return `solution_of` as JSON."""
     return as_doc(solution_of(solved))
 
 
 def as_doc(solution: SolutionFile) -> Doc:
-    """A solution as JSON, without unset fields."""
+    """Return a solution as JSON, without unset fields."""
     return solution.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
 def solution_verdict(found: Assessment) -> Verdict:
-    """The verdict on a solution (`abbe.service.identification.solve_report`)."""
+    """Return the verdict on a solution."""
     flagged = len({t.run for t in found.joint.residual_tests if t.flagged})
     return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
 
@@ -300,20 +300,20 @@ def _uncertainty(found: Assessment) -> Uncertainty:
 
 
 def point(values: F1) -> Point:
-    """Three numbers of an array."""
+    """Convert an array of three numbers to a tuple."""
     x, y, z = (float(v) for v in values)
     return x, y, z
 
 
 def _budget_line(found: Assessment, line: BudgetLine) -> BudgetLineValue:
-    """A source with its evaluation type and degrees of freedom; None for infinite ones."""
+    """Describe a source with its evaluation type (A or B) and degrees of freedom, None if infinite."""
     source = found.sources.source(line.name)
     dof = float(source.dof) if np.isfinite(source.dof) else None
     return BudgetLineValue(source=line.name, words=line.text, u_um=line.u_mm * 1e3, share=line.share, type=source.evaluation, dof=dof)
 
 
 def worst_line(found: Assessment) -> str:
-    """One line about the point with the largest uncertainty."""
+    """Return one line about the point with the largest uncertainty."""
     p, at = found.prediction, worst_point(found.prediction)
     place = ", ".join(f"{v:.0f}" for v in p.points_mm[at])
     return (
@@ -323,7 +323,7 @@ def worst_line(found: Assessment) -> str:
 
 
 def noise_lines(joint: JointSolution) -> list[str]:
-    """Estimated noise of each instrument, and its estimate from repeats alone."""
+    """Return the estimated noise of each instrument, and its estimate from repeats alone."""
     names = {"bar": "ball-bar", "laser": "laser"}
     out = []
     for kind, sigma in joint.noise_mm.items():
@@ -334,7 +334,7 @@ def noise_lines(joint: JointSolution) -> list[str]:
 
 
 def _rows(solved: Solved, outlier: Outlier) -> list[int]:
-    """First and last row of the run's columns, from 1, that the value was made of."""
+    """Return the first and last row of the run's columns, from 1, that the value was made of."""
     rows = solved.rows.get(outlier.run)
     return [] if rows is None or outlier.index >= len(rows) else [int(v) for v in rows[outlier.index]]
 
@@ -344,10 +344,10 @@ def _time(joint: JointSolution, outlier: Outlier) -> float:
 
 
 def outlier_lines(solved: Solved) -> list[str]:
-    """Outliers with reduced weight, largest first, with their rows in the run's file."""
+    """Return the outliers with reduced weight, largest first, with their rows in the run's file."""
     joint = solved.joint
     lines = [
-        f"run {o.run}, {_rows_text(_rows(solved, o))} (t = {_time(joint, o):.1f} s): {abs(o.size):.1f} sigma, counts {o.weight:.0%}"
+        f"run {o.run}, {_rows_text(_rows(solved, o))} (t = {_time(joint, o):.1f} s): {abs(o.size):.1f} sigma, weight {o.weight:.0%}"
         for o in joint.outliers[:LISTED]
     ]
     more = len(joint.outliers) - len(lines)
@@ -362,7 +362,7 @@ def _rows_text(rows: list[int]) -> str:
 
 
 def residual_lines(joint: JointSolution) -> list[str]:
-    """Flagged residual tests, one line per run, most significant run first."""
+    """Return the flagged residual tests, one line per run, most significant run first."""
     found: dict[str, list[str]] = {}
     for test in sorted((t for t in joint.residual_tests if t.flagged), key=lambda t: t.p_adjusted):
         found.setdefault(test.run, []).append(test.text.removeprefix(f"{test.run}: "))

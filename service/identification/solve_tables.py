@@ -1,4 +1,4 @@
-"""On request: the errors that each kind of table leaves, the 3-D grid as a file, and a Monte Carlo check of the stated uncertainty."""
+"""Further results of a solution: the errors that each kind of table leaves, the 3-D grid as a file, and a Monte Carlo check of U."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SEED, TRIALS = 101, 400_000
 
 
 def table_rows(found: Assessment, lsb_mm: float) -> list[TableRow]:
-    """Errors of distances that every kind of table leaves, µm, with standard uncertainties; tables rounded to the machine's unit."""
+    """Return the errors of distances that each kind of table leaves, µm, with standard uncertainties; tables rounded to ``lsb_mm``."""
     out = []
     for row in achievable(found.joint, lsb_mm=lsb_mm, sources=found.sources):
         d = row.distances
@@ -33,7 +33,7 @@ def table_rows(found: Assessment, lsb_mm: float) -> list[TableRow]:
 
 
 def machine_grid(found: Assessment, nodes: int, lsb_mm: float) -> GridTable:
-    """The 3-D grid of corrections where the error exceeds its uncertainty, rounded to the machine's unit.
+    """Return the 3-D grid of corrections where the error exceeds its uncertainty, rounded to ``lsb_mm``.
 
     Raises
     ------
@@ -52,12 +52,12 @@ def machine_grid(found: Assessment, nodes: int, lsb_mm: float) -> GridTable:
     mask = compensable_nodes(found.joint, counts, inputs=found.sources.inputs)
     table = quantise_grid(grid_table(found.joint, counts, compensable=mask, sources=found.sources), lsb_mm)
     if not table.compensated.any():
-        raise TableRefused("nowhere is the error larger than its uncertainty: nothing to compensate", "nothing was written")
+        raise TableRefused("the error exceeds its uncertainty nowhere: there is nothing to compensate", "nothing was written")
     return table
 
 
 def grid_text(table: GridTable) -> str:
-    """The grid as CSV, one node per line, X slowest. ``dx_um`` to ``dz_um``: added to the command; ``u_``: standard uncertainty."""
+    """Return the grid as CSV, one node per line, X slowest. ``dx_um`` to ``dz_um``: added to the command; ``u_``: standard uncertainty."""
     values = np.column_stack([table.correction_mm.reshape(-1, 3) * 1e3 + 0.0, table.u_mm.reshape(-1, 3) * 1e3])
     rows = zip(nodes_mm(table.position_mm), values, table.compensated.reshape(-1), strict=True)
     lines = [",".join([*(f"{v:.10g}" for v in p), *(f"{v:.6g}" for v in d), str(int(c))]) for p, d, c in rows]
@@ -65,7 +65,7 @@ def grid_text(table: GridTable) -> str:
 
 
 def monte_carlo(found: Assessment, progress: ProgressText) -> MonteCarloCheck:
-    """Check the stated 95 % intervals at the worst known point by Monte Carlo trials (GUM Supplement 1), limits as rectangular."""
+    """Check the 95 % intervals at the point with the largest U by Monte Carlo trials (GUM Supplement 1); limits count as rectangular."""
     p, at = found.prediction, worst_point(found.prediction)
     trials = campaign_trials(found.sources, p.points_mm[at : at + 1], frame=volume_frame(found.joint.machine), distributions=LIMITS)
     draw, done = trials.linear(), 0

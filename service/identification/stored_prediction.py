@@ -19,7 +19,7 @@ ENCODING = "base64 of float64, little endian, lower triangle by rows"
 
 
 def prediction_of(sources: ErrorSources) -> StoredPrediction:
-    """Terms (motion, order, axis, component), coefficients in mm and rad, and their covariance from all sources."""
+    """Return the terms (motion, order, axis, component), coefficients in mm and rad, and their covariance from all sources."""
     total = np.zeros((len(sources.terms), len(sources.terms)))
     for s in sources.sources:
         total += s.factor @ s.factor.T
@@ -36,7 +36,7 @@ def prediction_of(sources: ErrorSources) -> StoredPrediction:
 
 
 def stored_prediction(stored: StoredPrediction) -> tuple[tuple[Term, ...], F1, F2]:
-    """Terms, coefficients and covariance of a stored solution's ``prediction``."""
+    """Return the terms, coefficients and covariance of a stored solution's ``prediction``."""
     n = stored.covariance.shape[0]
     out = np.zeros((n, n))
     out[np.tril_indices(n)] = np.frombuffer(base64.b64decode(stored.covariance.data), dtype="<f8")

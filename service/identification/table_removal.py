@@ -1,8 +1,8 @@
-"""Subtract the effect of an active table beyond its smooth corrections from a campaign's readings; the remaining machine errors stay.
+"""Subtract what an active compensation table did beyond smooth corrections from a campaign's readings.
 
-The table was read from the controller or is in the database, so its moves are known exactly. Subtracted are the effect of the lost motion
-on these moves, and what interpolation and rounding added to them. The machine's lost motion is solved first, from the runs in which axes
-reverse by command and not while they are commanded to rest.
+The table is known exactly, from the controller or the database. Subtracted are the effect of lost motion on the axis moves that the table
+causes, and what interpolation and rounding add to these moves. The machine's lost motion is solved first, from the runs whose axes reverse
+by command, and not by the table while they are commanded to rest.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from abbe.service.tables.measured_with import images_of
 from abbe.service.tables.nine_tables import tables_from_image
 
 NOTHING = AppliedTables(np.zeros_like)
-NOT_REMOVED = "what it did beyond smooth corrections, with the lost motion above all, is still in the readings"
+NOT_REMOVED = "the effect of tables beyond smooth corrections, above all with lost motion, is still in the readings"
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ NO_TABLE = CampaignTable()
 
 
 def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
-    """The table of this database with which all identify runs of a campaign were measured."""
+    """Return the table of this database with which all identify runs of a campaign were measured."""
     stated = [r.table for r in campaign.runs if r.identifies]
     acted = [one for one in stated if one.acting_crc is not None]
     crc = acted[0].acting_crc if acted else None
@@ -62,7 +62,7 @@ def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
     image = images_of(store)(crc)
     if image is None:
         sure = any(one.acting for one in acted)  # runs of older versions do not state whether a table acted
-        return CampaignTable(None, f"measured with table {crc:08X}, which this database does not know: {NOT_REMOVED}" if sure else "")
+        return CampaignTable(None, f"measured with table {crc:08X}, which is not in this database: {NOT_REMOVED}" if sure else "")
     try:
         return CampaignTable(tables_from_image(image))
     except TableMismatch:
@@ -70,7 +70,7 @@ def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
 
 
 def remove_table(campaign: Campaign, table: NineTables | None) -> Campaign:
-    """The campaign as if every axis had followed smooth corrections by ``table``, which was active during the measurement.
+    """Return the campaign as if every axis had followed smooth corrections by ``table``, which was active during the measurement.
 
     ``removed`` of the result then names the table and the assumed lost motion with its uncertainty. Runs with another table than the
     identify runs, or without one, stay unchanged. Without a ``table`` the campaign stays unchanged.
@@ -97,28 +97,28 @@ def _had_table(run: Run, crc: int | None) -> bool:
 
 
 def table_line(removed: TableRemoval) -> str:
-    """One line about the removed table."""
+    """Return one line about the removed table."""
     lost = ", ".join(f"{axis} {one.value * 1e3:.1f} µm (u {one.u * 1e3:.1f})" for axis, one in removed.lost_motion_mm.items())
     which = "" if removed.crc is None else f" {removed.crc:08X}"
-    return f"table{which} was in force: what it did beyond smooth corrections is taken out of the readings, with lost motion {lost}"
+    return f"table{which} was in force: its effect beyond smooth corrections is subtracted from the readings, with lost motion {lost}"
 
 
 def removed_table(table: NineTables, lost_mm: F1) -> RemovedTable:
-    """What to subtract from readings that were measured with ``table`` by a machine with this lost motion of X, Y, Z, mm.
+    """Return what to subtract from readings measured with ``table`` on a machine with this lost motion of X, Y, Z, mm.
 
-    A table that polynomials do not fit, made by hand or of pitch errors, may correct errors outside these models: then only the effect of
-    the lost motion on its moves is subtracted.
+    A table that polynomials do not fit, made by hand or for pitch errors, may correct errors outside the models. Then only the effect of
+    lost motion on its moves is subtracted.
     """
     return RemovedTable(AppliedTables(table.correction_at, lost_mm), AppliedTables(smooth_of(table) or table.correction_at))
 
 
 def subtract_table(runs: list[Run], out: RemovedTable) -> list[Run]:
-    """Runs after subtracting a table's effect; a run without readings stays unchanged."""
+    """Subtract a table's effect from runs; a run without readings stays unchanged."""
     return [_subtracted(run, out) for run in runs]
 
 
 def _lost_motion(site: Site, used: list[Run], table: NineTables) -> dict[str, tuple[float, float]]:
-    """Lost motion and its u by axis, mm, from runs without the whole effect of the table, whose interpolation would look like reversals."""
+    """Solve lost motion and its u by axis, mm, without the whole effect of the table, whose interpolation would look like reversals."""
     plain = [r for r in used if r.is_bar or not r.laser.order]
     runs = subtract_table(plain or used, RemovedTable(AppliedTables(table.correction_at), NOTHING))
     return solve_joint(site.machine, tuple(run_data(r) for r in runs)).backlash_mm()

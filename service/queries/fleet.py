@@ -166,7 +166,7 @@ def _days(one: FigureTrend) -> tuple[float, float, float] | None:
 
 
 def row(line: MachineLine) -> tuple[str, ...]:
-    """Return the cells of `HEADINGS`."""
+    """Return the cells of one machine under `HEADINGS`."""
     figures = ", ".join(_figure_text(one) for one in line.figures)
     state = line.state if line.state != NOT_RUNNING else f"{NOT_RUNNING}, last heard {_minute(line.heard_utc)}"
     due = f"{_minute(line.next_due_utc)} {line.next_recipe}" if line.next_due_utc else ""

@@ -75,13 +75,13 @@ class RunDetail(RunSummary):
 
 
 def machines(reader: Reader, name: str | None, cursor: int | None, limit: int) -> tuple[list[MachineDescription], int | None]:
-    """Descriptions of machines, newest first."""
+    """Return the descriptions of machines, newest first."""
     rows, after = reader.page("machines", {"name": name}, cursor, limit)
     return [_machine(row) for row in rows], after
 
 
 def machine(reader: Reader, number: int) -> MachineDescription:
-    """One description of a machine. Raises NotStored."""
+    """Return one description of a machine. Raises NotStored."""
     return _machine(reader.row("machines", number, "machine"))
 
 
@@ -90,13 +90,13 @@ def _machine(row: Doc) -> MachineDescription:
 
 
 def campaigns(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[CampaignSummary], int | None]:
-    """Campaigns, newest first."""
+    """Return the campaigns, newest first."""
     rows, after = reader.page("campaigns", {"machine": machine}, cursor, limit)
     return [of_row(CampaignSummary, row) for row in rows], after
 
 
 def campaign(reader: Reader, number: int) -> CampaignDetail:
-    """A campaign with its runs. Raises NotStored."""
+    """Return a campaign with its runs. Raises NotStored."""
     row = reader.row("campaigns", number, "campaign")
     filters = {"campaign": row["name"]}
     runs = [_run(one) for one in reversed(reader.store.pages.page("runs", filters, None, MOST_RUNS))]
@@ -109,7 +109,7 @@ def campaign(reader: Reader, number: int) -> CampaignDetail:
 
 
 def runs(reader: Reader, filters: Mapping[str, str | None], cursor: int | None, limit: int) -> tuple[list[RunSummary], int | None]:
-    """Runs, newest first, including those that were broken off.
+    """Return the runs, newest first, including interrupted ones.
 
     ``filters`` has ``campaign``, ``machine``, ``test``, ``role`` and ``status`` (as stored: a run whose process died is ``running``
     here); None: any.
@@ -119,7 +119,7 @@ def runs(reader: Reader, filters: Mapping[str, str | None], cursor: int | None, 
 
 
 def runs_by_state(reader: Reader, campaign: str, test: str, state: str, limit: int) -> tuple[list[RunSummary], bool]:
-    """The newest runs with a visible state (empty: any), and whether there are more."""
+    """Return the newest runs with a visible state (empty: any), and whether there are more."""
     filters = {"campaign": campaign or None, "test": test or None, "status": state or None}
     if state not in (INCOMPLETE, RUNNING):
         found, after = runs(reader, filters, None, limit)
@@ -130,7 +130,7 @@ def runs_by_state(reader: Reader, campaign: str, test: str, state: str, limit: i
 
 
 def run(reader: Reader, number: int) -> RunDetail:
-    """One run with its channels. Raises NotStored."""
+    """Return one run with its channels. Raises NotStored."""
     row = reader.row("runs", number, "run")
     end = reader.store.runs.find(number).end_doc or {}
     state = visible_status(row)
@@ -139,7 +139,7 @@ def run(reader: Reader, number: int) -> RunDetail:
 
 
 def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
-    """Runs (of one campaign), oldest first; ``reason`` of a complete run with gaps counts the missing samples. Raises NotStored."""
+    """Return the runs (of one campaign), oldest first; ``reason`` counts the missing samples of a complete run. Raises NotStored."""
     owners = [store.campaigns.find(campaign)] if campaign is not None else store.campaigns.all()
     names = {one.id: store.machines.get(one.machine_id).name for one in owners}
     found = store.runs.all(owners[0].id if campaign is not None else None)
@@ -147,7 +147,7 @@ def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
 
 
 def run_summary(record: RunRecord, machine: str) -> RunSummary:
-    """Summary of a complete record."""
+    """Return the summary of a complete record."""
     row = {one.name: getattr(record, one.name) for one in fields(record)}
     state = record.visible_status
     return of_row(RunSummary, row, machine=machine, run_id=record.label, status=state, reason=_reason(state, record.reason, record.end_doc))
@@ -159,7 +159,7 @@ def _run(row: Doc) -> RunSummary:
 
 
 def _reason(state: str, reason: str, end: Doc | None) -> str:
-    """Why a run is not complete, or which samples a complete run lacks."""
+    """Tell why a run is not complete, or which samples a complete run lacks."""
     if state == INCOMPLETE:
         return "its process ended before the run was closed; the next command that connects to the machine takes over what was saved"
     gaps = (end or {}).get("gaps") or []
@@ -208,7 +208,7 @@ class RunColumns(SampleStretch):
 
 
 def samples(reader: Reader, run: int, channel: str, first: int, limit: int) -> Samples:
-    """Samples ``first`` to ``first + limit - 1`` of a channel.
+    """Return the samples ``first`` to ``first + limit - 1`` of a channel.
 
     Raises
     ------
@@ -229,7 +229,7 @@ def samples(reader: Reader, run: int, channel: str, first: int, limit: int) -> S
 
 
 def packed_samples(reader: Reader, run: int, first: int, limit: int) -> tuple[bytes, int]:
-    """A stretch of ball-bar samples, packed (18 bytes a sample), and the total number of samples."""
+    """Return a stretch of ball-bar samples, packed (18 bytes a sample), and the total number of samples."""
     reader.row("runs", run, "run")
     with as_stored():
         found, at, total = _chunks(reader.store, run, "bar", first, limit)
@@ -238,7 +238,7 @@ def packed_samples(reader: Reader, run: int, first: int, limit: int) -> tuple[by
 
 
 def columns(reader: Reader, run: int, first: int, limit: int) -> RunColumns:
-    """Rows ``first`` to ``first + limit - 1`` of a run's evaluated columns.
+    """Return the rows ``first`` to ``first + limit - 1`` of a run's evaluated columns.
 
     Raises
     ------
@@ -266,7 +266,7 @@ def _columns(taken: list[BarSample]) -> BarSamples:
 
 
 def _chunks(store: Store, run: int, channel: str, first: int, limit: int) -> tuple[list[ChunkRecord], slice, int]:
-    """Chunks that contain a stretch, its slice of their samples, and the number of samples in the channel."""
+    """Return the chunks that contain a stretch, its slice of their samples, and the number of samples in the channel."""
     sizes = store.chunks.sizes(run, channel) if storable(channel) and channel != IMPORTED_CHANNEL else []
     if not sizes:
         raise NotStored(

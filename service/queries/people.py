@@ -31,12 +31,12 @@ class TokenSummary:
 
 
 def users(store: Store) -> list[UserSummary]:
-    """All users."""
+    """Return all users."""
     return [UserSummary(**{one.name: getattr(user, one.name) for one in fields(UserSummary)}) for user in store.people.all()]
 
 
 def tokens(store: Store) -> list[TokenSummary]:
-    """All tokens with their owners."""
+    """Return all tokens with their owners."""
     return [
         TokenSummary(
             user=owner.name,
@@ -51,5 +51,5 @@ def tokens(store: Store) -> list[TokenSummary]:
 
 
 def audit(store: Store, limit: int) -> list[AuditEvent]:
-    """The newest records of the audit, oldest first."""
+    """Return the newest records of the audit, oldest first."""
     return store.audit.events(limit)

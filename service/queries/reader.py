@@ -53,18 +53,18 @@ class Reader:
         return self.clock.utc().timestamp()
 
     def control_of(self, machine: str) -> str:
-        """Identity of a machine's control; empty for machines of other services."""
+        """Return the identity of a machine's control; empty for machines of other services."""
         return self.control if machine == self.machine else ""
 
     def page(self, kind: str, filters: Mapping[str, object], cursor: int | None = None, limit: int = MOST) -> tuple[list[Doc], int | None]:
-        """Rows of a page, newest first, and the cursor of the next page; None: this is the last page."""
+        """Return the rows of a page, newest first, and the cursor of the next page; None: this is the last page."""
         if any(isinstance(value, str) and not storable(value) for value in filters.values()):
             return [], None
         rows = self.store.pages.page(kind, filters, cursor, limit + 1)
         return rows[:limit], rows[limit - 1]["id"] if len(rows) > limit else None
 
     def row(self, kind: str, number: int, what: str) -> Doc:
-        """One row with its document; ``what`` names the thing in the error. Raises NotStored."""
+        """Return one row with its document; ``what`` names the thing in the error. Raises NotStored."""
         found = self.store.pages.row(kind, number)
         if found is None:
             raise NotStored(f"there is no {what} {number}")
@@ -82,18 +82,18 @@ class StoredResult:
 
 
 def of_row(kind: type[T], row: Mapping[str, Any], **known: Any) -> T:
-    """A row of the store as a record: fields have the names of columns, ``number`` is ``id``; ``known`` overrides the row."""
+    """Convert a row of the store to a record: fields have the names of columns, ``number`` is ``id``; ``known`` overrides the row."""
     values = {"number": row["id"], **row, **known}
     return kind(**{one.name: values[one.name] for one in fields(kind) if one.name in values})  # type: ignore[arg-type]
 
 
 def json_value(value: object) -> Any:
-    """A record as the JSON value that HTTP and ``--json`` write."""
+    """Convert a record to the JSON value that HTTP and ``--json`` write."""
     return _ADAPTERS(type(value)).dump_python(value, mode="json")
 
 
 def read_as(kind: type[T], doc: object) -> T | None:
-    """A stored document as a record; None: it has another form."""
+    """Convert a stored document to a record; None if it has another form."""
     try:
         found: T = _ADAPTERS(kind).validate_json(json.dumps(finite(doc)))  # via JSON, where strict models accept lists for tuples
     except ValidationError:
@@ -137,7 +137,7 @@ def as_stored() -> Iterator[None]:
 
 
 def finite(value: Any) -> Any:
-    """A value for JSON, which has no NaN: non-finite numbers become null."""
+    """Convert a value for JSON, which has no NaN: non-finite numbers become null."""
     if isinstance(value, dict):
         return {key: finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):

@@ -95,13 +95,13 @@ class VolumeMap:
 def solutions(
     reader: Reader, campaign: str | None, machine: str | None, cursor: int | None, limit: int
 ) -> tuple[list[SolutionSummary], int | None]:
-    """Solutions, newest first."""
+    """Return the solutions, newest first."""
     rows, after = reader.page("solutions", {"campaign": campaign, "machine": machine}, cursor, limit)
     return [of_row(SolutionSummary, row, runs=row["run_ids"]) for row in rows], after
 
 
 def solution(reader: Reader, number: int) -> SolutionDetail:
-    """A solution: parameters with uncertainties, unobservable quantities, residuals, budget.
+    """Return a solution: parameters with uncertainties, unobservable quantities, residuals, budget.
 
     Raises
     ------
@@ -118,9 +118,9 @@ def solution(reader: Reader, number: int) -> SolutionDetail:
 
 
 def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) -> VolumeMap:
-    """The volume map of a solution, rounded to 0.001 µm, which is far below every U.
+    """Return the volume map of a solution, rounded to 0.001 µm, which is far below every U.
 
-    ``motions``: the map shows their joint effect, none: that of all; ``nodes``: per axis.
+    ``motions``: the map shows their joint effect; empty: that of all motions. ``nodes``: per axis.
     """
     reader.row("solutions", number, "solution")
     with as_stored():
@@ -145,13 +145,13 @@ def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) 
 def discoveries(
     reader: Reader, campaign: str | None, machine: str | None, cursor: int | None, limit: int
 ) -> tuple[list[DiscoverySummary], int | None]:
-    """Searches for missing effects, newest first."""
+    """Return the searches for missing effects, newest first."""
     rows, after = reader.page("discoveries", {"campaign": campaign, "machine": machine}, cursor, limit)
     return [of_row(DiscoverySummary, row, **_last(_states(reader.store.discoveries.steps(row["id"])))) for row in rows], after
 
 
 def discovery(reader: Reader, number: int) -> DiscoveryDetail:
-    """A search with its states and its answer. Raises NotStored."""
+    """Return a search with its states and its answer. Raises NotStored."""
     row = reader.row("discoveries", number, "discovery")
     states = _states(reader.store.discoveries.steps(number))
     found = next((step.finding for step in stored_steps(reader.store, number) if step.finding is not None), None)
@@ -188,13 +188,13 @@ class Trends:
 def checks(
     reader: Reader, machine: str | None, verdict: str | None, cursor: int | None, limit: int
 ) -> tuple[list[Verification], int | None]:
-    """Checks of all machines, newest first, without those stored in another form."""
+    """Return the checks of all machines, newest first, without those stored in another form."""
     rows, after = reader.page("verifications", {"machine": machine, "verdict": verdict}, cursor, limit)
     return [one for row in rows if (one := _check(row)) is not None], after
 
 
 def check(reader: Reader, number: int) -> Verification:
-    """One check: figures with uncertainties (k = 2), limits, verdict. Raises NotStored, Unusable."""
+    """Return one check: figures with uncertainties (k = 2), limits, verdict. Raises NotStored, Unusable."""
     row = reader.row("verifications", number, "check")
     found = _check(row)
     if found is None:
@@ -203,7 +203,7 @@ def check(reader: Reader, number: int) -> Verification:
 
 
 def latest_checks(reader: Reader, limit: int) -> list[Verification]:
-    """The latest checks of this service's machine, newest first."""
+    """Return the latest checks of this service's machine, newest first."""
     return checks(reader, reader.machine, None, None, limit)[0]
 
 
@@ -213,7 +213,7 @@ def _check(row: Doc) -> Verification | None:
 
 
 def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limit: int = CHECKS) -> Trends:
-    """Whether the figures of a machine's checks drift, since when, and when they reach their limits.
+    """Tell whether the figures of a machine's checks drift, since when, and when they reach their limits.
 
     Uses at most ``limit`` of the checks later than ``after_utc``; None: since the table came into force.
     """

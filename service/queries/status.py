@@ -134,11 +134,11 @@ class StatusSource(Protocol):
     """Source of the status for the pages."""
 
     async def status(self) -> Status:
-        """Content of the home page."""
+        """Return the content of the home page."""
         ...
 
     async def verifications(self, limit: int) -> list[Verification]:
-        """The latest checks, newest first."""
+        """Return the latest checks, newest first."""
         ...
 
     async def ready(self) -> None:
@@ -158,7 +158,7 @@ class StatusReader:
         self.reader, self._version, self._core, self._upcoming, self._broker = reader, version, core, upcoming, broker
 
     async def verifications(self, limit: int) -> list[Verification]:
-        """The latest checks, newest first."""
+        """Return the latest checks, newest first."""
         return await asyncio.to_thread(latest_checks, self.reader, limit)
 
     async def ready(self) -> None:
@@ -167,7 +167,7 @@ class StatusReader:
         _ = self._core.changes
 
     async def status(self) -> Status:
-        """Content of the home page."""
+        """Return the content of the home page."""
         reader, core, upcoming = self.reader, self._core, self._upcoming()
         now, machine = reader.clock.utc(), reader.machine
         job, attention = core.job, core.attention
@@ -201,12 +201,12 @@ class StatusReader:
 
 
 def alarms(store: Store, machine: str, *, every: bool = False) -> list[AlarmSummary]:
-    """Alarms of a machine, newest first: those that are active or not acknowledged, or all of them."""
+    """Return the alarms of a machine, newest first: those that are active or not acknowledged, or all of them."""
     return summaries(folded(store.alarms.entries(machine)), every=every)
 
 
 def summaries(found: Sequence[Alarm], *, every: bool = False) -> list[AlarmSummary]:
-    """Alarms, given oldest first, as people see them: newest first, only the open ones or all."""
+    """Convert alarms, given oldest first, for people: newest first, only the open ones or all."""
     return [_alarm(one) for one in reversed(found) if every or is_open(one)]
 
 

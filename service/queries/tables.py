@@ -69,7 +69,7 @@ class _StatusLookup:
         self._journals: dict[str, JournalView] = {}
 
     def of(self, number: int, proposed: Proposed) -> ProposalStatus:
-        """State of one proposal."""
+        """Return the state of one proposal."""
         store, machine = self._reader.store, proposed.candidate.machine
         if machine not in self._journals:
             self._journals[machine] = JournalView.read(store, machine, self._reader.control_of(machine))
@@ -77,7 +77,7 @@ class _StatusLookup:
 
 
 def proposals(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[ProposalSummary], int | None]:
-    """Proposals, newest first; one with an altered row has the state ``changed`` and does not hide the others."""
+    """Return the proposals, newest first; one with an altered row has the state ``changed`` and does not hide the others."""
     rows, after = reader.page("proposals", {"machine": machine}, cursor, limit)
     statuses = _StatusLookup(reader) if rows else None
     return [_summary(reader, row, statuses) for row in rows if statuses is not None], after
@@ -101,7 +101,7 @@ def _known(row: Doc, proposed: Proposed, status: ProposalStatus) -> Doc:
 
 
 def proposal(reader: Reader, number: int) -> ProposalDetail:
-    """One proposal: predicted improvement with uncertainty, state, and the reasons against it.
+    """Return one proposal: predicted improvement with uncertainty, state, and the reasons against it.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class ProposalDifference:
 
 
 def difference(reader: Reader, number: int, other: int | None = None) -> ProposalDifference:
-    """Changes of a proposal against another one, or against the table in force: nine tables with uncertainty. Raises NotStored."""
+    """Compare a proposal with another one, or with the table in force: nine tables with uncertainty. Raises NotStored."""
     for one in (number, other or number):
         reader.row("proposals", one, "proposal")
     with as_stored():
@@ -165,7 +165,7 @@ def difference(reader: Reader, number: int, other: int | None = None) -> Proposa
 
 
 def difference_of(found: TableDifference) -> ProposalDifference:
-    """A comparison of tables as numbers for programs."""
+    """Convert a comparison of tables to numbers for programs."""
     tables = [
         CurveDifference(
             table=f"{c.corrected} over {c.moved}",
@@ -186,18 +186,18 @@ def difference_of(found: TableDifference) -> ProposalDifference:
 def push_entries(
     reader: Reader, machine: str | None, push: int | None, state: str | None, cursor: int | None, limit: int
 ) -> tuple[list[PushTransition], int | None]:
-    """The push journal, newest entry first; a renamed machine keeps its journal under the first name."""
+    """Return the push journal, newest entry first; a renamed machine keeps its journal under the first name."""
     journal = machine and reader.store.pushes.chain(machine, reader.control_of(machine))
     rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
     return [of_row(PushTransition, row, state=PushState(row["state"])) for row in rows], after
 
 
 def push_entry(reader: Reader, number: int) -> PushEntry:
-    """One entry of the journal with the facts that it recorded. Raises NotStored."""
+    """Return one entry of the journal with the facts that it recorded. Raises NotStored."""
     row = reader.row("pushes", number, "entry of a push")
     return of_row(PushEntry, row, state=PushState(row["state"]))
 
 
 def tables(reader: Reader) -> TableHistory:
-    """The table in force on this service's machine, its pushes, and the possible rollback. Raises JournalChanged."""
+    """Return the table in force on this service's machine, its pushes, and the possible rollback. Raises JournalChanged."""
     return JournalView.read(reader.store, reader.machine, reader.control).history()

@@ -36,7 +36,7 @@ class ScheduleState(Schedule):
 
 
 def next_due(schedule: Schedule, slot_utc: datetime, now: datetime) -> NextDue:
-    """A future slot with its texts for people."""
+    """Return a future slot with its texts for people."""
     return NextDue(
         schedule=schedule.name,
         recipe=schedule.recipe,
@@ -48,7 +48,7 @@ def next_due(schedule: Schedule, slot_utc: datetime, now: datetime) -> NextDue:
 
 
 def schedule_state(reader: Reader, schedule: Schedule) -> ScheduleState:
-    """A schedule with its next slot and the outcome of its latest slots."""
+    """Return a schedule with its next slot and the outcome of its latest slots."""
     return ScheduleState(
         **{name: getattr(schedule, name) for name in Schedule.__dataclass_fields__},
         rule_text=rule_as_text(schedule),
@@ -58,12 +58,12 @@ def schedule_state(reader: Reader, schedule: Schedule) -> ScheduleState:
 
 
 def past_slots(reader: Reader, schedule: str, limit: int) -> list[SlotRecord]:
-    """The latest slots of a schedule of this service's machine, newest first."""
+    """Return the latest slots of a schedule of this service's machine, newest first."""
     return reader.store.slots.latest(f"{reader.machine}/{schedule}", limit)
 
 
 def due_as_text(due: datetime, now: datetime, zone: tzinfo) -> str:
-    """A due time as text: ``Monday 23 November 06:00, in 2 days``."""
+    """Return a due time as text: ``Monday 23 November 06:00, in 2 days``."""
     left_s = (due - now).total_seconds()
     local = due.astimezone(zone)
     clock = f"{local:%H:%M}" if local.second == 0 else f"{local:%H:%M:%S}"
@@ -72,7 +72,7 @@ def due_as_text(due: datetime, now: datetime, zone: tzinfo) -> str:
 
 
 def span(seconds: float) -> str:
-    """A duration in the largest sensible unit: ``40 s``, ``5 min``, ``3 h``, ``2 days``."""
+    """Return a duration in the largest sensible unit: ``40 s``, ``5 min``, ``3 h``, ``2 days``."""
     seconds = abs(seconds)
     if seconds < 90:
         return f"{seconds:.0f} s"

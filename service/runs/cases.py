@@ -104,7 +104,7 @@ def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> P
 
 
 def _feed(run: Run) -> F1:
-    """The feed of every reading, mm/min."""
+    """Return the feed of every reading, mm/min."""
     columns = run.columns
     return _driven_feed(columns.q_mm, columns.t_s, columns.feed_mm_min) if run.is_bar else columns.feed_mm_min
 
@@ -120,7 +120,7 @@ def _driven_feed(q_mm: F2, t_s: F1, feed_mm_min: F1) -> F1:
 
 
 def _away(q_mm: F2, centre_mm: F1, label: str) -> F2:
-    """Unit vectors from the cup to the positions, shape (n, 3)."""
+    """Return the unit vectors from the cup to the positions, shape (n, 3)."""
     away = q_mm - centre_mm
     length = np.linalg.norm(away, axis=1, keepdims=True)
     if not (length > 0).all():
@@ -129,7 +129,7 @@ def _away(q_mm: F2, centre_mm: F1, label: str) -> F2:
 
 
 def _first(at: Places) -> Places:
-    """The first record of a laser run, to which all others are relative."""
+    """Return the first record of a laser run, to which all others are relative."""
     return Places(
         at.q_mm[:1], at.sign[:1], at.since_mm[:1], at.v_mm_s[:1], at.a_mm_s2[:1], at.t_s[:1], {s: v[:1] for s, v in at.temp_c.items()}
     )

@@ -220,23 +220,23 @@ def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:
 
 
 def _setup(start: RunStart, end: RunEnd) -> Doc:
-    """The set-up with its mounting time."""
+    """Return the set-up with its mounting time."""
     return start.setup if end.mounted_us is None else start.setup | {"t_set_s": start.since_zero_s(end.mounted_us)}
 
 
 def pack_columns(columns: Doc) -> list[dict[str, Any]]:
-    """Imported columns (name to list or None) as records for ``json/1``, one per column in order."""
+    """Return the imported columns (name to list or None) as records for ``json/1``, one per column in order."""
     return [{"name": name, "values": values} for name, values in columns.items()]
 
 
 def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
-    """Imported columns (name to list or None) from the chunks of a run, in the order of the file."""
+    """Return the imported columns (name to list or None) from the chunks of a run, in the order of the file."""
     records = [record for chunk in _of(chunks, IMPORTED_CHANNEL, JSON_CODEC) for record in decode_json(chunk.payload)]
     return {record["name"]: record["values"] for record in records}
 
 
 def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord]) -> tuple[Columns, Doc]:
-    """The columns and the ``timing`` document."""
+    """Return the columns and the ``timing`` document."""
     if record.test.startswith("ballbar") and not start.point_by_point:
         bar_chunks = _of(chunks, BAR_CHANNEL, BAR_CODEC)
         samples = [sample for chunk in bar_chunks for sample in decode_bar(chunk.payload)]

@@ -137,7 +137,7 @@ def check_judged(run: Run) -> None:
 
 
 def _of_path(run: Run, start: RunStart) -> float | None:
-    """Share of the commanded path length, or of the planned standstills."""
+    """Return the share of the commanded path length, or of the planned standstills."""
     if run.is_sealed:
         return None
     valid, path = run.columns.valid, start.path
@@ -148,7 +148,7 @@ def _of_path(run: Run, start: RunStart) -> float | None:
 
 
 def _of_setup(run: Run) -> float | None:
-    """Share according to the set-up of a run from a file: turns of a helix, angle of a circle, outward path of a laser run."""
+    """Return the share according to the set-up of a run from a file: turns of a helix, angle of a circle, outward path of a laser run."""
     if run.is_sealed:
         return None
     at, setup = run.columns.q_mm[run.columns.valid], run.setup
@@ -165,7 +165,7 @@ def _of_setup(run: Run) -> float | None:
 
 
 def _turned(setup: BarSetup, at: F2, *, circle: bool) -> float | None:
-    """Share of the turns about the axis of a ball-bar path."""
+    """Return the share of the turns about the axis of a ball-bar path."""
     axis = circle_axis(setup.plane) if circle else helix_axis(setup.axis, at)
     whole = setup.span_deg / 360.0 if circle else setup.turns
     if whole is None or not whole > 0.0:
@@ -190,6 +190,6 @@ def _share(part: float, whole: float) -> float | None:
 
 
 def _read_mm(at: F2, step_mm: float) -> float:
-    """Path length between consecutive valid readings, without gaps, mm."""
+    """Return the path length between consecutive valid readings, without gaps, mm."""
     steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
     return float(steps[steps <= max(GAP_MM, GAP_SAMPLES * step_mm)].sum()) + step_mm

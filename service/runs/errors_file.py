@@ -41,7 +41,7 @@ class KnownErrors:
     unused: list[str]
 
     def warnings(self) -> list[str]:
-        """One line for each unused key, and for each combination of parameters that the measurement could not observe."""
+        """Return one line for each unused key, and for each combination of parameters that the measurement could not observe."""
         return [*self.unused, *(f"not observable: {_combination(one)}" for one in self.not_observable)]
 
 
@@ -70,7 +70,7 @@ def read_errors(path: Path) -> KnownErrors:
 
 
 def _further(part: BaseModel) -> dict[str, Any]:
-    """Keys of a part outside the format."""
+    """Return the keys of a part outside the format."""
     return part.model_extra or {}
 
 
@@ -154,7 +154,7 @@ def _runs(key: str, indices: list[int]) -> list[str]:
 
 
 def _unused(path: Path, found: formats.ErrorsFile) -> list[str]:
-    """One line for each unknown key, except below ``not_observable``."""
+    """Return one line for each unknown key, except below ``not_observable``."""
     parts: list[tuple[str, BaseModel, Iterable[str]]] = [("", found, type(found).model_fields)]
     parts.append(("squareness_rad.", found.squareness_rad, SQUARENESS))
     parts += [(f"motions.{key}.", one, type(one).model_fields) for key, one in found.motions.items()]

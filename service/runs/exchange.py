@@ -73,7 +73,7 @@ def read_folder(folder: Path) -> Folder:
 
 
 def _parsed(path: Path, run: Doc) -> Run:
-    """The run of a checked file. Keys that only Abbe writes, such as ``table``, may still have another type."""
+    """Return the run of a checked file. Keys that only Abbe writes, such as ``table``, may still have another type."""
     try:
         return Run.from_document(run)
     except StoreError as err:

@@ -56,7 +56,7 @@ def with_reversals(run: Run, q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dt
 
 
 def _along(run: Run) -> F1:
-    """Unit vector from start to end of a test."""
+    """Return the unit vector from start to end of a test."""
     way = run.laser.span_mm
     return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
@@ -128,7 +128,7 @@ def _run_data(run: Run, blocks: int) -> RunData:
 
 
 def _signs(run: Run) -> F2:
-    """Direction of each axis' last move, shape (n, 3), from the rows with finite positions; NaN for the others, which are invalid."""
+    """Return the direction of each axis' last move, shape (n, 3), from rows with finite positions; NaN in other rows, which are invalid."""
     axes_mm = run.columns.q_mm
     known = np.isfinite(axes_mm).all(axis=1)
     out = np.full(axes_mm.shape, np.nan)

@@ -56,7 +56,7 @@ class PointsFile:
     unused: list[str]
 
     def place(self, index: int) -> str:
-        """File, row and line of a point, for messages; rows count from 1 below the header."""
+        """Return the file, row and line of a point, for messages; rows count from 1 below the header."""
         return f"{self.path}: row {index + 1} (line {self.lines[index]})"
 
 
@@ -105,7 +105,7 @@ def read_points(path: Path) -> PointsFile:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of each non-blank row, header first."""
+    """Return the line number and cells of each non-blank row, header first."""
     line = 0
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:

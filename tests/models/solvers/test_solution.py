@@ -58,9 +58,9 @@ def test_every_step_diagonal_figure_has_its_uncertainty_and_says_what_is_not_in_
         assert all(figures[f"u_{k}"] > 0 for k in named)
         # R / (2 X) sqrt(2 n) sigma with sigma 0.3 um: 580 x 480 x 430 mm in 12 steps
         assert figures["u_EYX_end_um"] == pytest.approx(np.linalg.norm([580, 480, 430]) / (2 * 480) * np.sqrt(24) * 0.3, rel=1e-3)
-    assert "mirrors" in doc["step_diagonals_note"]
+    assert "mirror tilt" in doc["step_diagonals_note"]
     assert "joint solution" in doc["step_diagonals_note"]
-    assert "that sphere only" in doc["ten_parameter_helix_note"]
+    assert "sphere of their run only" in doc["ten_parameter_helix_note"]
     assert "temperature" in doc["mean_over_volume_note"]
     json.dumps(doc, allow_nan=False)
 
@@ -69,7 +69,7 @@ def test_words_on_the_screen_say_the_same(solved, capsys):
     told = assess(solved)
     _print(told, SolutionFile.read({"campaign": "c1"} | solution_doc(told)))
     text = " ".join(capsys.readouterr().out.split())
-    for words in ("about that sphere only", "Tilt of the mirrors", "temperature", "step diagonals XYZ", "one tool length"):
+    for words in ("on the sphere of their run only", "mirror tilt", "temperature", "step diagonals XYZ", "one tool length"):
         assert words in text
     assert "1 combinations" not in text
     assert any("temperature" in row.note for row in parameter_rows(solved.joint))

@@ -193,7 +193,7 @@ def test_a_model_of_another_geometry_is_not_used(abbe: Call, finds: Callable[[Se
     with Store.open(DB) as store:
         raw = from_store(store, "july")
         told = remove_effects(store, raw, NO_TABLE)
-    line = "model version 1 of VMC-1 is of another geometry and was not used"
+    line = "model version 1 of VMC-1 is for another geometry and was not used"
     assert (told.lines, told.labels, told.campaign.runs) == ((line,), (), raw.runs)
     assert told.doc["machine_model"]["not_for_tables"] == [line]
 

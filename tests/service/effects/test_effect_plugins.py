@@ -65,7 +65,7 @@ def test_an_effect_of_another_package_is_found_and_another_beside_it_too(site: P
     ("text", "why"),
     [
         ("import no_such_module_of_ours", "ModuleNotFoundError"),
-        ("EFFECT = 3", "an Effect or a tuple of them expected, got int"),
+        ("EFFECT = 3", "expected an Effect or a tuple of Effects, got int"),
         ("EFFECT = ()", "offers no effect"),
         ("x = 1", "AttributeError"),
         (GOOD.format(name="backlash", slope=1.0), "the name 'backlash' is taken"),

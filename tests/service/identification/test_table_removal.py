@@ -123,7 +123,7 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
     with Store.open(DB) as store:
         before = from_store(store, "july")
         then = campaign_table(store, before)
-        assert (then.table, then.why) == (None, f"measured with table {crc32(image):08X}, which this database does not know: {NOT_REMOVED}")
+        assert (then.table, then.why) == (None, f"measured with table {crc32(image):08X}, which is not in this database: {NOT_REMOVED}")
         assert prepare(before, catalogue(), None, table=then).flags[-1] == then.why
         store.tables.add(store.campaigns.find("july").machine_id, None, image, crc32(image), {})
         then = campaign_table(store, before)
@@ -152,7 +152,7 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
     x = told.lost_motion_mm["X"]
     assert abs(x.value - WIDTH_MM) < 4.0 * x.u + 1e-3
     assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6"]) == 0
-    assert f"table {crc32(image):08X} was in force: what it did beyond smooth corrections is taken out" in " ".join(
+    assert f"table {crc32(image):08X} was in force: its effect beyond smooth corrections is subtracted" in " ".join(
         capsys.readouterr().out.split()
     )
 
