@@ -321,7 +321,7 @@ def bar_is_valid(status: int) -> bool:
 
 
 def bar_reasons(status: int) -> list[str]:
-    """Reasons why the reading is invalid; empty if it is valid."""
+    """Return the reasons why the reading is invalid; empty if it is valid."""
     return [reason for bit, reason in _BAR_REASONS if status & bit]
 
 

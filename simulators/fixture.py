@@ -24,15 +24,15 @@ class Box(Protocol):
     """Logs of the site and the ball-bar's cable, which the fixture offers to tests."""
 
     def ledger(self) -> Answer:
-        """Samples sent and dropped since the last start."""
+        """Return the numbers of samples sent and dropped since the last START, and the fates of all samples."""
         ...
 
     def commands(self) -> list[Command]:
-        """All commands to the controller so far."""
+        """Return all commands to the controller so far."""
         ...
 
     def table_accesses(self) -> list[TableAccess]:
-        """Every attempt to change the controller's tables so far."""
+        """Return every attempt to change the controller's tables so far."""
         ...
 
     async def unplug(self) -> None:
@@ -158,7 +158,7 @@ class Fixture:
         return {}
 
     def _standing(self) -> Any:
-        """Tool position; refused while the machine moves."""
+        """Return the tool position; refused while the machine moves."""
         if self._world.controller.moving:
             raise FixtureError("the machine is moving")
         return self._world.tool_position()

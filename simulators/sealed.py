@@ -26,14 +26,14 @@ def no_correction(command_mm: F) -> F:
 
 
 def grid(machine: Machine, nodes: int) -> F:
-    """Nodes of a cubic grid over the full stroke: (nodes^3, 3) mm, X outermost."""
+    """Return the nodes of a cubic grid over the full stroke: (nodes^3, 3) mm, X outermost."""
     low, high = machine.geometry.low_mm, machine.geometry.high_mm
     axes = [np.linspace(low[a], high[a], nodes) for a in range(3)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def deviation(machine: Machine, command_mm: F, correction: Correction = no_correction) -> F:
-    """Actual - nominal at n commanded positions: (n, 3) mm. Mean of both approach directions (no backlash), no drift."""
+    """Return actual - nominal position at n commanded positions: (n, 3) mm. Mean of both approach directions (no backlash), no drift."""
     actual = machine.tool_position(command_mm + correction(command_mm))
     nominal: F = command_mm + machine.geometry.tool_mm
     return actual - nominal
@@ -67,12 +67,12 @@ def without_one_axis_functions(deviation_mm: F, nodes: int) -> F:
 
 
 def rms_norm(vectors: F) -> float:
-    """Root mean square of the vectors' lengths."""
+    """Return the root mean square of the vectors' lengths."""
     return float(np.sqrt(np.mean(np.sum(vectors * vectors, axis=1))))
 
 
 def body_diagonals_um(machine: Machine, correction: Correction = no_correction) -> dict[str, float]:
-    """Range (max - min) of the deviation along each body diagonal of the stroke box, µm."""
+    """Return the range (max - min) of the deviation along each body diagonal of the stroke box, µm."""
     low, high = machine.geometry.low_mm, machine.geometry.high_mm
     result = {}
     for name, signs in DIAGONALS.items():

@@ -147,14 +147,14 @@ class Site:
         return self._port.url
 
     def commands(self) -> list[Command]:
-        """All commands to the controller so far."""
+        """Return all commands to the controller so far."""
         return self.registers.log
 
     def table_accesses(self) -> list[TableAccess]:
-        """Every attempt to change the controller's tables so far."""
+        """Return every attempt to change the controller's tables so far."""
         return self.registers.table_log
 
     def ledger(self) -> dict[str, Any]:
-        """Samples sent and dropped since the last start; ``fates``: (stream, first, last, fate) of every sample since the box was made."""
+        """Return the numbers of samples sent and dropped since the last START, and the ``fates`` of all samples (see `BoxLedger`)."""
         self.box.flush()
         return {"samples_sent": self.box.samples_sent, "samples_dropped": self.box.samples_dropped, "fates": self.box.ledger.runs}

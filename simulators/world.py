@@ -67,11 +67,11 @@ class World:
         self.time_s = to_s
 
     def locate(self, times_s: F, axes_mm: F) -> F:
-        """Actual tool position in workpiece coordinates at n instants with the axes at (n, 3) mm: (n, 3) mm, drift included."""
+        """Return the actual tool position in workpiece coordinates at n instants with the axes at (n, 3) mm: (n, 3) mm, drift included."""
         return self.machine.tool_position(axes_mm) + drift(self.draws, times_s)
 
     def tool_position(self) -> F:
-        """Actual tool position now, (3,) mm."""
+        """Return the actual tool position now, (3,) mm."""
         axes = self._axes(np.array([self.time_s]))
         actual: F = self.locate(np.array([self.time_s]), axes)[0]
         return actual

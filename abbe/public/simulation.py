@@ -117,7 +117,7 @@ class _SimulatedMachine:
     cups: dict[str, F1]
 
     def read(self, path: Path, effects: Sequence[tuple[Effect, str, float]]) -> F1:
-        """Readings of a run, mm."""
+        """Return the readings of a run, mm."""
         out = path.read(self._deviation)[:, 0]
         for effect, key, coefficient in effects:
             column = effect.signal((path,), key, {p.name: p.typical for p in effect.shape})[0]
@@ -166,7 +166,7 @@ def _coefficient(effect: Effect, strength: float, values: Values) -> float:
 
 
 def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float, instruments: SimulatedInstruments) -> Run:
-    """A run without readings."""
+    """Return a run without readings."""
     paths = [_path_rows(step, begins_s, instruments) for step in test.steps if isinstance(step, RecordPath)]
     t_s, q_mm, feed, direction = paths[0] if paths else _stationary_rows(test, begins_s)
     return Run(

@@ -89,7 +89,7 @@ Frame = BarSample | Answer | Bad
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: poly 0x1021, init 0xFFFF; ``crc16(b"123456789") == 0x29B1``."""
+    """Return the CRC-16/CCITT-FALSE of bytes (poly 0x1021, init 0xFFFF); ``crc16(b"123456789") == 0x29B1``."""
     return crc_hqx(data, 0xFFFF)
 
 

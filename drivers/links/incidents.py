@@ -122,7 +122,7 @@ class Backoff:
         self._wait_s = 0.0
 
     def left_s(self) -> float:
-        """Seconds until the next attempt is due; 0 if it is due now."""
+        """Return the seconds until the next attempt is due; 0 if it is due now."""
         return max(0.0, self._next_s - self._clock())
 
     async def due(self) -> None:

@@ -147,7 +147,7 @@ class BallbarDevice:
     # ---- time ----------------------------------------------------------------------------------------------------
 
     def due_s(self, until_s: float) -> F:
-        """Instants (world time, s) of the samples to be taken up to ``until_s``."""
+        """Return the instants (world time, s) of the samples to be taken up to ``until_s``."""
         if self.rate_hz == 0:
             return np.empty(0)
         count = (int(until_s * 1e6) - self._start_us) // self._period_us + 1 - self._next

@@ -23,7 +23,7 @@ class BytePort(Protocol):
         ...
 
     def room(self) -> int:
-        """Bytes that can be sent now without losing any."""
+        """Return the number of bytes that can be sent now without losing any."""
         ...
 
     def send(self, data: bytes) -> None:
@@ -58,7 +58,7 @@ class PtyPort:
         return f"serial://{path}?baud={BAUD}"
 
     def room(self) -> int:
-        """Room in the buffer; none while unplugged."""
+        """Return the room in the buffer; none while unplugged."""
         return 0 if self._serial is None else max(0, self._buffer_bytes - self._serial.backlog)
 
     @property
@@ -102,7 +102,7 @@ class TcpPort:
         return f"socket://127.0.0.1:{self._port}"
 
     def room(self) -> int:
-        """Room in the buffer; none without a host."""
+        """Return the room in the buffer; none without a host."""
         if self._writer is None:
             return 0
         return max(0, BUFFER_BYTES - self._writer.transport.get_write_buffer_size())

@@ -69,7 +69,7 @@ _SAMPLE_DTYPE = np.dtype(
 
 
 def _crc_table() -> NDArray[np.uint16]:
-    """CRC-16/CCITT-FALSE of each single byte value."""
+    """Return the CRC-16/CCITT-FALSE of each single byte value."""
     table = []
     for byte in range(256):
         crc = byte << 8
@@ -84,7 +84,7 @@ _TABLE_LIST = [int(v) for v in _TABLE]
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE of some bytes."""
+    """Return the CRC-16/CCITT-FALSE of some bytes."""
     crc = 0xFFFF
     for byte in data:
         crc = ((crc << 8) & 0xFFFF) ^ _TABLE_LIST[(crc >> 8) ^ byte]
@@ -92,13 +92,13 @@ def crc16(data: bytes) -> int:
 
 
 def encode(kind: int, payload: bytes) -> bytes:
-    """One frame."""
+    """Return a frame of this type and payload."""
     body = bytes([kind, len(payload)]) + payload
     return SYNC_BYTES + body + struct.pack("<H", crc16(body))
 
 
 def encode_samples(samples: Samples) -> bytes:
-    """SAMPLE frames of n samples, all at once."""
+    """Return the SAMPLE frames of n samples."""
     frames = np.zeros(len(samples.seq), dtype=_SAMPLE_DTYPE)
     frames["sync"] = (0xA5, 0x5A)
     frames["type"], frames["length"] = SAMPLE, 18
@@ -113,18 +113,18 @@ def encode_samples(samples: Samples) -> bytes:
 
 
 def encode_info(tag: int, boot_id: int, rate_hz: int, serial_no: int = SERIAL_NO, firmware: int = FIRMWARE_BCD) -> bytes:
-    """INFO frame."""
+    """Return an INFO frame."""
     return encode(INFO, struct.pack("<HIIHHH12s", tag, boot_id, serial_no, firmware, MAX_RATE_HZ, rate_hz, MODEL))
 
 
 def encode_settings(tag: int, settings: Settings) -> bytes:
-    """SETTINGS frame."""
+    """Return a SETTINGS frame."""
     nm = (round(settings.range_mm * 1e6), round(settings.zero_mm * 1e6))
     return encode(SETTINGS, struct.pack("<HBBIi", tag, settings.number, settings.inch, *nm))
 
 
 def encode_ack(tag: int, command: int, result: int) -> bytes:
-    """ACK frame."""
+    """Return an ACK frame."""
     return encode(ACK, struct.pack("<HBB", tag, command, result))
 
 

@@ -31,7 +31,7 @@ def empty_image() -> list[int]:
 
 
 def to_bytes(words: list[int]) -> bytes:
-    """Words as big-endian bytes."""
+    """Return words as big-endian bytes."""
     return struct.pack(f">{len(words)}H", *words)
 
 

@@ -55,7 +55,7 @@ class Compensation:
         return True
 
     def owner(self, now_s: float) -> int:
-        """Holder of the lease, 0 = free."""
+        """Return the holder of the lease, 0 = free."""
         return self._owner if now_s < self._lease_end_s else 0
 
     def lease_left_ms(self, now_s: float) -> int:

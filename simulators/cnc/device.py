@@ -54,18 +54,18 @@ class Motion:
         self._vertices = np.vstack([self._vertices, vertices_mm])
 
     def travelled(self, times_s: F) -> F:
-        """Length travelled at n instants, (n,) mm."""
+        """Return the length travelled at n instants, (n,) mm."""
         run = self._ref_mm + self._speed * self._factor * (times_s - self._ref_s)
         clipped: F = np.clip(run, 0.0, self.total_mm)
         return clipped
 
     def position(self, times_s: F) -> F:
-        """Commanded point at n instants: (n, 3) mm."""
+        """Return the commanded point at n instants: (n, 3) mm."""
         run = self.travelled(times_s)
         return np.stack([np.interp(run, self._length, self._vertices[:, a]) for a in range(3)], axis=1)
 
     def end_s(self) -> float:
-        """Instant of arrival at the present speed; infinity on hold."""
+        """Return the instant of arrival at the present speed; infinity on hold."""
         rest = self.total_mm - self._ref_mm
         speed = self._speed * self._factor
         if rest <= 0.0:
@@ -73,7 +73,7 @@ class Motion:
         return self._ref_s + rest / speed if speed > 0.0 else float("inf")
 
     def vertex_times(self, from_s: float, to_s: float) -> F:
-        """Instants in (from_s, to_s] at which a vertex is passed: an axis can reverse there."""
+        """Return the instants in (from_s, to_s] at which a vertex is passed: an axis can reverse there."""
         speed = self._speed * self._factor
         if speed <= 0.0:
             return np.empty(0)
@@ -83,14 +83,14 @@ class Motion:
         return times
 
     def vertices_reached(self, now_s: float) -> int:
-        """Number of vertices reached, without the starting point."""
+        """Return the number of vertices reached, without the starting point."""
         run = float(self.travelled(np.array([now_s]))[0])
         # a thousandth of a nanometre tolerates the rounding of an arrival computed from its own instant
         return int(np.searchsorted(self._length[1:], run + 1e-9, side="right"))
 
 
 def _lengths(vertices_mm: F) -> F:
-    """Length from the first vertex to each: (n,) mm."""
+    """Return the length from the first vertex to each: (n,) mm."""
     steps = np.linalg.norm(np.diff(vertices_mm, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -133,26 +133,26 @@ class Timetable:
         raise ValueError("an NC program runs")
 
     def position(self, times_s: F) -> F:
-        """Commanded point at n instants: (n, 3) mm."""
+        """Return the commanded point at n instants: (n, 3) mm."""
         program = np.clip(self._ref + self._factor * (times_s - self._ref_s), 0.0, self._knots[-1])
         return np.stack([np.interp(program, self._knots, self._places[:, a]) for a in range(3)], axis=1)
 
     def end_s(self) -> float:
-        """Instant at which the program ends at the present factor; infinity on hold."""
+        """Return the instant at which the program ends at the present factor; infinity on hold."""
         rest = float(self._knots[-1]) - self._ref
         if rest <= 0.0:
             return self._ref_s
         return self._ref_s + rest / self._factor if self._factor > 0.0 else float("inf")
 
     def vertex_times(self, from_s: float, to_s: float) -> F:
-        """Instants in (from_s, to_s] at which a block ends: an axis can reverse there."""
+        """Return the instants in (from_s, to_s] at which a block ends: an axis can reverse there."""
         if self._factor <= 0.0:
             return np.empty(0)
         times: F = self._ref_s + (self._knots - self._ref) / self._factor
         return times[(times > from_s) & (times <= to_s)]
 
     def vertices_reached(self, now_s: float) -> int:
-        """Number of blocks done."""
+        """Return the number of blocks done."""
         return int(np.searchsorted(self._knots[1:], self._program_s(now_s) + 1e-12, side="right"))
 
     def _program_s(self, now_s: float) -> float:
@@ -255,17 +255,17 @@ class Controller:
         return not blocked and s.remote and s.referenced and self.drives_on
 
     def commanded(self, times_s: F) -> F:
-        """Commanded positions at n instants from now until the next command: (n, 3) mm."""
+        """Return the commanded positions at n instants from now until the next command: (n, 3) mm."""
         if self._motion is None:
             return np.repeat(self.position_mm[None, :], times_s.size, axis=0)
         return self._motion.position(times_s)
 
     def turning_times(self, until_s: float) -> F:
-        """Instants after now and up to ``until_s`` at which the commanded point passes a vertex."""
+        """Return the instants after now and up to ``until_s`` at which the commanded point passes a vertex."""
         return np.empty(0) if self._motion is None else self._motion.vertex_times(self.now_s, until_s)
 
     def sync_level(self, times_s: F) -> B:
-        """Level of the path-running output at n instants from now on."""
+        """Return the level of the path-running output at n instants from now on."""
         if not self.path_running or self._motion is None:
             return np.zeros(times_s.size, dtype=np.bool_)
         level: B = (times_s >= self.path_start_s) & (times_s < self._motion.end_s())

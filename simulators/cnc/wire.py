@@ -26,7 +26,7 @@ _BANKS_AT = (1000, 6000)
 
 
 def words(data: bytes) -> list[int]:
-    """Bytes as big-endian registers."""
+    """Return bytes as big-endian registers."""
     return list(struct.unpack(f">{len(data) // 2}H", data))
 
 
@@ -54,7 +54,7 @@ class CncRegisters:
     # ---- reading -------------------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> list[int] | None:
-        """Words of one read request, None for an illegal address."""
+        """Return the words of one read request, None for an illegal address."""
         self._advance()
         for number, base in enumerate(_BANKS_AT):
             if base <= address and address + count <= base + BANK_WORDS:
@@ -114,7 +114,7 @@ class CncRegisters:
         return sum(1 << i for i, bit in enumerate(bits) if bit)
 
     def _done_number(self) -> int:
-        """Number of the last motion command that has finished."""
+        """Return the number of the last motion command that has finished."""
         if self._waiting is not None and self._cnc.motions_done >= self._waiting[1]:
             self._motion_done, self._waiting = self._waiting[0], None
         return self._motion_done
@@ -241,5 +241,5 @@ class CncRegisters:
 
 
 def _us(time_s: float) -> int:
-    """Seconds as whole microseconds."""
+    """Return seconds as whole microseconds."""
     return round(time_s * 1e6)

@@ -72,7 +72,7 @@ class LaserDevice:
 
     @staticmethod
     def tick_before(time_s: float) -> int:
-        """Number of the last output sample at or before an instant."""
+        """Return the number of the last output sample at or before an instant."""
         return int(np.floor(time_s * RATE_HZ + 1e-6))
 
     def record(self, count: int, time_s: float, axes_mm: F) -> None:
@@ -80,7 +80,7 @@ class LaserDevice:
         self._pending = (count, time_s, axes_mm)
 
     def output(self) -> Output:
-        """Newest output sample."""
+        """Return the newest output sample."""
         if self._pending is not None:
             count, time_s, axes_mm = self._pending
             self._pending = None
@@ -171,7 +171,7 @@ class LaserDevice:
 
 
 def _sideways(rng: np.random.Generator, direction: F, size_urad: tuple[float, float]) -> F:
-    """Small vector perpendicular to a unit vector: random direction, length uniform between the ends (given in µrad)."""
+    """Return a small random vector perpendicular to a unit vector; its length is uniform between the ends (given in µrad)."""
     across = rng.normal(size=3)
     across -= direction * (direction @ across)
     vector: F = across / np.linalg.norm(across) * rng.uniform(*size_urad) * 1e-6

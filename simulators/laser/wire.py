@@ -32,7 +32,7 @@ class LaserRegisters:
         self._ack, self._result = 0, LaserResult.OK
 
     def read(self, address: int, count: int) -> list[int] | None:
-        """Words of one read request, None for an illegal address."""
+        """Return the words of one read request, None for an illegal address."""
         self._advance()
         end = address + count
         if end <= 28:

@@ -37,7 +37,7 @@ class FunctionSet:
     start_mm: float
 
     def __call__(self, position_mm: F) -> F:
-        """Values of the m functions at n positions: shape (n,) in mm gives (n, m)."""
+        """Return the values of the m functions at n positions: shape (n,) in mm gives (n, m)."""
         x = position_mm[:, None]
         m = self.offset.size
         waves = np.cos(x * self.wavenumber.reshape(1, -1) + self.phase.reshape(1, -1)) * self.amplitude.reshape(1, -1)
@@ -157,14 +157,14 @@ def draw_machine(scenario: Scenario) -> Draws:
 
 
 def _axis_rms(rng: np.random.Generator, sizes: Magnitudes, axis: int) -> F:
-    """Root mean squares of the six motions of one carriage: (6,), mm and rad."""
+    """Return the root mean squares of the six motions of one carriage: (6,), mm and rad."""
     linear = rng.uniform(*sizes.straightness_rms_um, size=3) * UM
     linear[axis] = rng.uniform(*sizes.positioning_rms_um) * UM
     return np.concatenate([linear, rng.uniform(*sizes.angle_rms_urad, size=3) * URAD])
 
 
 def _slopes(axis: int, scale: float, angle_slope: F, stroke_mm: Pair) -> F:
-    """Slopes per mm of the six motions of one carriage: (6,). Straightness has none: its slope is squareness."""
+    """Return the slopes per mm of the six motions of one carriage: (6,). Straightness has none: its slope is squareness."""
     slopes = np.zeros(6)
     slopes[axis] = scale
     slopes[3:] = angle_slope / (stroke_mm[1] - stroke_mm[0])

@@ -32,7 +32,7 @@ class Machine:
         """Scale error (mm/mm) added after the draw, about the start of each stroke."""
 
     def motions(self, axis: int, position_mm: F) -> tuple[F, F]:
-        """Translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""
+        """Return translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""
         new = np.diff(position_mm, prepend=np.nan) != 0.0  # evaluate repeated positions of a resting axis once
         values = self.draws.motions[axis](position_mm[new])[np.cumsum(new) - 1]
         shift = values[:, :3].copy()
@@ -46,7 +46,7 @@ class Machine:
         return shift, values[:, 3:]
 
     def tool_position(self, axes_mm: F) -> F:
-        """Position of the functional point relative to the workpiece, mm: axis positions (n, 3) give (n, 3).
+        """Return the position of the functional point relative to the workpiece, mm: axis positions (n, 3) give (n, 3).
 
         Without errors this is axis positions + tool_mm.
         """

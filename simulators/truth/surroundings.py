@@ -9,7 +9,7 @@ from abbe.simulators.truth.draws import STREAM_AIR, Draws, generator
 
 
 def drift(draws: Draws, time_s: F) -> F:
-    """Thermal displacement of the tool relative to the workpiece at n times since power-on: (n,) s gives (n, 3) mm."""
+    """Return the thermal displacement of the tool relative to the workpiece at n times since power-on: (n,) s gives (n, 3) mm."""
     growth = -np.expm1(-time_s / draws.drift_tau_s)
     moved: F = growth[:, None] * draws.drift_mm
     return moved
