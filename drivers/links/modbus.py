@@ -18,23 +18,11 @@ from pymodbus import FramerType
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
-from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout
+from abbe.drivers.errors import BadFrame, DriverError, LinkDown, ReplyTimeout, run_to_end
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 
 _TCP_HEADER = 7
 _READ = (3, 4)
-
-EXCEPTION_TEXT = {
-    1: "illegal function",
-    2: "illegal data address (or not writable)",
-    3: "illegal data value",
-    4: "device failure",
-    5: "acknowledged, still busy with it",
-    6: "busy",
-    8: "memory parity error",
-    10: "gateway path unavailable",
-    11: "gateway target does not respond",
-}
 
 
 def tcp_mismatch(sent: bytes, heard: bytes) -> str:
@@ -128,6 +116,10 @@ class ModbusReply:
     exception: int = 0
 
 
+TURNS_TO_OPEN = 2
+"""Turns of the event loop after which pymodbus knows a serial port that it has opened."""
+
+
 class ModbusWire:
     """The connection to one Modbus unit, at most one at a time."""
 
@@ -161,15 +153,14 @@ class ModbusWire:
         """
         await self.drop()
         client, self._lost, self.strays = self._new_client(timeout_s), False, 0
-        connected = False
+        # In a task: before Python 3.12, the wait_for in connect() swallows a cancellation that meets its result.
+        connecting, connected = asyncio.create_task(client.connect()), False
         try:
-            async with asyncio.timeout(timeout_s):
-                connected = await client.connect()
-        except TimeoutError:
-            pass
+            await asyncio.wait({connecting}, timeout=timeout_s)
+            connected = connecting.done() and connecting.result()
         finally:
             if not connected:
-                client.close()
+                await run_to_end(_given_up(client, connecting))
         if not connected:
             raise LinkDown(self.name, "connect", "refused, busy or unreachable", self._remedy())
         self._client = client
@@ -320,3 +311,12 @@ class ModbusWire:
         if not connected:
             self._lost = True
             self._interrupt()
+
+
+async def _given_up(client: AsyncModbusTcpClient | AsyncModbusSerialClient, connecting: asyncio.Task[bool]) -> None:
+    """End an attempt to connect, and close what it has opened so far."""
+    connecting.cancel()
+    await asyncio.wait({connecting})
+    for _ in range(TURNS_TO_OPEN):
+        await asyncio.sleep(0)
+    client.close()

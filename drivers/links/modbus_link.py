@@ -298,7 +298,11 @@ class ModbusLink:
             No answer at the address, or the serial port cannot be opened.
         """
         link = cls(url, timeout_s=timeout_s, canary=canary, backoff=backoff, heartbeat_s=heartbeat_s)
-        await link._ready(_PATIENCE_S)
+        try:
+            await link._ready(_PATIENCE_S)
+        except BaseException:
+            await link.close()
+            raise
         if link._heartbeat_s is not None:
             link._pulse = asyncio.get_running_loop().create_task(link._beat(link._heartbeat_s))
         return link

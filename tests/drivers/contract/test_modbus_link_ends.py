@@ -52,6 +52,23 @@ async def test_nobody_there(tcp_peer):
         await ModbusLink.connect(parse_url("modbus+rtu:///dev/no-such-port"))
 
 
+async def test_a_cancellation_while_connecting_is_never_lost(peer):
+    """Also in the turn of the event loop in which the connection comes up; and no connection stays open."""
+    for turns in range(20):
+        connecting = asyncio.create_task(ModbusLink.connect(parse_url(peer.url)))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        if connecting.done():
+            await connecting.result().close()
+            break
+        connecting.cancel()
+        await asyncio.wait({connecting})
+        assert connecting.cancelled(), f"cancelled after {turns} turns"
+    link = await ModbusLink.connect(parse_url(peer.url))  # the port is free
+    await link.close()
+    assert turns > 2
+
+
 async def test_a_port_in_use_is_refused(rtu_peer):
     first = await ModbusLink.connect(parse_url(rtu_peer.url))
     with pytest.raises(LinkDown, match="another program"):

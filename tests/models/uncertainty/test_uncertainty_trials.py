@@ -42,7 +42,7 @@ def test_trials_give_the_propagated_uncertainty_and_validate_its_intervals(sourc
     """GUM-S1 8: ends of the 95 % interval agree within half a unit of the first digit of u; u within its sampling error."""
     points = POINTS[:2] if LONG else POINTS[2:3]  # there u has a smaller first digit: fewer trials judge it
     draw = campaign_trials(sources, points, frame=FRAME).linear()
-    found = adaptive(draw, np.random.default_rng(1), digits=1, share=VALIDATION_SHARE, largest=400_000 if LONG else 100_000)
+    found = adaptive(draw, np.random.default_rng(1), digits=1, share=VALIDATION_SHARE, largest=400_000)
     p = predict_deviation(sources, points, frame=FRAME)
     assert validate(p.deviation_mm.ravel(), p.expanded_mm.ravel(), found).valid.all()
     np.testing.assert_allclose(found.u, p.u_mm.ravel(), rtol=5.0 / np.sqrt(2.0 * found.trials))
@@ -66,7 +66,7 @@ def test_limits_make_shorter_intervals_than_the_law_of_propagation_says(solution
     point = np.array([[580.0, 20.0, 20.0]])
     p = predict_deviation(hot, point, frame=FRAME)
     draw = campaign_trials(hot, point, frame=FRAME, distributions=LIMITS).linear()
-    found = adaptive(draw, np.random.default_rng(3), digits=1, share=VALIDATION_SHARE, largest=200_000 if LONG else 100_000)
+    found = adaptive(draw, np.random.default_rng(3), digits=1, share=VALIDATION_SHARE, largest=400_000)
     assert found.u[0] == pytest.approx(p.u_mm[0, 0], rel=0.02)
     assert (found.symmetric.width / found.u)[0] < 2 * 1.75
     assert not validate(p.deviation_mm.ravel(), p.expanded_mm.ravel(), found).valid[0]
