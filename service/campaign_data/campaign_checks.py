@@ -155,8 +155,10 @@ def _timed(run: Run, rows: Counter[Any]) -> Counter[Any]:
 
 
 def _shows_noise(run: Run) -> bool:
-    """Whether the readings show noise, so that a repeated measurement would differ: places visited again read differently, or, without
-    repeated places, the second differences exceed those from rounding."""
+    """Whether the readings show noise, so that a repeated measurement would differ.
+
+    Then places visited again read differently; without such places, the second differences exceed those from rounding.
+    """
     y, columns = run.columns.readings_mm, run.columns
     states = map(tuple, np.column_stack([columns.q_mm, columns.direction]).tolist())
     places: dict[Any, list[float]] = {}

@@ -1,7 +1,7 @@
 """Listens to a program that the operator starts: reads the laser continuously and turns its standstills into the readings of the recipe.
 
-For controllers that Abbe does not move. Abbe writes nothing to the controller; of its status it uses the clock, the position and "NC
-program running". Sample times are those of the laser's own clock, converted to the controller's.
+This is for controllers that Abbe does not move. Abbe writes nothing to the controller and uses only its clock, its position and the status
+"NC program running". Sample times are those of the laser's own clock, converted to the controller's.
 """
 
 from __future__ import annotations

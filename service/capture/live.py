@@ -1,7 +1,7 @@
-"""Readings of a running path for live views: a bounded copy beside the recording, which never waits and may drop data.
+"""Readings of a running path for live views: a bounded copy that never delays the recording and may drop data.
 
-The driver's thread puts batches in (`LiveFeed.take`), the event loop takes stretches out. Batches that wait too long are dropped from the
-live view only: the recorder already has every sample.
+The driver's thread puts batches in (`LiveFeed.take`), and the event loop takes stretches out. Batches that wait too long are dropped from
+the live view only: the recorder already has every sample.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class CaptureLog:
     """Writes one run's segment, which must be new and empty.
 
     ``opening``: content of the first record. ``durable`` is called with offset and length of every record that reached the disk,
-    ``published`` when ``durable_seq`` has risen.
+    ``published`` when more samples are durable.
     """
 
     def __init__(

@@ -318,7 +318,7 @@ def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
     if version != VERSION:
         raise CaptureFault(
             f"a record of format {version}: this segment was made by a newer version of this program",
-            "start the newer version once, it recovers the run; nothing was changed",
+            "start the newer version once: it recovers the run; nothing was changed",
         )
     payload = bytes(data[at + HEAD_BYTES : body_end])
     names = (channel.rstrip(b"\0").decode(), codec.rstrip(b"\0").decode())

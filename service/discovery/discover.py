@@ -45,10 +45,10 @@ Thin = Callable[[list[Run]], list[Run]]
 class DiscoveryJob:
     """Input of a discovery.
 
-    ``campaign``: as measured; ``runs``: its runs, decimated (`abbe.service.campaign_data.decimation`), without the effect of an active
-    table; ``case``: the same without the effects of the model book; ``known_mm``: these effects by run; ``known``: their labels; ``base``:
-    the book version they are from; ``flags``: oddities of single runs, and what decimation hides; ``thinning``: the decimation in numbers,
-    None without any; ``table_mm``: the subtracted effect of an active table by run; ``since``: the solution to compare with.
+    ``campaign``: as measured. ``runs``: its runs, decimated (`abbe.service.campaign_data.decimation`) and without the effect of an active
+    table (``table_mm``, by run). ``case``: these runs without the effects of the model book: ``known_mm``, by run, with the labels
+    ``known`` from version ``base``. ``flags``: oddities of single runs, and what decimation hides. ``thinning``: the decimation in
+    numbers, None without any. ``since``: the solution to compare with.
 
     ``expected_version``: the version that must still be the current one when this discovery adds its own. It is the newest version, or the
     version that the continued discovery of the same readings added.

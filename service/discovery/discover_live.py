@@ -115,7 +115,7 @@ async def measure_added(session: Session, store: Store, site: Site, campaign: Ca
     Returns
     -------
     float
-        0.0 after the measurement. Otherwise the seconds until it can begin; nothing was asked or moved.
+        0.0 after the measurement. If it is too early to begin, the seconds until then; nothing was asked or moved.
 
     Raises
     ------

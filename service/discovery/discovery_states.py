@@ -64,7 +64,7 @@ def ending(finding: Finding, judged: Judgement) -> DiscoveryStep:
 
 
 def not_entered(finding: Finding, judged: Judgement) -> str | None:
-    """Return the reason to keep a finding out of the model book; None if its `entering` effects are added: proved, without close rivals."""
+    """Return the reason to keep a finding out of the model book; None if it is proved, needed and without close rivals."""
     if judged.proved is not True:
         return f"it is not proved: {judged.rule}"
     if finding.beside:
@@ -79,7 +79,7 @@ def not_entered(finding: Finding, judged: Judgement) -> str | None:
 
 
 def with_proof(finding: Finding) -> Finding:
-    """Add the result of the holdout runs to a finding. Effects that they refute become suspects, and the verdict "unknown"."""
+    """Add the result of the holdout runs to a finding. Effects that they refute become suspects, and the verdict becomes "unknown"."""
     if not finding.effects:
         return finding
     judged = judge(finding)
@@ -112,7 +112,7 @@ def entering(finding: Finding) -> tuple[EffectFound, ...]:
 def judge(finding: Finding) -> Judgement:
     """Judge by the holdout runs how much of the gap closes, and whether that proves the finding.
 
-    If they cannot judge, effects are rejected if they leave a gap above `LEFT` times the noise in the fitted runs.
+    If they cannot judge, effects that leave a gap above `LEFT` times the noise in the fitted runs are rejected.
     """
     moving = any(e.kind == "mean" for e in _names(finding))
     found = _judged(finding, moving=moving)

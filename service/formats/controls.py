@@ -273,7 +273,7 @@ class _Builder:
 
 
 def _added_by(product: ProductTable, points_mm: F2) -> F2:
-    """Return the correction by one product, which the other tables need not make."""
+    """Return the correction by one product, by which the other tables are reduced."""
     return correction_at(Compensation(products=(product,)), points_mm)
 
 

@@ -19,7 +19,7 @@ from abbe.models.geometry.chain import deviation_mm, squareness_motions
 from abbe.models.machine import AXES, Machine
 
 Lookup = Literal["command", "corrected"]
-"""Argument of cross, product and grid tables: the command, or the position corrected by the own-axis tables."""
+"""Position at which cross, product and grid tables are looked up: the command, or the command corrected by the own-axis tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ def correction_at(comp: Compensation, axes_mm: F2, direction: F2 | None = None, 
     direction : array, shape (n, 3), optional
         Direction of motion of each axis, +1 or −1; None: the mean of both.
     lookup : "command" or "corrected"
-        Argument of all tables but the own-axis ones.
+        Position at which all tables but the own-axis ones are looked up (`Lookup`).
 
     Returns
     -------

@@ -46,7 +46,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        There are a grid or error motions, or a table exceeds a limit or MD18342 (``settings.points``).
+        There is a grid or an error motion, or a table exceeds a limit or MD18342 (``settings.points``).
     """
     limits = LIMITS if settings.points is None else FormatLimits(points=settings.points, equidistant=True, cross=True, products=True)
     check_kinds(comp, limits, WHAT)

@@ -24,8 +24,8 @@ from abbe.service.storage.store import Store
 class RemovedEffects:
     """A campaign without the effects that tables cannot correct.
 
-    ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the book was not used;
-    ``version``: of the model, None without a book; ``in_force``: the active table whose side effects were subtracted
+    ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the model book was not
+    used; ``version``: of the book, None without one; ``in_force``: the active table whose side effects were subtracted
     (`abbe.service.identification.table_removal.remove_table`), None without one; ``not_removed``: why the side effects of a table remain
     in the readings, empty otherwise.
     """

@@ -58,7 +58,7 @@ ENOUGH, HALF = 0.8, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """``word``: one of `VERDICTS`; ``text``: its basis in numbers; ``reasons``: why it is not better."""
+    """Verdict on a solution. ``word``: one of `VERDICTS`; ``text``: its basis in numbers; ``reasons``: why it is not better."""
 
     word: str
     text: str

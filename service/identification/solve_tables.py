@@ -65,7 +65,7 @@ def grid_text(table: GridTable) -> str:
 
 
 def monte_carlo(found: Assessment, progress: ProgressText) -> MonteCarloCheck:
-    """Check the 95 % intervals at the point with the largest U by Monte Carlo trials (GUM Supplement 1); limits count as rectangular."""
+    """Check the 95 % intervals at the point with the largest U by Monte Carlo trials (GUM-S1); stated limits are rectangular."""
     p, at = found.prediction, worst_point(found.prediction)
     trials = campaign_trials(found.sources, p.points_mm[at : at + 1], frame=volume_frame(found.joint.machine), distributions=LIMITS)
     draw, done = trials.linear(), 0

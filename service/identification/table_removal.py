@@ -33,7 +33,7 @@ NOT_REMOVED = "the effect of tables beyond smooth corrections, above all with lo
 
 @dataclass(frozen=True)
 class RemovedTable:
-    """``force``: the applied tables, lost motion included; ``stays``: the part that stays in the readings."""
+    """Effect of a table. ``force``: the applied tables, lost motion included; ``stays``: the part that stays in the readings."""
 
     force: AppliedTables
     stays: AppliedTables

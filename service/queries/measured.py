@@ -55,8 +55,8 @@ class RunSummary(RunFacts):
 class CampaignDetail(CampaignSummary):
     """A campaign with its runs in the order of measurement, and the numbers of its solutions and discoveries.
 
-    ``incidents``: of the links while it was measured, None for an imported campaign; ``incidents_not_written``: those that the database
-    did not get in time.
+    ``incidents``: incidents of the device links during the measurement, None for an imported campaign; ``incidents_not_written``: number
+    of those that the database did not get in time.
     """
 
     runs: list[RunSummary]
@@ -284,5 +284,7 @@ def _chunks(store: Store, run: int, channel: str, first: int, limit: int) -> tup
     found = store.chunks.between(run, channel, wanted[0], wanted[-1])
     for chunk in found:
         if zlib.crc32(chunk.payload) != chunk.crc32:
-            raise StoreError(f"run {run}, chunk {chunk.seq} of channel {channel!r}: stored bytes do not match their CRC")
+            raise StoreError(
+                f"run {run}, chunk {chunk.seq} of channel {channel!r}: stored bytes do not match their CRC", "restore a backup"
+            )
     return found, slice(first - before, first - before + limit), at

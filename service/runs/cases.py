@@ -124,7 +124,9 @@ def _away(q_mm: F2, centre_mm: F1, label: str) -> F2:
     away = q_mm - centre_mm
     length = np.linalg.norm(away, axis=1, keepdims=True)
     if not (length > 0).all():
-        raise MeasurementFault(f"run {label}: a reading is on the cup's centre, where the bar has no direction")
+        raise MeasurementFault(
+            f"run {label}: a reading is on the cup's centre, where the bar has no direction", "correct centre_mm or the positions"
+        )
     return np.asarray(away / length)
 
 

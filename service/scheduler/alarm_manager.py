@@ -60,7 +60,7 @@ class Duties:
     investigate : callable
         ``await investigate(alarm, note, progress, control)``.
     push : callable or None
-        ``await push(order)`` returns the outcome as far as it learned it; None: the service does not push by itself.
+        ``await push(order)`` returns the outcome as far as it is known; None: the service does not push by itself.
     """
 
     warn_days: float
@@ -119,7 +119,7 @@ class AlarmManager(RetryingStore):
             alarms = [one for one in folded(entries) if one.active]
             return self._check_again(alarms) or await self._push(entries) or self._investigation(alarms)
         except StoreError as trouble:
-            log.warning("alarms unreadable; retry", cause=trouble.detail)
+            log.warning("the alarms cannot be read; trying again later", cause=trouble.detail)
             return None
 
     async def _pushes_settled(self, entries: list[AlarmEntryRecord]) -> list[AlarmEntryRecord]:
@@ -235,7 +235,7 @@ class AlarmManager(RetryingStore):
                 event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": doc["text"]})
                 await asyncio.to_thread(self._channels.audit.write, event)
             except AbbeError as error:  # the entry itself is stored: a service that ended here would raise no more alarms
-                log.error("audit record failed", cause=error.detail)
+                log.error("the audit record of an alarm was not written", cause=error.detail)
         return entry
 
 

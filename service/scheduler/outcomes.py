@@ -1,4 +1,4 @@
-"""Waiting slots, and outcomes of slots whose check did not simply run: state (at most 30 characters), code of the alarm, sentence for both.
+"""Waiting slots, and outcomes of slots without a normal run: state (at most 30 characters), code of the alarm, sentence for both.
 
 The job writes ``done: <verdict>``; ``interrupted`` is also written when the service is stopped. All others are made here:
 ``missed: <how> late`` (moving a machine hours after the planned time would surprise anyone next to it), ``skipped: busy``,

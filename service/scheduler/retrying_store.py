@@ -43,7 +43,7 @@ class RetryingStore:
             try:
                 return await once()
             except StoreError as trouble:
-                log.warning("store retry", cause=trouble.detail, pause_s=pause_s)
+                log.warning("the database did not answer; trying again", cause=trouble.detail, pause_s=pause_s)
                 await self._clock.sleep(pause_s)
         return await once()
 

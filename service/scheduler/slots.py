@@ -5,7 +5,7 @@ at the first instant after the gap; a time that exists twice (autumn) is due onc
 few minutes run through both hours. Intervals count in UTC from a fixed instant, so that every process and every restart finds the same
 slots. Windows, for maintenance and for staffed hours, are judged in the wall time of their zone.
 
-cronsim only counts here, on clocks without zones: with a zone of its own it loses slots where the clocks change by half an hour
+cronsim is used on wall times without a zone: given a zone, it loses slots where the clocks change by half an hour
 (``20 */6 * * *`` in Australia/Lord_Howe, 2026-04-05 06:20; found by tests/service/core/test_two_years.py).
 """
 
