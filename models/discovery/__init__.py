@@ -1,1 +1,1 @@
-"""Discovery: where simulation and measurement disagree, which effect is missing, and what it changes. Pure: arrays in, findings out."""
+"""Discovery: where simulation and measurement disagree, and which physical effect is missing. Pure functions of arrays."""

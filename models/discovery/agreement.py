@@ -17,13 +17,13 @@ from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.probability import f_above
 
 LAGS = 10
-"""Lags over which remaining memory of the whitened noise is summed: by then the usual memory (`noise.MEMORY`) has faded to 6 %, and more
-lags would add more noise than memory."""
+"""Lags over which the autocorrelation of the whitened noise is summed: at the last, the usual memory (`instrument_noise.MEMORY`) has fallen
+to 6 %, and more lags would add mainly noise."""
 BLOCKS, SHORTEST = 12, 8
-"""Blocks per run: they resolve up to six periods, and eight or more remain after cup and length are fitted. Shortest block in readings: the
-usual memory has faded to a tenth, so sums are nearly independent."""
+"""Blocks per run: they resolve up to six periods, and eight or more remain after cup and length are fitted. Readings in the shortest block:
+the usual memory has fallen to a tenth there, so block sums are nearly independent."""
 FREE_MM = 1.0
-"""Wide prior of the unknowns that a run has for itself."""
+"""Wide prior of a run's own unknowns."""
 NO_NOISE = "the fitted runs do not tell the noise of their instrument"
 TOO_FEW = "too few of their readings count"
 
@@ -32,8 +32,9 @@ TOO_FEW = "too few of their readings count"
 class _Noise:
     """Whitened noise of one instrument, estimated from the fitted runs.
 
-    ``variance``: of a reading, over the assumed one. ``freedom``: its degrees of freedom. ``spread``: variance of the mean square over that
-    of independent normal readings. ``long``: long-run variance over that of a reading, 1 or more.
+    ``variance``: ratio of a reading's variance to the assumed one. ``freedom``: degrees of freedom of this estimate. ``spread``: ratio of
+    the variance of the mean square to that of independent normal readings. ``long``: ratio of the long-run variance to that of a reading, 1
+    or more.
     """
 
     variance: float
@@ -45,11 +46,12 @@ class _Noise:
 def agreements(
     problem: WhitenedProblem, solved: SolvedModel, predicted_mm: Mapping[str, F1]
 ) -> tuple[tuple[Agreement, ...], tuple[Unjudged, ...]]:
-    """Agreement of every holdout run with a solution without effects, the worst first.
+    """Test the agreement of every holdout run with a solution without effects; the worst first.
 
-    A run's whitened residual, reading by reading and in block sums (sensitive to smooth deviations), is weighted by the inverse covariance
-    of noise and prediction together. Its mean square over that of the fitted runs of the same instrument follows an F distribution, with
-    fewer degrees of freedom where readings have memory or long tails. p is twice the smaller of the two.
+    A run's whitened residual is tested twice, reading by reading and in block sums (sensitive to smooth deviations), weighted by the
+    inverse covariance of noise and prediction together. The ratio of its mean square to that of the fitted runs of the same instrument
+    follows an F distribution, with fewer degrees of freedom where readings are correlated or have long tails. p is twice the smaller p of
+    both tests.
 
     Parameters
     ----------
@@ -62,8 +64,7 @@ def agreements(
     tuple of Agreement
         ``p`` family-wise over the runs (Sidak).
     tuple of Unjudged
-        Runs of an instrument whose noise is unknown (never fitted, or its runs only determine unknowns), and runs with too few valid
-        readings.
+        Runs of an instrument whose noise is unknown (not fitted, or without degrees of freedom), and runs with too few valid readings.
     """
     noise = {kind: _noise(problem, kind) for kind in problem.colours}
     root = _root(solved.theta_covariance)
@@ -109,10 +110,10 @@ def _noise(problem: WhitenedProblem, kind: str) -> _Noise | None:
 def _white(
     problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, fitted_setups: set[str]
 ) -> tuple[F2, int]:
-    """Whitened residual of a run's valid readings, then columns of the prediction's uncertainty (one standard deviation each).
+    """Columns for the valid readings of a run: whitened residual, then uncertainties of the prediction (one standard deviation each).
 
-    Also the number of columns, the last ones, that are the run's own unknowns. One standard deviation is that of the assumed noise;
-    `_tested` applies the ratio of estimated to assumed noise.
+    Also returns how many of the last columns are the run's own unknowns. Readings are whitened with the assumed noise; `_tested` applies
+    the ratio of estimated to assumed noise.
     """
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
@@ -125,7 +126,7 @@ def _white(
 
 
 def _worse(white: F2, free: int, known: _Noise) -> tuple[float, float] | None:
-    """Rms over the allowed one, and p: the worse of single readings and block sums; None where neither can be tested."""
+    """Ratio of rms to expected rms, and p: the worse of single readings and block sums; None if neither can be tested."""
     tests = [_tested(white, free, known, 1.0, known.spread), _tested(_sums(white), free, known, known.long, 1.0)]
     tested = [t for t in tests if t is not None]
     if not tested:
@@ -144,11 +145,11 @@ def _sums(white: F2) -> F2:
 
 
 def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float) -> tuple[float, float] | None:
-    """Rms over the allowed one, and p; None where too few degrees of freedom remain.
+    """Ratio of rms to expected rms, and p; None where too few degrees of freedom remain.
 
-    The last ``free`` columns are the run's own unknowns. They use as many degrees of freedom as the values determine (a circle about its
-    cup three, not four; sums over whole turns hardly any). ``variance``: of the values' noise over that of a reading. ``spread``: as in
-    `_Noise`.
+    The last ``free`` columns are the run's own unknowns. They take as many degrees of freedom as the values determine (for a circle about
+    its cup three, not four; for sums over whole turns hardly any). ``variance``: ratio of the values' noise variance to that of a reading.
+    ``spread``: as in `_Noise`.
     """
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
     inner = known.T @ known

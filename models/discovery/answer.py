@@ -1,4 +1,4 @@
-"""Result of a discovery, in mm, rad and s; the service renders it as the answer of run-format.md 5 and as text."""
+"""Result of a discovery, in mm, rad and s; the service writes it as JSON (docs/schemas/discovery.schema.json) and as text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Verdict = Literal["none", "named", "unknown"]
 @dataclass(frozen=True)
 class Significance:
     """One localization test: ``kind`` ("run", "test", "axis", "direction", "feed", "time", "position", "frequency",
-    "temperature", "instrument"), ``value`` (which one, for people), statistic, and family-wise p-value."""
+    "temperature", "instrument"), ``value`` (which of them, as text), statistic, and family-wise p-value."""
 
     kind: str
     value: str
@@ -24,8 +24,8 @@ class Significance:
 
 @dataclass(frozen=True)
 class Localization:
-    """Where a gap or an effect is. None or empty: not located in that respect. Fields as in run-format.md 5 ``where``;
-    ``shape``: what it looks like there, for people."""
+    """Where a gap or an effect is. None or empty: not located in this respect. The fields are those of ``where`` in
+    docs/schemas/discovery.schema.json; ``shape``: form of the deviation, as text; ``table``: all tests."""
 
     tests: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
@@ -48,16 +48,17 @@ class NamedEffect:
 
     Attributes
     ----------
-    name, key : of the catalogue.
-    strength, u_strength : in the unit of run-format.md 5 (um, urad, ms, K, K/h, mrad), signed where a sign has meaning.
-    parameters : non-linear ones by name with their standard uncertainty, (value, u); u is NaN where none is known.
-    coefficients, covariance : linear ones, in the units of the effect's columns.
-    evidence : gain in log evidence (half the chi-square) after its price.
-    alternatives : rivals that the data cannot exclude, (label, evidence lacking), best first.
+    name, key : name in the catalogue; axis or error motion that it concerns.
+    strength, u_strength : strength and standard uncertainty in the effect's unit (um, urad, ms, K, K/h, mrad), signed where a sign has
+        meaning.
+    parameters : non-linear parameters by name, (value, standard uncertainty); the latter is NaN where it is unknown.
+    coefficients, covariance : linear coefficients, in the units of the effect's columns.
+    evidence : gain in log evidence (half the chi-square) after the price of the effect.
+    alternatives : rivals that the data cannot exclude, (label, missing log evidence), best first.
     location : where its signal is largest.
     forms : freedoms of form in use.
-    needed : rms of the holdout runs without this effect over that with it; 1 or less: not needed. None: no holdout run, or a variance
-        effect, which moves no reading.
+    needed : ratio of the holdout runs' rms without this effect to that with it; 1 or less: not needed. None: no holdout run, or a variance
+        effect, which changes no mean reading.
     """
 
     name: str
@@ -81,8 +82,8 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class NextTest:
-    """Proposed measurement: ``adds`` of run-format.md 5, suspects that it separates (labels; for a structure without a name, possible
-    causes as text), expected separation (None: not known), duration; ``like``: the run to repeat or vary, if any."""
+    """Proposed measurement: ``adds`` as in docs/schemas/discovery.schema.json, suspects that it separates (labels; for a structure without
+    a name, possible causes as text), expected separation (None: not known), duration; ``like``: the run to repeat or vary, if any."""
 
     adds: tuple[str, ...]
     separates: tuple[str, ...]
@@ -94,7 +95,7 @@ class NextTest:
 
 @dataclass(frozen=True)
 class Gap:
-    """Rms of one role's residuals over its noise floor before and after, and the three in mm: rms_before, rms_after, floor."""
+    """Rms residual of one role's runs without and with the found effects, and the noise floor, mm."""
 
     before_mm: float
     after_mm: float
@@ -114,7 +115,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """A blind spot of a campaign: ``what`` it cannot show, ``because`` of what, and the addition of run-format.md 5 that would show it."""
+    """A blind spot of a campaign: ``what`` it cannot show, ``because`` of what, and ``adds``: the measurement that would show it."""
 
     what: str
     because: str
@@ -128,7 +129,7 @@ class Agreement:
     Attributes
     ----------
     run : its label.
-    times : rms of its residuals (or of their block sums, if worse) over what noise and prediction uncertainty allow; about 1 is agreement.
+    times : rms of its residuals (or of their block sums, if worse) over the rms expected from noise and prediction uncertainty.
     p : family-wise over all holdout runs of the campaign.
     """
 
@@ -151,21 +152,23 @@ class Discovery:
 
     Attributes
     ----------
-    verdict : "none": the present model explains the runs; "named"; "unknown": something is missing that the catalogue does not explain.
-    effects : in order of evidence. rejected : rejected labels with the reason, for the protocol: structures without a name, names beside
-        an unknown, residues of other effects.
-    beside : structures without a name found beside names, (label, evidence), by evidence; the names do not explain their part of the gap.
-    confounded_with : rivals of the names that the price rule does not exclude.
+    verdict : "none": the present model explains the runs; "named": named effects are missing; "unknown": something is missing that the
+        catalogue does not explain.
+    effects : in order of evidence. rejected : rejected labels with the reason: structures without a name, names beside an unknown, residues
+        of other effects.
+    beside : structures without a name found beside named effects, (label, evidence), by evidence; the effects do not explain this part of
+        the gap.
+    confounded_with : rivals of the named effects that the data do not exclude.
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : by role ("identify", "holdout").
     residual_before_mm, residual_after_mm, predicted_mm, predicted_before_mm : by run label; predictions also of sealed runs.
-    noise_mm : of one reading, by "bar", "laser"; from repeats where these scatter less than the fit's residuals.
+    noise_mm : noise of one reading, by "bar", "laser"; from repeats where these scatter less than the fit's residuals.
     p_value : of the whole finding.
     theta, theta_names, theta_covariance : the refitted model without the effects.
     agreement : how holdout runs agree with their prediction, if nothing was found; the worst first.
     unjudged : holdout runs that cannot be judged.
-    unseen : blind spots of the runs, where nothing was found.
-    fitted : values of the present simulation that people want to know (the scale of a single axis).
+    unseen : blind spots of the runs, if nothing was found.
+    fitted : significant values of the present simulation to be reported (the scale of a single axis).
     """
 
     verdict: Verdict

@@ -16,12 +16,13 @@ from abbe.models.solvers.observe import LOST, AxisPlaces, SetupUnknowns, bar_len
 from abbe.models.solvers.priors import Priors, smooth_shapes, term_prior_sd
 
 ORDER = 14
-"""Highest Legendre order of each error motion. With 7 coefficients nulls look like discoveries, with 10 to 18 not (discovery.md 5)."""
+"""Highest Legendre order of each error motion. With 7 coefficients, cases without a missing effect gave false discoveries; with 10 to 18
+none did."""
 LENGTH = 0.4
-"""Correlation length of the error motions that predictions assume, strokes."""
+"""Correlation length of the error motions, strokes, for predictions."""
 BAR = "bar_length"
 CUP_MM, BAR_MM, TILT_RAD, ZERO_MM = 60e-3, 20e-3, 1e-3, 20e-3
-"""Prior standard deviations of set-up unknowns, wide: what a careless hand leaves."""
+"""Prior standard deviations of set-up unknowns, wide enough for careless mounting."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,12 @@ class Baseline:
 
     Attributes
     ----------
-    setup : set-up unknowns as `abbe.models.solvers.observe` takes them.
+    setup : set-up unknowns in the form of `abbe.models.solvers.observe`.
     parts : array: values of ``setup`` = parts @ the set-up unknowns of ``names``.
-    names, prior_sd : of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves all radii, so that it is too long by
-        the same ``bar_length`` with all of them.
+    names, prior_sd : of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves all radii, so all share one length
+        error ``bar_length``.
     root : array, shape (p, p)
-        The same prior with the smoothness of the error motions: covariance = root root^T.
+        Factor of the prior covariance root root^T, which includes the smoothness of the error motions.
     """
 
     machine: Machine
@@ -67,9 +68,9 @@ class Baseline:
         return value + turning @ theta[:n], np.concatenate([jacobian[:, :n] + turning, jacobian[:, n + LOST :] @ self.parts], axis=1)
 
     def _turning(self, run: RunData) -> F2:
-        """What a plane mirror on the tool adds to a laser's reading as it turns with the tool, per unit of each term, shape (n, terms).
+        """Change of a laser's reading as the plane mirror turns with the tool, per unit of each term, shape (n, terms).
 
-        On a step diagonal the beam meets the mirror up to a step away from where it met it first; 50 mm times 20 urad is 1 um.
+        On a step diagonal the point where the beam meets the mirror moves by up to one step; 50 mm times 20 urad is 1 um.
         """
         out = np.zeros((len(run.axes_mm), len(self.terms)))
         if run.kind == "laser":
@@ -83,9 +84,9 @@ class Baseline:
         return out
 
     def along(self, path: Path, run: RunData, theta: F1) -> Path:
-        """The path with ``look`` as a bar really points on the fitted machine: the cup's offset and the machine's deviation turn it.
+        """The path with the actual direction of the bar (``look``), which the cup's offset and the machine's deviation turn.
 
-        A lag of a millimetre along the path times an offset of 30 um over a bar of 150 mm is 0.2 um of reading (discovery.md 5).
+        A lag of a millimetre along the path times an offset of 30 um over a bar of 150 mm is 0.2 um of reading.
         """
         if path.kind != "bar":
             return path
@@ -101,7 +102,7 @@ class Baseline:
 
 
 def baseline_of(case: Case) -> Baseline:
-    """Unknowns that ``case.includes`` says the present simulation has; those of sealed runs that no other run shares are left at zero."""
+    """Build the unknowns that the present simulation has by ``case.includes``."""
     terms = tuple(t for t in smooth_terms(ORDER) if "rigid21" in case.includes or t.order == 0 or (t.order == 1 and t.component == t.axis))
     sd: dict[str, float] = {}
     for run in case.runs:
@@ -127,7 +128,7 @@ def baseline_of(case: Case) -> Baseline:
 
 
 def _root(terms: tuple[Term, ...], prior_sd: F1, priors: Priors) -> F2:
-    """Independent unknowns but for the coefficients of order 2 and more of one motion, which belong to one stationary process."""
+    """Prior factor of independent unknowns, except that orders of 2 and more of a motion are correlated (`smooth_shapes`)."""
     root = np.diag(prior_sd)
     motion = np.array([t.motion if t.order >= 2 else "" for t in terms])
     shapes, variance = smooth_shapes(ORDER, LENGTH)

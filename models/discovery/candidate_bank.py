@@ -1,4 +1,4 @@
-"""Candidates for what is missing: every effect at every key over a grid of its non-linear parameters, all scored at once."""
+"""Candidates for the missing effect: every effect at every key over a grid of its non-linear parameters, all scored at once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ UNNAMED = "unnamed_"
 GENEROUS = 3.0
 """Prior standard deviation of a strength, as a multiple of the top of its usual range."""
 VISIBLE_SHARE = 1e-5
-"""A candidate is invisible when the projection leaves less than this share of its square."""
+"""A candidate is invisible when the projection leaves less than this fraction of its squared norm."""
 MOST_CACHED = 16
-"""Picks whose columns are cached: a search returns to those it has just used."""
+"""Number of picks whose columns are cached, because a search returns to those just used."""
 Short = NDArray[np.float32]
 PART = 20
 """Candidates whitened together; whitening makes several copies of its input."""
@@ -28,7 +28,7 @@ PART = 20
 
 @dataclass(frozen=True)
 class Pick:
-    """An effect with its key, non-linear parameters and the freedoms of form that it uses."""
+    """An effect with its key (axis or error motion), values of its non-linear parameters and the freedoms of form in use."""
 
     effect: Effect
     key: str
@@ -42,7 +42,7 @@ class Pick:
 
     @property
     def unnamed(self) -> bool:
-        """Whether it is a generic rival."""
+        """Whether it is a structure without a name."""
         return self.effect.name.startswith(UNNAMED)
 
     def raw(self, problem: WhitenedProblem) -> F2:
@@ -53,7 +53,7 @@ class Pick:
 
     @property
     def start(self) -> str:
-        """Label, non-linear parameters and forms: what its columns depend on."""
+        """Identifier of the pick's columns: label, non-linear parameters and forms."""
         return f"{self.label} {sorted(self.values.items())} {[f.name for f in self.forms]}"
 
     def prior_sd(self, problem: WhitenedProblem, columns: int) -> F1:
@@ -64,9 +64,9 @@ class Pick:
 
 
 def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
-    """The coefficient at which the strength is `GENEROUS` times the top of its usual range, for any power law of the strength.
+    """Prior standard deviation of a coefficient: it gives `GENEROUS` times the top of the usual strength, for any power law of the latter.
 
-    ``width``: how many columns the effect has along one run.
+    ``width``: number of columns of the effect along one run.
     """
     top = GENEROUS * effect.typical[1]
     if effect.name.startswith(UNNAMED):
@@ -102,13 +102,14 @@ class Bank:
     Attributes
     ----------
     picks : tuple of Pick, one per group.
-    known : group of every requested start; -1 where no run sees it.
+    known : group index of every requested start; -1 where no run sees it.
     first : array of int, first column of each group; size : number of columns of each.
-    parts : arrays, shape (columns, n): whitened columns as rows, no group split between parts. Single precision suffices to choose where a
-        refinement starts; the parts are half of the memory of a search.
+    parts : arrays, shape (columns, n): whitened columns as rows, no group split between parts. Single precision suffices, because the bank
+        only chooses where a refinement starts; the parts are half of the memory of a search.
     own : array, shape (K,): squared norm of each column before projection.
-    gram : tuple of arrays (k, k), one per group: columns^T M columns. moment : array, shape (K,): columns^T M y.
-    prior_sd : array, shape (K,). logs : array, shape (groups,): sum over a group's columns of the log of how many readings see them.
+    gram : tuple of arrays (k, k), one per group: columns^T M columns (M: `SignalProjection`). rhs : array, shape (K,): columns^T M y.
+    prior_sd : array, shape (K,). logs : array, shape (groups,): sum over a group's columns of the log of the number of readings that they
+        change.
     """
 
     picks: tuple[Pick, ...]
@@ -123,7 +124,7 @@ class Bank:
     logs: F1
 
     def gains(self, y: F1, rows: F2) -> F1:
-        """Reduction of chi-square by each group after ``rows`` (k, n) of earlier picks were projected out too, shape (groups,)."""
+        """Reduction of chi-square by each group, shape (groups,), with earlier picks projected out too by their ``rows`` (k, n)."""
         short = rows.astype(np.float32)
         also = np.concatenate([np.zeros((len(rows), 0)), *(short @ part.T for part in self.parts)], axis=1)
         rhs = self.rhs - also.T @ (rows @ y)
@@ -159,7 +160,7 @@ class _Group:
 
 
 def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
-    """Gains of groups of one size: moment^T (gram + prior^-2)^-1 moment; columns that are hardly visible count as rounding errors."""
+    """Gains of groups of one size: rhs^T (gram + prior^-2)^-1 rhs; columns that are hardly visible count as rounding errors."""
     k = gram.shape[1]
     eye = np.eye(k)
     weight = prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30
@@ -168,7 +169,7 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
-    """Columns of all candidates that some run sees; groups of the problem's other live banks are reused."""
+    """Build the bank of all candidates that some run sees; groups of the problem's other live banks are reused."""
     asked = [p.start for p in picks]
     banks = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in banks if list(b.known) == asked), None)
@@ -221,9 +222,9 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
 
 
 def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
-    """Reduction of chi-square by one pick after ``rows`` of others were projected out too.
+    """Reduction of chi-square by one pick, with other picks projected out too by their ``rows``.
 
-    In double precision: where the projection leaves little of a column, single precision shifts an evidence of thousands by several.
+    In double precision: where the projection leaves little of a column, single precision would change an evidence of thousands by several.
     """
     projection = problem.projection
     columns = problem.white(pick.raw(problem))

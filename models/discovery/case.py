@@ -1,4 +1,4 @@
-"""Input of a discovery: runs with paths, readings and roles, and the contents of the present simulation."""
+"""Input of a discovery: runs with paths, readings and roles, and which errors the present simulation includes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CaseRun:
     length_calibrated: bool | None = None
 
     def data(self) -> RunData:
-        """The run as the joint solver's observation models take it (zeros in place of sealed readings), every reading, invalid ones too."""
+        """The run as solver input, with invalid readings too; sealed and invalid readings are zero."""
         p = self.path
         reading = np.zeros(p.n) if self.deviation_mm is None else np.where(self.valid, self.deviation_mm, 0.0)
         bar = p.kind == "bar"
@@ -40,12 +40,13 @@ class CaseRun:
 
 @dataclass(frozen=True)
 class Case:
-    """A campaign (run-format.md 4).
+    """A campaign to be searched.
 
     Attributes
     ----------
     includes : frozenset of str
-        Contents of the present simulation: ``rigid6`` or ``rigid21``, ``setup_centre_offset``, ``bar_length_error``, ``mirror_tilt``.
+        Errors that the present simulation includes: ``rigid6`` or ``rigid21``, ``setup_centre_offset``, ``bar_length_error``,
+        ``mirror_tilt``.
     resolution_mm : smallest step of the readings of "bar" and "laser".
     """
 

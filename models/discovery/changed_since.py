@@ -1,10 +1,10 @@
-"""Changes of a machine since a solution: which error motions, by how much, judged by runs that did not choose them.
+"""Changes of a machine since a solution: which error motions have changed and by how much, cross-validated by other runs.
 
-A known machine that drifts lacks no physical effect: its model is complete, its numbers are old. So the old solution, with its covariance,
-is compared with new runs, and error motions compete for the residuals: six linear ones (scales, squareness) and the shape of each of the
-21. Selection is stepwise by the marginal likelihood of a linear normal model (as `abbe.models.solvers.components`) less the price, the
-logarithm of the number of candidates. For validation, one half of the set-ups chooses and the other judges, both ways round. Set-ups and
-lost motion are refitted throughout: a new cup is not a change of the machine.
+The model of a known machine is complete, only its values are old. So the old solution, with its covariance, is compared with new runs, and
+changes of error motions compete to explain the residuals: the six linear ones (scales, squareness) and the shape of each motion. Selection
+is stepwise by the marginal likelihood of a linear normal model (as `abbe.models.solvers.components`) less a price, the logarithm of the
+number of candidates. For validation, each half of the set-ups judges the changes that the other half chose. Set-ups and lost motion are
+refitted throughout, because a new cup is not a change of the machine.
 """
 
 from __future__ import annotations
@@ -26,15 +26,13 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 from abbe.models.uncertainty.known_field import KnownField
 
-# Evidence of a change of unknown size: each candidate alone, all else integrated out.
-
 LINEAR = ("EXX", "EYY", "EZZ", "C0Y", "B0Z", "A0Z")
 LINEAR_SIZES = (3e-6, 10e-6, 30e-6, 100e-6, 300e-6)
 """Sizes of a change of scale or squareness that are tried, rad."""
 SHAPE_SIZES = (0.1, 0.3, 1.0, 3.0)
-"""Sizes of a change of a motion's shape that are tried, in documented sizes of the motion itself (`abbe.models.solvers.priors`)."""
+"""Sizes of a change of a motion's shape that are tried, as multiples of its documented size (`abbe.models.solvers.priors`)."""
 ENOUGH = 3.0
-"""A change is named from this evidence on (natural logarithm, after its price): the readings are twenty times as likely with it."""
+"""A change is named from this log evidence on, after its price: the readings are twenty times as likely with it."""
 NEAR = 3.0
 """The runs cannot distinguish a named change from a rival whose evidence is lower by no more than this."""
 MOST = 6
@@ -47,7 +45,7 @@ FEWEST_SETUPS = 2
 class AskedChange:
     """A candidate: normal coefficients along ``directions``, shape (p, q), with mean 0 and one of ``sizes`` as standard deviation.
 
-    ``several``: whether it is the shape of a motion; else a single coefficient (scale or squareness).
+    ``several``: whether it is the shape of a motion, with several coefficients; else a scale or squareness.
     """
 
     name: str
@@ -66,27 +64,27 @@ class ChangeEvidence:
 
 
 def evidence_of(gram: F2, rhs: F1, base: F2, asked: Sequence[AskedChange]) -> list[ChangeEvidence]:
-    """Ask every candidate alone.
+    """Return the evidence of every candidate alone.
 
     Parameters
     ----------
     gram, rhs : arrays, shape (p, p) and (p,)
-        Normal equations of the whitened readings, less what is expected without any change.
+        Normal equations of the whitened readings minus their expectation without any change.
     base : array, shape (p, k)
-        Factor of the covariance of everything that is unknown without a change; it is integrated out.
+        Factor of the covariance of all other unknowns; they are integrated out.
     asked : sequence of AskedChange
 
     Returns
     -------
-    list of Evidence
-        In the same order. Gain: log of the ratio of marginal likelihoods with and without the candidate.
+    list of ChangeEvidence
+        In the same order. Gain: log ratio of the marginal likelihoods with and without the candidate.
     """
     own, gradient = without(gram, rhs, base)
     return [_one(a, own, gradient) for a in asked]
 
 
 def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
-    """Normal equations (p, p) and (p,) with everything along ``base`` (p, k) integrated out; one base after another is both at once."""
+    """Normal equations (p, p) and (p,) with everything along ``base`` (p, k) integrated out."""
     if not base.shape[1]:
         return gram, rhs
     inside = base.T @ gram @ base
@@ -121,7 +119,7 @@ def _one(asked: AskedChange, gram: F2, rhs: F1) -> ChangeEvidence:
 
 @dataclass(frozen=True)
 class TakenChange:
-    """A chosen candidate: its size beside the others, its gain after its price, and its near rivals."""
+    """A chosen candidate: size and gain (after its price) beside the other chosen ones, and rivals as (name, missing gain)."""
 
     asked: AskedChange
     size: float
@@ -133,7 +131,7 @@ class TakenChange:
 class Chosen:
     """Changes chosen from some runs, and the runs' normal equations relative to the old solution: (p, p) and (p,).
 
-    ``own``, ``gradient``: the same with everything integrated out that is unknown without any change.
+    ``own``, ``gradient``: the same with the unknowns other than changes integrated out.
     """
 
     taken: tuple[TakenChange, ...]
@@ -145,7 +143,7 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class ChangeContext:
-    """The new runs, linearised about their own fit, and the old solution. Unknowns in units of their typical size."""
+    """The old solution, and the new runs linearised about their own fit. Unknowns are in units of their typical size."""
 
     known: KnownField
     problem: CampaignProblem
@@ -180,16 +178,16 @@ class ChangeContext:
         return out
 
     def _shape(self, motion: str) -> F2:
-        """Factor of the documented size of a motion but for its linear part, shape (p, q)."""
+        """Factor of the prior covariance of a motion's shape, at its documented size, shape (p, q)."""
         return self.problem.sizes.root[:, [k for k, t in enumerate(self.known.terms) if t.motion == motion and _is_shape(t)]]
 
     def choose(self, sums: InformationSums) -> Chosen:
-        """Add the candidate with the largest gain until none gains enough; drop those that have become needless.
+        """Add the candidate with the largest gain until none gains enough; drop those that are no longer needed.
 
-        Greedy selection alone fails twice. A flexible shape may gain more at first than either of two linear changes that together explain
-        everything. And if all axes grow equally, each alone gains nothing, because a laser's wavelength explains the growth nearly as
-        well. So selection also starts from each linear candidate and from all of them; the choice that makes the readings most likely
-        wins, the empty one included.
+        Greedy selection alone has two weaknesses. A flexible shape may first gain more than either of two linear changes that together
+        explain everything. And if all axes grow equally, no axis alone gains anything, because a laser's wavelength explains the growth
+        nearly as well. So selection starts three times: from no change, from linear changes chosen first, and from all linear changes. The
+        choice with the largest evidence wins, no change included.
         """
         weight = np.exp(-self.fit.components.eta)
         gram, rhs = np.tensordot(weight, sums.gram, 1), weight @ sums.rhs
@@ -204,7 +202,7 @@ class ChangeContext:
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
     def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
-        """Candidates that explain nearly as much in place of a chosen one, beside all the others."""
+        """Candidates that explain nearly as much in place of a chosen one, beside all other chosen ones."""
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
         others = self._changed([t for t in chosen.taken if t is not taken])
@@ -233,7 +231,7 @@ class ChangeContext:
         return TakenChange(left[k], found[k].size, gain, ())
 
     def _needed(self, chosen: Chosen) -> Chosen:
-        """Gain and size of every choice beside all others; drops the least needed until all are needed."""
+        """Update gain and size of every chosen change beside the others, and drop the weakest until all gain enough."""
         taken = list(chosen.taken)
         while taken:
             for k, one in enumerate(taken):
@@ -255,11 +253,11 @@ class ChangeContext:
         return np.column_stack([self._open[:, :0], *(t.asked.directions * t.size for t in taken)])
 
     def _beside(self, taken: Sequence[TakenChange]) -> F2:
-        """Factor of the covariance when these have changed, shape (p, k)."""
+        """Factor of the covariance of all unknowns with these changes, shape (p, k)."""
         return np.column_stack([self._open, self._changed(taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:
-        """As `_beside`, with all scales and squareness free except candidate ``but``."""
+        """As `_beside`, with all scales and squareness errors as changes, but without candidate ``but``."""
         others = [t for t in chosen.taken if t.asked.name != but]
         names = {but, *(t.asked.name for t in others)}
         linear = [TakenChange(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
@@ -302,9 +300,9 @@ class ChangeContext:
         return np.asarray(term_values(self.known.terms, points, stroke) * mine)
 
     def hidden(self, chosen: Chosen) -> dict[str, float]:
-        """Largest change, rad, that each scale or squareness not chosen may have: |estimate| + U (k = 2), with all of them fitted.
+        """Bound on the change (rad) of each scale or squareness that was not chosen: |estimate| + U (k = 2), all of them fitted.
 
-        Left out: those whose change these runs could not see, even at the largest size that is tried.
+        Those are left out for which U exceeds the largest size that is tried: these runs cannot show them.
         """
         names = {t.asked.name for t in chosen.taken}
         out = {}
@@ -317,7 +315,7 @@ class ChangeContext:
         return out
 
     def floor_mm(self) -> float:
-        """Noise of the readings, rms."""
+        """Rms noise of the readings, mm."""
         return float(np.sqrt(np.mean(self._noise_mm[self._whole] ** 2)))
 
     @property
@@ -330,9 +328,9 @@ class ChangeContext:
         return np.asarray(self.fit.weight > 0.5)
 
     def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float, float]:
-        """Each half judges the other's choice: rms of all readings without and with it, mm, set-ups refitted; gain in log likelihood.
+        """Judge each half's choice by the other half: rms of all readings without and with it, mm, set-ups refitted; log likelihood gain.
 
-        The gain is the smaller of the two halves, with everything that is unknown without a change integrated out.
+        The gain is that of the half with the smaller gain; the unknowns other than changes are integrated out.
         """
         old = self.known.coefficients
         before, after, count, gains = 0.0, 0.0, 0, []
@@ -353,7 +351,7 @@ class ChangeContext:
         return with_it - plain + float(moved @ mine.rhs) - 0.5 * float(moved @ mine.gram @ moved)
 
     def _left(self, rows: NDArray[np.bool_], coefficients: F1) -> float:
-        """Sum of squares of readings less what coefficients predict, mm²; lost motion and set-ups refitted within their priors."""
+        """Sum of squared differences of readings and prediction, mm²; lost motion and set-ups refitted within their priors."""
         r, n, typical = self.problem.readings, self._n, self.problem.sizes.typical
         noise = self._noise_mm[rows]
         sd = self.fit.prior_sd[n:] / typical[n:]
@@ -377,16 +375,16 @@ class Change:
     Attributes
     ----------
     name : str
-        ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for what is not linear in it (of an angle: all of it).
+        ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for the whole motion (of positioning: without the scale).
     value, u : float
-        Change and standard uncertainty, estimated together with all scales and squareness: of a scale or squareness rad (m/m); of a shape
-        its rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.
+        Change and standard uncertainty, estimated together with all scales and squareness errors: of a scale (m/m) or squareness (rad); of
+        a shape its rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.
     evidence : float
         Gain in log evidence after its price, beside all other named changes.
-    rivals : tuple of (name, evidence less)
+    rivals : tuple of (name, missing evidence)
         Candidates that explain nearly as much in its place: these runs cannot distinguish them.
     halves : int
-        Number of halves of the runs that chose it independently: 0 to 2.
+        In how many halves of the runs it was chosen independently: 0 to 2.
     """
 
     name: str
@@ -401,10 +399,9 @@ class Change:
 class Changed:
     """All changes found.
 
-    ``before_mm``: rms of readings minus the old solution. ``after_mm``: minus the changes, too, that the OTHER half of the set-ups chose.
+    ``before_mm``: rms of readings minus the old solution. ``after_mm``: the same with the changes that the OTHER half of the set-ups chose.
     ``floor_mm``: rms noise. ``judged``: log likelihood ratio of each half for the other's choice, the smaller of the two. None: too few
-    set-ups to judge. ``hidden``: bound on the change of each scale and squareness that was not named, rad, without those that these runs
-    do not see.
+    set-ups to judge. ``hidden``: bound on the change (rad) of each scale and squareness that was not named but that these runs can show.
     """
 
     changes: tuple[Change, ...]
@@ -423,7 +420,7 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
     known : KnownField
         The old solution, with its covariance.
     runs : tuple of RunData
-        Runs measured since, corrected for the active table and known effects like the solved runs.
+        Runs measured since, corrected for the active table and known effects as the runs of the solution were.
 
     Raises
     ------
@@ -455,7 +452,7 @@ def _halves(parts: tuple[InformationSums, ...], problem: CampaignProblem) -> lis
 
 
 def _changes(context: ChangeContext, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
-    """All that were chosen by all runs, the largest evidence first."""
+    """The changes that all runs together chose, largest evidence first."""
     out = []
     for taken in whole.taken:
         value, u = context.size(whole, taken.asked)

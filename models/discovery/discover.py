@@ -1,4 +1,7 @@
-"""The complete search over one campaign: where simulation and measurement disagree and which effect is missing (discovery.md 4)."""
+"""The complete search over one campaign: where simulation and measurement disagree and which effect is missing.
+
+Variance effects are found in the residuals of the mean model and then excluded from the search for mean effects.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +23,20 @@ from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extr
 from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
 from abbe.models.effects.effect import Effect
 
-# Variance effects are found in the residuals of the mean model and then excluded from the search for mean effects.
-
-
 GATE = 1.3
-"""Readings below this multiple of the stick-slip speed are excluded from the mean, up to the share `MOST_GATED`."""
+"""Readings below this multiple of the stick-slip speed are excluded from the search for mean effects, unless they exceed `MOST_GATED`."""
 MOST_GATED = 0.35
 """If more than this share of all readings is below `GATE`, none is excluded."""
 Progress = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
-"""A rival replaces a name when it explains more by this chi-square, the margin that a new name also needs."""
+"""A rival replaces a named effect when it explains more by this chi-square; a new name needs the same margin."""
 ROUNDS = 3
 """Maximum number of repetitions of the search, each with noise and simulation refitted beside the findings."""
 
 
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
-    """Variance effects in the residuals of simulation and ``picks``; lone outliers of lasers are included again."""
+    """Find variance effects in the residuals of simulation and ``picks``, this time with the lone outliers of lasers."""
     solved = solve(problem, picks)
     model = problem.tangent.raw @ (solved.theta - problem.theta)
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
@@ -50,7 +50,7 @@ def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[Variance
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """The problem without the findings: a vibration's waves are projected out run by run, readings with excess variance do not count."""
+    """The problem without these findings: vibrations are projected out of each run, readings with excess variance get weight 0."""
     waves, use = [problem.also], problem.use
     for f in findings:
         if f.name == "vibration":
@@ -96,8 +96,8 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     case : Case
         Identify runs are fitted, holdout runs judge, sealed runs are predicted.
     effects : tuple of Effect
-        Names to choose from.
-    progress : function (what is being done, share that is done), optional
+        Effects to choose from.
+    progress : function (stage, share done from 0 to 1), optional
 
     Returns
     -------
@@ -120,7 +120,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
 
 
 def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:
-    """Search mean, then variance, and repeat with noise and simulation refitted beside the findings until these stay the same."""
+    """Search for mean, then for variance effects; refit noise and simulation with the findings and repeat until these stay the same."""
     contest = Contest.of(problem, effects)
     found, loud = selected(contest), tuple[VarianceFinding, ...]()
     for i in range(ROUNDS):
@@ -139,9 +139,10 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
 
 
 def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], list[list[Rival]]]:
-    """The names with their rivals; a rival that explains more once both have their freedoms of form replaces the name.
+    """Return the findings with their rivals, after a rival that explains more than a named effect has replaced it.
 
-    The search compares names without their forms, so it may have chosen the wrong one of two similar effects.
+    The search compares effects without their freedoms of form, so it may have chosen the wrong one of two similar effects. Here both have
+    them.
     """
     changed = False
     for i in range(len(found)):
@@ -156,7 +157,7 @@ def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], l
 
 
 def _rivals(contest: Contest, found: list[Selection], i: int) -> list[Rival]:
-    """Rivals of one name; a structure without a name has none."""
+    """Rivals of one finding; a structure without a name has none."""
     return [] if found[i].pick.unnamed else rivals_of(contest, found, i)
 
 

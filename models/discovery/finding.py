@@ -25,12 +25,9 @@ from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Family
 from abbe.models.probability import chi2_above
 
-# Strength of a named effect in its customary unit, and its uncertainty: noise, form, and the share that no data can show.
-
-
 TRUE_TO_FORM: dict[Family, float] = {"drive": 0.03, "structure": 0.03, "thermal": 0.12, "instrument": 0.05, "geometry": 0.1}
-"""Relative standard uncertainty of a strength because no machine follows a formula exactly, by family. A step is a step; a warming part
-follows several time constants, whose end a campaign does not see."""
+"""Relative standard uncertainty of a strength because no machine follows a formula exactly, by family. It is largest for thermal effects: a
+warming part has several time constants, and a campaign does not see the longest."""
 TRUE_TO_FORM_OF = {
     "contour_lag": 0.05,  # a second lag in the loop counts in the sum, but shrinks a circle less
     "cyclic_error": 0.1,  # swells along its screw, by a tenth to a third
@@ -39,40 +36,41 @@ TRUE_TO_FORM_OF = {
     "beam_outliers": 0.05,
     "ram_sag": 0.05,  # the bending line is not a parabola
     "mirror_tilt": 0.1,  # a mirror is not mounted equally badly every time
-    "air_refraction": 0.1,  # a hall does not swing as a sine
-    "dead_path": 0.1,  # nor does its air warm up at one rate
+    "air_refraction": 0.1,  # the temperature of a hall does not follow a sine
+    "dead_path": 0.1,  # the air in the dead path does not warm up at a constant rate
 }
 """`TRUE_TO_FORM` of single effects that differ from their family."""
 CARRYING = ("modulated", "sensor")
 """Forms (by prefix) that carry part of an effect's size, thermal effects aside."""
 OFFSET = "offset"
-"""Prefix of forms whose first column is a constant: the start value of a sensor is not part of the swing."""
+"""Prefix of forms whose first column is a constant: the start value of a sensor is not part of the effect."""
 TIME_TRUE_TO_FORM = 0.3
-"""Relative standard uncertainty of a time constant: of several time constants, a short campaign shows the quick ones."""
+"""Relative standard uncertainty of a thermal time constant: of several time constants, a short campaign shows only the short ones."""
 RESIDUE_SHARE = 0.001
 """A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
 SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
-"""Stick-slip and vibration are residues below this share of the strongest mean effect, whatever the axis. A smooth effect leaves less
-that looks like scatter than one with corners or waves (a true stick-slip had 1.0 % of a pitch error)."""
+"""Stick-slip and vibration are residues below this share of the strongest mean effect, on any axis: below 1 % of an effect with corners or
+waves (`ROUGH`), below 0.3 % of a smooth one, which leaves less that looks like scatter (a true stick-slip had 1.0 % of a pitch error)."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
-"""Effects at the reversals of one axis differ by their form only: below `AXIS_SHARE` the weaker is a residue of the stronger."""
+"""Effects at the reversals of one axis differ only in form: with less than `AXIS_SHARE` of its evidence, one is a residue of another."""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
 KIN_SHARE = 0.03
 CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
 LAG = ("contour_lag", "servo_mismatch")
 SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
-"""Effects on the same clock, over the same positions, or lags of drives: the residue of one, off by a sixth (3 % squared), resembles
-another. Counted on 345 cases (lags on 150 others): ten false names at 0.2 to 2.9 % of the strong one, one true name at 9 %."""
+"""Groups of related effects (thermal courses, curves over the position, lags of drives): a deviation of one from its formula by a sixth,
+3 % of its evidence, resembles another of the group. In 345 cases (150 others for lags) ten false names had 0.2 to 2.9 % of the evidence of
+the strong effect, and one true name 9 %."""
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
-"""A name with less evidence than this share of another's, and this overlap of their signals, is a residue of the other."""
+"""A name with less than this share of another's evidence, and more than this overlap of their signals, is a residue of the other."""
 STARTS = 2000.0
-"""Starts compared in a campaign; bounds the p-value of the best."""
+"""Assumed number of starts compared in a campaign, to bound the p-value of the best."""
 
 
 def true_to_form(name: str, family: Family) -> float:
-    """Relative standard uncertainty of an effect's strength from its form."""
+    """Relative standard uncertainty of an effect's strength because its true form differs from its formula."""
     return TRUE_TO_FORM_OF.get(name, TRUE_TO_FORM[family])
 
 
@@ -113,11 +111,11 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
 
 
 def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
-    """Matrix from all coefficients of a pick to those of its effect without forms whose signal is nearest (least squares).
+    """Matrix that maps all coefficients of a pick to those of the plain effect, without forms, with the nearest signal (least squares).
 
     Shape (columns of the effect, columns with those of its forms). Only forms that carry part of the effect's size count: an amplitude that
     changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic or wind-up, are no part of the
-    strength. ``offset``: estimate the start value of a sensor beside the effect, so that it does not count.
+    strength. ``offset``: fit the start value of a sensor as well, so that it does not count.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]
@@ -136,22 +134,17 @@ def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2
     return np.asarray(np.linalg.lstsq(basis / scale, raw, rcond=1e-9)[0] / scale[:, None])[:k]
 
 
-# Names that are only residues of a stronger effect, whose true form differs from its formula.
-
-
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
-    """Names that the form of a stronger effect explains.
+    """Find names that may be only the deviation of a stronger effect from its formula.
 
-    A name is a residue with evidence below
+    A name is such a residue if its evidence is below
 
-    - 0.1 % of the strongest name's;
-    - 1 % of the strongest effect of the mean's, where it is stick-slip or vibration, whatever the axis (0.3 % where that effect is smooth);
-    - 2 % of that of a stronger effect of the same drive (lost motion, its change along the axis, spikes, lateral play, servo mismatch: keys
-      that end with the same axis);
-    - 3 % of that of a stronger related effect: thermal effects on the same clock (bar included), curves over the same axis or in the same
-      direction (also positioning beside thermal growth of the same axis), lags of all drives or of one.
-
-    A weak effect of another kind, or with neither axis nor direction in common, stays.
+    - 0.1 % of that of any stronger effect;
+    - 1 % of that of a mean effect (0.3 % of a smooth one), for stick-slip or vibration, on any axis;
+    - 2 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
+      mismatch);
+    - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
+      positioning beside thermal growth of the same axis), another lag of the drives.
 
     Parameters
     ----------
@@ -160,7 +153,7 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
     Returns
     -------
     dict
-        Reasons for people, by label.
+        Reason as text, by label.
     """
     out: dict[str, str] = {}
     for small in effects:
@@ -168,13 +161,13 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
             share = _share(small, big, big.label in scatter)
             if small.evidence < share * big.evidence:
                 share_text = f"{small.evidence:.0f} nats, {small.evidence / big.evidence:.1%} of {big.label}'s"
-                out[small.label] = f"{share_text}: too small beside it to be more than what its formula leaves"
+                out[small.label] = f"{share_text}: it may be only the deviation of {big.label} from its formula"
                 break
     return out
 
 
 def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
-    """Share of ``big``'s evidence below which ``small`` is its residue."""
+    """Share of ``big``'s evidence below which ``small`` counts as its residue."""
     if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
         return AXIS_SHARE
     grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
@@ -197,7 +190,7 @@ def _together(a: str, b: str) -> bool:
 
 @dataclass(frozen=True)
 class _Judgement:
-    """Findings sorted: kept mean effects (indices of the search), all named effects, structures without a name, rejected labels."""
+    """Sorted findings: indices of the kept mean effects, all named effects, structures without a name, rejected labels with reasons."""
 
     mean: tuple[int, ...]
     effects: tuple[NamedEffect, ...]
@@ -219,9 +212,9 @@ def finding(
 
     Parameters
     ----------
-    problem, plain : with the noise after the findings, and without findings.
-    found, loud : effects of the mean and of the variance. solved, rivals : of ``found``, in its order.
-    predicted : readings of every run without and with the effects.
+    problem, plain : the problem with the noise estimated beside the findings; the problem before the search.
+    found, loud : mean effects and variance effects. solved, rivals : of ``found``, in its order.
+    predicted : readings of every run, mm, without and with the effects.
     """
     case, judgement = problem.case, _judge(problem, found, loud, solved, rivals)
     is_named, unnamed = judgement.verdict == "named", judgement.unnamed
@@ -278,15 +271,16 @@ def _judge(
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
-        rejected += [(e.label, f"{e.evidence:.0f} nats, less than what has no name: not named beside it") for e in effects]
+        rejected += [(e.label, f"{e.evidence:.0f} nats, less than the structures without a name: not named beside them") for e in effects]
     for i, j in companions.items():
-        rejected.append((found[i].pick.label, f"{found[i].score / 2.0:.0f} nats: form residue of {found[j].pick.label}"))
+        share_text = f"{found[i].score / 2.0:.0f} nats: it may be only the deviation of {found[j].pick.label} from its formula"
+        rejected.append((found[i].pick.label, share_text))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
     return _Judgement(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
 
 
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
-    """Rms of the holdout runs without each effect over that with all of them, by its number (`NamedEffect.needed`)."""
+    """Ratio of the holdout runs' rms without an effect to that with all effects, by the effect's index (`NamedEffect.needed`)."""
     fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
@@ -304,7 +298,7 @@ def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int])
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
-    """Rivals that the price rule does not exclude; more distant ones remain among their effect's alternatives."""
+    """Rivals that lack less than `EXCLUDED` chi-square; `NamedEffect.alternatives` holds the more distant ones too."""
     return tuple(dict.fromkeys(label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0))
 
 
@@ -316,9 +310,9 @@ def _verdict(named: float, unnamed: float) -> Verdict:
 
 
 def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: Localization | None) -> float:
-    """Smallest p of a lack of fit; else a bound on how often noise alone gives the strongest finding.
+    """Smallest p of a lack of fit; else a bound on the probability that noise alone gives the strongest finding.
 
-    The bound is the chi-square tail of the finding's parameters times the number of starts compared.
+    The bound is the chi-square tail of the finding's gain times the number of starts compared.
     """
     if lack is not None:
         return min((s.p for s in lack.table), default=CHANCE)
@@ -328,7 +322,7 @@ def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: 
 
 
 def _companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
-    """Findings that are only residues of another: its index by theirs."""
+    """Findings that are only residues of another: index of the other by their index."""
     power = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
         size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2
@@ -374,7 +368,7 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
 
 
 def gaps_of(problem: WhitenedProblem, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
-    """Gaps of every role with at least one valid reading."""
+    """Gap of every role ("identify", "holdout") with at least one valid reading."""
     out = {}
     for role in ("identify", "holdout"):
         runs = [r for r in problem.case.runs if r.role == role and r.path.label in before]

@@ -1,4 +1,4 @@
-"""Noise of the instruments: a white part plus a part with memory, in proportions common to all readings of one instrument."""
+"""Noise of the instruments: a white part plus a correlated part ("memory"), in the same proportion for all readings of an instrument."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import scipy
 from abbe.models.arrays import F1, F2
 
 SHARE, MEMORY = 0.1, 0.75
-"""Share of the variance with memory, and its correlation from reading to reading, assumed before estimation (typical of ball-bars and
-interferometers in a workshop: long-run variance 1.6 times that of one reading, discovery.md 4)."""
+"""Share of the variance with memory, and its correlation from reading to reading; typical of ball-bars and interferometers in a workshop
+(long-run variance 1.6 times that of one reading)."""
 CLEARLY = 0.85
-"""Differences of neighbours give the noise where it is less than this share of that of the residuals."""
+"""The noise from differences of neighbours is used if it is less than this fraction of the residuals' standard deviation."""
 LONE = 7.0
 """A reading farther from its neighbours than this many standard deviations does not count."""
 
@@ -28,9 +28,9 @@ class Colour:
     memory: float = MEMORY
 
     def filter(self) -> tuple[float, float, float]:
-        """ARMA(1, 1) of the same autocovariance: (memory, weight of the last innovation, variance of an innovation over that of a reading).
+        """ARMA(1, 1) with the same autocovariance: (m, c, ratio of an innovation's variance to that of a reading).
 
-        Autocovariance 1, s m, s m^2, ...; (1 - m B) noise = (1 + c B) innovation.
+        Autocovariance 1, s m, s m^2, ... with share s and memory m; (1 - m B) noise = (1 + c B) innovation, B the shift by one reading.
         """
         s, m = self.share, self.memory
         g0 = 1.0 + m * m - 2.0 * m * (s * m)
@@ -43,7 +43,7 @@ class Colour:
 
 
 def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> F2:
-    """Columns (n, k) of stacked runs, whitened by the innovations of their instrument's noise of 1 mm; its size is left to the caller."""
+    """Whiten columns (n, k) of stacked runs as for an instrument noise of 1 mm; the caller divides by the actual noise."""
     out = np.empty_like(columns)
     start = 0
     for n, kind in zip(lengths, kinds, strict=True):
@@ -57,16 +57,17 @@ def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours:
 
 
 def robust_sd(values: F1) -> float:
-    """Standard deviation from the median of absolute values."""
+    """Robust standard deviation: median absolute value over 0.6745; NaN without values."""
     return float(np.median(np.abs(values)) / 0.6745) if values.size else float("nan")
 
 
 def level(
     residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1, resolution_mm: Mapping[str, float]
 ) -> dict[str, Colour]:
-    """Noise of each instrument from what is left of whitened readings (times the noise that was assumed, mm).
+    """Estimate the noise of each instrument from whitened residuals, mm (times the noise assumed for whitening).
 
-    Differences of neighbours are blind to smooth effects that are not in the model yet: where they say clearly less, they are believed.
+    Differences of neighbours are insensitive to smooth effects that are not in the model yet. If they give clearly less noise, they are
+    used (`CLEARLY`).
     """
     out: dict[str, Colour] = {}
     for kind in dict.fromkeys(kinds):
@@ -87,7 +88,7 @@ def level(
 
 
 def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str]) -> F1:
-    """1 for readings of a laser that go with their neighbours, 0 for lone ones far off (a beam that was cut for a moment), shape (n,)."""
+    """Weights, shape (n,): 0 for single laser readings far from their neighbours (`LONE`; a beam cut for a moment), else 1."""
     out = np.ones(residual.size)
     start = 0
     for n, kind in zip(lengths, kinds, strict=True):

@@ -1,7 +1,7 @@
 """Lack of fit: whether residuals exceed independently known noise after the search has found nothing.
 
-The search finds known shapes only, and noise estimated from the residuals includes the unknown ones. So the noise comes from repeats where
-there are any, and the verdict "nothing is missing" requires that residuals agree with it: all together, run by run, and against position,
+The search finds only known shapes, and noise estimated from the residuals includes unknown ones. So the noise comes from repeats if there
+are any. The verdict "nothing is missing" requires that residuals agree with this noise: all together, run by run, and by position,
 direction, time, feed and temperature (`abbe.models.discovery.localization.locate`). Holdout runs must agree, too.
 """
 
@@ -22,18 +22,18 @@ from abbe.models.machine import AXES
 from abbe.models.probability import f_above
 
 TIMES = 1.5
-"""Residuals exceed noise from this multiple of its rms."""
+"""Residuals exceed noise if their rms is above this multiple of its rms."""
 CHANCE = 1e-3
-"""Significance level of statements about one run, place or direction, per campaign."""
+"""Significance level of statements about one run, position or direction, family-wise for a campaign."""
 FEWEST, REPEATS = 8, 20
 """Minimum number of readings for judging a single run, and of repeats for estimating noise."""
 NEAR_MM = 0.05
-"""Positions closer than this are the same one, approached again."""
+"""Positions closer than this are repeats of one position."""
 ALONG_ONE_AXIS = 0.999
 """A laser measures along one axis if that component of its beam is larger."""
 KNOWN_FREEDOM = 1e6
 COMMON, PERIODIC = 0.8, 0.6
-"""Smallest share of a gap's energy to be reported: the part common to both directions, and the part that one period explains."""
+"""Least shares of the residuals' energy: to report them as alike in both directions; to report a period."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Floor:
 
 
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
-    """Noise of each instrument: from repeats if clearly smaller than the fit's residuals, which may contain missing effects."""
+    """Noise of each instrument: from repeats if these give clearly less than the fit's residuals, which may contain missing effects."""
     out = {}
     for kind, colour in problem.colours.items():
         steps = repeat_steps(problem.case, kind)
@@ -59,7 +59,7 @@ def floors(problem: WhitenedProblem) -> dict[str, Floor]:
 def repeat_steps(case: Case, kind: str) -> F1:
     """Differences of successive dwell readings at the same place, from the same side, in the same set-up, mm.
 
-    Slow drift contributes little to them; place, direction and set-up contribute nothing.
+    Slow drift contributes little to them; errors of position, direction and set-up contribute nothing.
     """
     visits: dict[object, list[tuple[float, float]]] = {}
     for run in case.runs:
@@ -77,7 +77,7 @@ def repeat_steps(case: Case, kind: str) -> F1:
 def lack_of_fit(
     problem: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
 ) -> Localization | None:
-    """Where the residuals of a solution without effects exceed noise; None: nowhere.
+    """Locate where the residuals of a solution without effects exceed noise; None: nowhere.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def lack_of_fit(
 
 
 def _times(rest: F1) -> float:
-    """Rms of valid readings over that of the noise."""
+    """Rms of valid readings in units of the noise (residuals are divided by it; exact zeros are not readings)."""
     read = rest[rest != 0.0]
     return float(np.sqrt(np.mean(read**2))) if read.size else 0.0
 
@@ -118,7 +118,7 @@ def _louder(rest: F1, floor: Floor, tried: int) -> bool:
 
 
 def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping[str, Floor]) -> Localization | None:
-    """Shape of the residuals along the one axis that all runs measure: span, direction, period; None without such an axis."""
+    """Shape of the residuals if all runs are laser lines along one axis: span, direction, period; else None."""
     lines = [r for r in runs if r.path.test == "laser_linear" and np.abs(r.path.look[0]).max() > ALONG_ONE_AXIS]
     axes = {int(np.argmax(np.abs(r.path.look[0]))) for r in lines}
     if not lines or len(axes) != 1 or len(lines) < len(runs):
@@ -145,7 +145,7 @@ def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping
 
 
 def _common(x: F1, y: F1, up: F1) -> tuple[F1, F1]:
-    """Index of every reading's place, and the common part of both directions there, shape (n,) each."""
+    """Index of every reading's position, and the mean of both directions there, shape (n,) each."""
     place = np.round(x / NEAR_MM)
     both = np.zeros(len(y))
     for p in np.unique(place):
@@ -162,7 +162,7 @@ def _loudest(y: F1, up: F1) -> int:
 
 
 def _period(x: F1, y: F1) -> float | None:
-    """Period that explains most of a shape beside a straight line, mm; None where none explains enough, or too few places were seen."""
+    """Period that explains most of a shape beside a straight line, mm; None if none explains enough or there are too few positions."""
     if x.size < FEWEST:
         return None
     spacing, span = float(np.median(np.diff(x))), float(np.ptp(x))
@@ -175,5 +175,5 @@ def _period(x: F1, y: F1) -> float | None:
         share = 1.0 - float(left @ left) / max(float(flat @ flat), 1e-300)
         if share > best:
             best, found = share, float(period)
-    # two parameters of few places explain a share by themselves
+    # with few positions, the two parameters of a wave always explain some share
     return found if best > max(PERIODIC, 6.0 / x.size) else None

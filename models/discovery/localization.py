@@ -1,7 +1,7 @@
-"""Localization of the gap and of a signal.
+"""Localization of the gap between measurement and simulation (`locate`), and of an effect's signal (`localize_signal`).
 
-The gap: tests of whitened residuals by run, axis, direction, feed, time, place, frequency and temperature. A signal: tests, runs, axes,
-directions, time and place that hold most of its energy.
+The gap is located by tests of the whitened residuals by run, axis, direction, feed, time, position, frequency and temperature. A signal is
+located at the tests, runs, axes, directions, time and position that hold most of its energy.
 
 Every p-value is family-wise (Sidak over all tests). Energy is tested reading by reading and in block sums, which are sensitive to smooth
 deviations; the noise variance is enlarged by `ROOM`.
@@ -23,11 +23,11 @@ from abbe.models.machine import AXES
 from abbe.models.probability import chi2_above, normal_above
 
 SHARE = 0.9
-"""A signal is located at the runs and times that hold this share of its energy."""
+"""A signal is located at the time and position that hold this share of its energy."""
 PRESENT = 0.2
-"""A test, axis or direction counts as affected from this share of the mean square of the strongest one on."""
+"""A test, run, axis or direction counts as affected from this fraction of the strongest one's mean square on."""
 LOCAL = 0.25
-"""A signal is confined in place or time when the part that holds it is at most this share of the campaign."""
+"""A signal is confined in position or time when the part that holds it is at most this fraction of the campaign."""
 
 K = TypeVar("K", str, int)
 BLOCKS = 12
@@ -38,7 +38,7 @@ CELLS = 4
 """Position cells along each axis."""
 LEAST = 20
 NEIGHBOURS, DIFFER = " (neighbours)", " up and down differ"
-"""Suffixes in the table that say how a run or an axis was tested."""
+"""Suffixes in the table for tests of a run's neighbouring residuals, and of an axis' two directions."""
 ROOM = 1.15
 """Factor on the noise variance, which is known to some percent only."""
 DEPENDS = {
@@ -53,7 +53,7 @@ DEPENDS = {
 
 @dataclass(frozen=True)
 class _SignalRows:
-    """All readings of some runs: energy, its share along each axis, clock, place, direction of the path, test and run by number."""
+    """All readings of some runs: squared signal, squared direction cosines, time, position, direction along the path."""
 
     energy: F1
     along: F2
@@ -73,8 +73,8 @@ def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localiza
     Returns
     -------
     Localization
-        Tests and runs that see it, axes it lies along (by the square of the look), directions of the path, and, only where it is confined,
-        the time and the place that hold 90 % of its energy. Empty for a signal of zeros.
+        Tests and runs that see it, axes that it lies along, directions of the path, and, only if it is confined, the time and the position
+        that hold 90 % of its energy. Empty for a signal of zeros.
     """
     rows = _signal_rows(paths, signal)
     if not rows.energy.sum() > 0:
@@ -112,7 +112,7 @@ def _strong(sizes: dict[K, float]) -> tuple[K, ...]:
 
 
 def _time(rows: _SignalRows) -> tuple[float, float] | None:
-    """Shortest interval that holds the share, if it is a small part of the campaign."""
+    """Interval that holds the central `SHARE` of the energy, if it is a small part of the campaign."""
     order = np.argsort(rows.t_s, kind="stable")
     t, cumulative = rows.t_s[order], np.cumsum(rows.energy[order])
     low, high = np.interp([(1 - SHARE) / 2 * cumulative[-1], (1 + SHARE) / 2 * cumulative[-1]], cumulative, t)
@@ -247,7 +247,7 @@ def _energy(kind: str, value: str, rows: _Rows, weight: F1) -> _Group:
 
 
 def _weighted_p(weight: F1, square: F1) -> float:
-    """Chance of a weighted sum of chi-squares this large (Satterthwaite)."""
+    """Probability of a weighted sum of chi-squares this large or larger (Satterthwaite)."""
     if weight.sum() <= 0:
         return 1.0
     scale, freedom = float(weight @ weight / weight.sum()), float(weight.sum() ** 2 / (weight @ weight))
@@ -266,7 +266,7 @@ def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_G
 
 
 def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Energy of each direction of the path, and whether an axis reads differently on the way up and down."""
+    """Tests of each direction of the path, and of the difference between an axis' two directions of motion."""
     way = np.concatenate([np.sign(p.direction) for p in paths])
     for d in (1, -1):
         yield _energy("direction", f"{d:d}", rows, (way == d).astype(np.float64))
@@ -277,7 +277,7 @@ def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
 
 
 def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Whether the reading follows a sensor, along any axis."""
+    """Tests whether the residuals follow a temperature sensor, in proportion to the position along any axis."""
     for sensor in sorted(set.intersection(*(set(p.at.temp_c) for p in paths)) if paths else ()):
         value = np.concatenate([p.at.temp_c[sensor] for p in paths])
         if np.ptp(value) < 0.05:

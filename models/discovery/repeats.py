@@ -1,8 +1,8 @@
 """Repeats of a positioning test: does one slow drift, common to all positions, explain their differences?
 
-Positions approached repeatedly from the same side differ by noise and by drift. A drift of the reading with time that
-is the same at all positions shows in the repeats alone, without any model of the axis. Noise with memory looks like drift, so the p-value
-is that of noise with the memory that the residuals have, by simulation, for the best of all forms that were tried.
+Positions approached repeatedly from the same side differ by noise and by drift. A drift in time that is the same at all positions shows
+in the repeats alone, without a model of the axis. Correlated noise looks like drift, so the p-value is simulated with noise that has the
+residuals' correlation from reading to reading ("memory"), for the best of all forms of drift tried.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from abbe.models.arrays import F1, F2
 P_LIMIT = 0.005
 """A drift is claimed below this p-value ..."""
 SHARE_LIMIT = 0.5
-"""... and from this share of the repeat variance on: removing less improves the repeatability by less than 30 %."""
+"""... and from this share of the repeat variance on; removing less improves the repeatability by less than 30 %."""
 TAUS = (0.15, 0.3, 0.6, 1.2)
-"""Time constants tried, as shares of the test's duration; shorter ones are over at once, longer ones are straight lines."""
+"""Time constants tried, as fractions of the test's duration; a longer one is nearly a straight line."""
 TRIALS = 2000
 MEMORIES = np.linspace(0.0, 0.96, 25)
 LEAST = 3
-"""Visits that a position needs (per side) for its repeats to count."""
+"""Least number of visits of a position from one side for its repeats to count."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class RepeatDrift:
     ----------
     named : whether it is claimed (`P_LIMIT`, `SHARE_LIMIT`).
     share : part of the repeat variance that it explains, 0 to 1.
-    p : chance that noise with the residuals' memory gives as much.
+    p : probability that noise with the residuals' memory gives as large a share.
     form, tau_s : "linear", or "exponential" with its time constant.
     change_mm, u_change_mm : from the first to the last reading, with its standard uncertainty.
-    before_mm, after_mm : scatter of the repeats with and without it (standard deviation).
-    memory : correlation of neighbouring readings' noise.
-    drift_mm : array, shape (n,): from the first reading on, in the order given.
+    before_mm, after_mm : standard deviation of the repeats before and after its removal.
+    memory : correlation of the noise of neighbouring readings.
+    drift_mm : array, shape (n,): drift since the earliest reading, in the caller's order.
     """
 
     named: bool
@@ -62,14 +62,14 @@ def repeat_drift(place: F1, t_s: F1, reading_mm: F1) -> RepeatDrift | None:
     Parameters
     ----------
     place : array, shape (n,)
-        Number of each reading's position and side: equal numbers are repeats.
+        Number for each reading's position and side; readings with equal numbers are repeats.
     t_s, reading_mm : array, shape (n,)
         Time, s, and deviation, mm, of each reading.
 
     Returns
     -------
     RepeatDrift or None
-        None if no place was visited `LEAST` times, or not over time.
+        None if too few readings are repeats (`LEAST`), or if they do not spread over time.
     """
     order = np.argsort(t_s, kind="stable")
     groups, which, count = np.unique(place[order], return_inverse=True, return_counts=True)
@@ -135,9 +135,9 @@ def _simplest(gains: F1, dof: int) -> int:
 
 
 def _memory(residual: F1, taken: F2) -> float:
-    """Memory of noise whose residuals after the fit have these neighbour correlations, plus two standard errors.
+    """Memory of the noise that explains the neighbour correlation of the residuals after the fit, plus two standard errors.
 
-    Without the margin, noise with a memory of 0.8 was called a drift in 3 of 100 tests, because the best form absorbs memory.
+    Without the margin, noise with a memory of 0.8 was called a drift in 3 of 100 tests, because the fitted drift absorbs memory.
     """
     n, ss = residual.size, float(residual @ residual)
     if ss <= 0.0:
@@ -154,7 +154,7 @@ def _memory(residual: F1, taken: F2) -> float:
 
 
 def _chance(gain: float, basis: F2, units: F2, memory: float) -> float:
-    """Chance that some form explains as much of noise with that memory."""
+    """Probability that some form of drift explains as large a share of noise with this memory."""
     rng = np.random.default_rng(20261121)
     n = basis.shape[0]
     root = scipy.linalg.cholesky(_correlation(n, memory), lower=True)

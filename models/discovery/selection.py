@@ -1,7 +1,7 @@
-"""Forward selection of missing effects with backward steps and a price for every parameter and label tried (discovery.md 4.6).
+"""Forward selection of missing effects with backward steps and a price for every parameter and label tried.
 
-A candidate's non-linear parameters are refined between the starts of its grid before it is compared (`refined`). Every other name is tried
-in the place of a chosen one, against the same readings (`rivals_of`, discovery.md 4.9).
+A label is an effect with its key; the search calls labels of the catalogue names. A candidate's non-linear parameters are refined between
+the starts of its grid before it is compared (`refined`). Other names are tried in place of a chosen one on the same readings (`rivals_of`).
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from abbe.models.effects.effect import Effect, Parameter
 SWEEPS = 2
 EVALUATIONS = 9
 NEAR = 0.02
-"""A structure without a name is refined within this share of its parameters' range."""
+"""A structure without a name is refined within this fraction of its parameters' range on both sides of the start."""
 MOST_EFFECTS = 5
 SHORTLIST = 6
 THRESHOLD = 4.0
-"""Price of every new name on top of those for its parameters and for the number of names tried."""
+"""Price of every new name, beside those for its parameters and for the number of names tried."""
 UNNAMED_PRICE = 6.0
 VARIANT_PRICE = 4.0
 """Price of a name that contains a simpler one (`abbe.models.effects.effect.Effect.variant_of`), equal to the price of a new name."""
 FORM_LEAST = 0.0002
-"""A freedom of form must explain at least this share of its effect's gain; a smaller one would shift the strength for nothing."""
+"""A freedom of form must explain at least this share of its effect's gain; a smaller one would only shift the strength."""
 NEARLY = 0.93
 """A name that explains this share of the gain of a structure without a name is preferred to it."""
 HOPELESS = 0.5
 """A start that gains less than this share of the best name so far is not refined."""
 UNNAMED_LABELS = 40
-"""Kinds of structure without a name that are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
+"""Number of labels of structures without a name that are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
-"""A freedom of form of a chosen effect pays this share of the price of its parameters, plus this."""
+"""Price of a freedom of form of a chosen effect: this share of the price of its columns, plus a constant."""
 EXCLUDED = 12.0
-"""A rival that explains less by this much chi-square, after its price, is excluded."""
+"""A rival whose score is lower by this much chi-square is excluded."""
 TRIED = 8
 KIN = 0.02
-"""Rivals that explain all but this share of the evidence are not excluded: a curved form of one resembles the other."""
+"""Rivals that explain all but this share of the gain are not excluded, because a real effect deviates that much from its formula."""
 
 
 def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
-    """Best values near those of ``pick`` (one parameter after the other, between the neighbouring starts), and the gain there."""
+    """Optimise the non-linear parameters of ``pick`` one after the other, between the neighbouring starts; return the pick and its gain."""
     best = gain_of(problem, pick, rows)
     if not pick.effect.shape:
         return pick, best
@@ -91,7 +91,7 @@ def _neighbours(parameter: Parameter, value: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Selection:
-    """A pick with its gain (reduction of chi-square beside all others) and its score (gain less price)."""
+    """A pick with its gain (reduction of chi-square beside all other picks) and its score (gain minus price)."""
 
     pick: Pick
     gain: float
@@ -101,7 +101,7 @@ class Selection:
 def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
     """Gain that a new name needs: for each parameter, for the number of names tried, and for being new.
 
-    ``logs``: sum of the logarithms of how many readings see each of its columns; a non-linear parameter takes all ``readings``.
+    ``logs``: sum over its columns of the log of the number of readings that each changes; a non-linear parameter counts all ``readings``.
     """
     return (
         logs
@@ -119,7 +119,7 @@ def form_price(logs: float) -> float:
 
 @dataclass(frozen=True)
 class Contest:
-    """The search over one problem: its bank of named candidates, the price of each label's columns, how many labels there are."""
+    """The search over one problem: banks of candidates, price of each label's columns (``widths``), number of labels and of readings."""
 
     problem: WhitenedProblem
     banks: list[Bank]
@@ -129,13 +129,13 @@ class Contest:
 
     @classmethod
     def of(cls, problem: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
-        """A contest of all starts of all mean effects that the present simulation does not contain."""
+        """Set up a search over all starts of all mean effects that the present simulation does not contain."""
         bank = bank_of(problem, starts_of(competing(effects, problem.case.includes)))
         widths = {p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)}
         return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(problem.use.sum()))
 
     def look_for_unnamed(self, rows: F2) -> None:
-        """Add structures without a name to the contest, with starts at the peaks of the residuals after ``rows``."""
+        """Add structures without a name to the search, with starts at the peaks of the residuals after projection by ``rows``."""
         problem = self.problem
         left = problem.projection.residual - rows.T @ (rows @ problem.projection.y)
         labels = [p.label for p in problem.paths]
@@ -146,7 +146,7 @@ class Contest:
         self.banks[1:] = [bank]
 
     def price(self, pick: Pick) -> float:
-        """Price of a name in this contest, its forms included."""
+        """Price of a pick in this search, its forms included."""
         plain = price(pick, self.widths[pick.label], self.readings, self.labels)
         return plain + sum(form_price(self._form_width(pick, i)) for i in range(len(pick.forms)))
 
@@ -179,7 +179,7 @@ class Contest:
         if not good:
             return None
         best = max(good, key=lambda f: f.score)
-        if best.pick.unnamed:  # it contains a name's formula: prefer the name, whose own forms come next
+        if best.pick.unnamed:  # it can imitate a name's formula: prefer the name, whose forms are tried next
             near = [f for f in good if not f.pick.unnamed and f.gain > NEARLY * best.gain]
             return max(near, key=lambda f: f.score, default=best)
         return best
@@ -203,7 +203,7 @@ class Contest:
 
 
 def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Selection]:
-    """All effects that are worth their price, with back-steps after every addition."""
+    """Select all effects that are worth their price, with backward steps after every addition."""
     picks, problem = list(start), contest.problem
     for _ in range(3 * most):
         rows = rows_for(problem, picks)
@@ -239,7 +239,7 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Replace two picks of one effect by one where that scores higher: Y that trails looks much like X and Z that lead equally."""
+    """Replace two picks of one effect by one where that scores higher: a lag of Y looks much like equal leads of X and Z."""
     for i, j in combinations(range(len(picks)), 2):
         a, b = picks[i], picks[j]
         if a.effect.name != b.effect.name or a.unnamed:
@@ -279,7 +279,7 @@ def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
 
 @dataclass(frozen=True)
 class Rival:
-    """A name that could replace another, and its lack of chi-square (after price)."""
+    """A name that could replace another: ``deficit``: missing chi-square after price; ``share``: its gain over that of the other."""
 
     pick: Pick
     deficit: float
@@ -287,7 +287,7 @@ class Rival:
 
 
 def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
-    """Names that the readings do not exclude in place of pick ``i``, the nearest first; variants of the same name are not rivals."""
+    """Names that the readings do not exclude in place of pick ``i``, best first; variants of the same name are not rivals."""
     picks = [f.pick for f in found]
     rows = others(contest.problem, picks, i)
     own = found[i]
@@ -310,7 +310,7 @@ def _nested(a: Pick, b: Pick) -> bool:
 
 
 def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:
-    """A rival with the freedoms of form that are worth their price, as for the chosen name."""
+    """Add the freedoms of form that are worth their price to a rival; return it with gain and score."""
     score = gain - contest.price(pick)
     for form in pick.effect.forms:
         more = replace(pick, forms=(*pick.forms, form))

@@ -1,4 +1,4 @@
-"""Final solution with the effects that were found, and what every run reads then, sealed ones too."""
+"""Final solution with the effects found, and its prediction of every run, sealed runs included."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from abbe.models.effects.effect import Signal
 
 STEPS = 2
 LONGEST_STEP = 0.3
-"""Longest step of a non-linear parameter as a share of its value."""
+"""Longest step of a non-linear parameter as a fraction of its value."""
 
 
 @dataclass(frozen=True)
 class SolvedModel:
-    """Unknowns of the simulation and of the effects from the identify runs, with usual sizes as priors.
+    """Unknowns of the simulation and of the effects, fitted to the identify runs with usual sizes as priors.
 
     Attributes
     ----------
-    picks : with their non-linear parameters as solved.
-    theta, theta_covariance : of the simulation.
+    picks : the effects, with fitted non-linear parameters.
+    theta, theta_covariance : unknowns of the simulation, mm and rad.
     coefficients, covariance : of each pick, forms last.
-    shape_u : standard uncertainty of the non-linear parameters of each pick.
+    shape_u : standard uncertainty of the non-linear parameters of each pick, by name.
     """
 
     picks: tuple[Pick, ...]
@@ -60,7 +60,7 @@ def solve(problem: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
 
 
 def _steps(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], SolvedModel, SolvedModel]:
-    """Columns of the picks, the fit at their non-linear parameters, and the fit in which those may move too."""
+    """Columns of the picks, the fit at their present non-linear parameters, and the fit with these free too."""
     raw = [p.raw(problem) for p in picks]
     sd = [p.prior_sd(problem, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
     first = _fit(problem, raw, sd)
@@ -74,7 +74,7 @@ def _shape_sd(pick: Pick) -> F1:
 
 
 def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:
-    """Non-linear parameters moved by a step, at most a third of their value, where the step is more than a tenth of what is known."""
+    """The pick after a step of its non-linear parameters (`LONGEST_STEP`); steps below a tenth of the standard uncertainty are skipped."""
     k = len(covariance) - len(change)
     values = dict(pick.values)
     for j, q in enumerate(pick.effect.shape):
@@ -113,7 +113,7 @@ def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> Solve
 
 
 def predictions(problem: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
-    """Reading of every run of the case, mm, sealed ones too. Set-ups that no identify run shares: cup and length at nominal."""
+    """Predicted reading of every run, mm, sealed runs included; set-up unknowns that no identify run determines are zero."""
     runs = ordered(problem.case.runs)
     data = [r.data() for r in runs]
     out = [problem.base.read(d, solved.theta) for d in data]
@@ -145,7 +145,7 @@ def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
 
 
 def free_columns(run: CaseRun, fitted_setups: set[str]) -> F2:
-    """Columns of a judged run's own unknowns: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
+    """Columns of a run's own unknowns: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
     p = run.path
     if p.kind == "laser":
         return np.ones((p.n, 1))
@@ -165,7 +165,7 @@ def left_over(run: CaseRun, predicted_mm: F1, fitted_setups: set[str]) -> F1:
 
 
 def left_together(runs: Sequence[CaseRun], predicted_mm: Mapping[str, F1], fitted_setups: set[str]) -> dict[str, F1]:
-    """As `left_over` for several runs, by label; ball-bar runs that share a set-up of their own have one cup and one length of each bar."""
+    """As `left_over` for several runs, by label; ball-bar runs that share a set-up without identify runs share cup and bar lengths."""
     groups: dict[str, list[CaseRun]] = {}
     for run in runs:
         own_cup = run.path.kind == "bar" and run.path.setup not in fitted_setups

@@ -1,4 +1,4 @@
-"""Structures without a name that a search found: evidence, location, description, and the experiments that would show their cause."""
+"""Structures without a name, that is, found deviations that no effect of the catalogue explains: description and proposed experiment."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from abbe.models.effects.path import Path
 TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
 """Titles of the variance structures."""
 REPEATS = 3
-"""Runs of a repeat in one set-up."""
+"""Number of repeats of a run in one set-up."""
 PERIODS = 10
-"""Periods for which an instrument is read at standstill."""
+"""Number of periods for which an instrument is read at standstill."""
 
 
 @dataclass(frozen=True)
 class Structure:
-    """A structure without a name; ``title`` for people."""
+    """A structure without a name; ``title``: its kind as text."""
 
     label: str
     title: str
@@ -34,7 +34,7 @@ class Structure:
 
 
 def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
-    """Structures among the effects of the mean (``found``) and of the variance (``loud``), by evidence."""
+    """Structures without a name among the mean effects (``found``) and the variance effects (``loud``), by evidence."""
     out = [
         Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, location_of(f.pick.effect, f.pick.key, f.pick.values, case))
         for f in found
@@ -45,7 +45,7 @@ def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFi
 
 
 def lacking(location: Localization) -> Structure:
-    """A lack of fit as a structure."""
+    """A lack of fit (`abbe.models.discovery.lack`) as a structure."""
     axis = f":{location.axes[0]}" if len(location.axes) == 1 else ""
     if location.shape:
         return Structure(f"{PREFIX}smooth{axis}", location.shape, 0.0, location)
@@ -55,7 +55,7 @@ def lacking(location: Localization) -> Structure:
 def describe_structure(structure: Structure, *, beside: bool) -> str:
     """``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: names were found too."""
     parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.location)]
-    return ", ".join(parts) + ("; what it closes of the gap is not the names'" if beside else "")
+    return ", ".join(parts) + ("; the named effects do not explain this part of the gap" if beside else "")
 
 
 def _place(location: Localization) -> list[str]:
@@ -76,8 +76,10 @@ def _place(location: Localization) -> list[str]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """``adds``: what is proposed, the first that the campaign does not hold; ``always``: the last one can be proposed even if it does, else
-    the run is repeated; ``between``: what it tells apart; ``why``: for people, ``{run}``, ``{standstill}`` filled in."""
+    """Experiment for a kind of structure. The first of ``adds`` that the campaign lacks is proposed. If it has all, the last is proposed
+    again (``always``), or the run is repeated. ``between``: the two causes that it separates; ``why``: text with ``{run}`` and
+    ``{standstill}``.
+    """
 
     adds: tuple[str, ...]
     between: tuple[str, str]
@@ -88,25 +90,26 @@ class _Plan:
 _AGAIN = _Plan(
     ("longer_session",),
     ("something of the machine", "something of that session"),
-    f"{{run}} again, later, {REPEATS} times in one undisturbed set-up: what recurs belongs to the machine, what does not "
-    "belonged to that session",
+    f"measure {{run}} again later, {REPEATS} times in one undisturbed set-up: if the deviation recurs, it belongs to the machine, "
+    "otherwise to that session",
 )
 _PERIOD = _Plan(
     ("second_feed",),
     ("a period of time", "a period of position"),
-    "at another feed a period of time keeps its seconds, one of position its millimetres; the instrument read at standstill{standstill} "
-    "tells whether it needs motion",
+    "at another feed a period of time keeps its seconds, a period of position its millimetres; reading the instrument at "
+    "standstill{standstill} shows whether the wave needs motion",
 )
 _BUMP = _Plan(
     ("second_radius",),
     ("a place of the machine", "a moment of that run"),
-    "a denser path with another bar, whose sphere passes through the same place: what is there again belongs to the place",
+    "a denser path with another bar whose sphere passes through the same place: a deviation that recurs there belongs to the place",
     always=True,
 )
 _LOBES = _Plan(
     ("ballbar",),
     ("a ball of the bar", "the machine"),
-    "{run} again with the bar turned a quarter about its length, or with another ball in the cup: lobes that go with it are the ball's",
+    "measure {run} again with the bar turned a quarter about its length, or with another ball in the cup: lobes that change belong to the "
+    "ball",
     always=True,
 )
 _SMOOTH = _Plan(
@@ -117,9 +120,9 @@ _SMOOTH = _Plan(
 _ODD = _Plan(
     ("opposite_direction", "single_axis_laser", "planar_circles"),
     ("the direction of motion", "the order of the readings"),
-    "the same places from the other side: what turns its sign with the direction turns again",
+    "the same positions from the other side: if the direction is the cause, the deviation changes its sign again",
 )
-_BEAT = replace(_AGAIN, why=f"{_AGAIN.why}; the instrument read at standstill{{standstill}} tells whether it needs motion")
+_BEAT = replace(_AGAIN, why=f"{_AGAIN.why}; reading the instrument at standstill{{standstill}} shows whether it needs motion")
 _PLANS = {
     "step": _AGAIN, "slip": _AGAIN, "settling": _AGAIN, "burst": _AGAIN, "place": _AGAIN, "surge": _PERIOD, "wave": _PERIOD,
     "bump": _BUMP, "lobes": _LOBES, "smooth": _SMOOTH, "odd": _ODD,
@@ -127,7 +130,7 @@ _PLANS = {
 
 
 def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | None:
-    """The measurement that would show what the strongest structure without a name is.
+    """Propose the measurement that would show the cause of the strongest structure without a name.
 
     Parameters
     ----------
@@ -136,8 +139,8 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
     Returns
     -------
     NextTest or None
-        None without structures. ``separates`` says in words what it may be. How far the two differ is not known: it is unknown what
-        the structure would do elsewhere, so there are no sigmas.
+        None without structures. ``separates`` names two possible causes. The expected separation is unknown, because it is unknown how the
+        structure continues elsewhere.
     """
     if not structures:
         return None
@@ -153,10 +156,10 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
 
 
 def _chosen(kind: str, like: Path, open_: set[str]) -> tuple[_Plan, str]:
-    """The plan for a kind of structure and what it adds; where that is there already, a repeat."""
+    """The plan for a kind of structure and the addition to propose."""
     plan = _PLANS[kind]
     adds = next((a for a in plan.adds if a in open_), None)
-    if kind == "bump" and like.kind != "bar":  # no sphere to pass through the place
+    if kind == "bump" and like.kind != "bar":  # the plan needs a ball-bar
         return _AGAIN, "longer_session"
     if adds is None and plan.always:
         return plan, plan.adds[-1]
@@ -167,7 +170,7 @@ def _chosen(kind: str, like: Path, open_: set[str]) -> tuple[_Plan, str]:
 
 
 def _like(case: Case, structure: Structure) -> Path:
-    """The run that is measured again: of those that show it a helix, if there is one, for a machine does that alone; near its moment."""
+    """The run to measure again: among those that show the structure, near its time; helices first, which a machine runs unattended."""
     paths = [r.path for r in case.of("identify", "holdout")]
     location = structure.location
     shown = [p for p in paths if p.label in location.runs] or paths
@@ -186,5 +189,5 @@ def _once_minutes(like: Path) -> float:
 
 
 def _repeat_minutes(like: Path) -> float:
-    """Items of the test: a wait, one set-up and the repeats."""
+    """Minutes of a wait, one set-up and the repeats."""
     return WAIT_MIN + _once_minutes(like) + (REPEATS - 1) * _run_minutes(like)

@@ -1,6 +1,6 @@
 """Readings of a campaign, prepared for the search: present simulation fitted, noise estimated, the simulation's unknowns projected out.
 
-Readings and candidates are projected onto the complement of the model's unknowns (Frisch-Waugh-Lovell).
+Readings and candidates are projected onto the orthogonal complement of the simulation's columns (Frisch-Waugh-Lovell).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from abbe.models.effects.effect import Signal, Values
 from abbe.models.effects.path import Path
 
 ROWS = 2048
-"""Readings per block of a product, so that no second matrix of all readings and unknowns exists."""
+"""Readings per block of a product, to save memory."""
 FIRST_NOISE = {"bar": Colour(4e-4), "laser": Colour(2.5e-4)}
 STEPS = 2
 WIDE = 10.0
@@ -40,8 +40,8 @@ FITTED = 3.0
 class SignalProjection:
     """Whitened readings and the operator that projects the unknowns out of them.
 
-    With T = [root @ columns^T @ diag(weight); rows], shape (p + k, n), the operator is M = 1 - T^T T; with flat priors M is a projection.
-    T is as large as the columns, so only its factors are stored, and the columns belong to the simulation.
+    With T = [root @ columns^T @ diag(weight); more], shape (p + k, n), the operator is M = 1 - T^T T; with flat priors M is a projection.
+    T is as large as the columns, so only its factors are stored.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class SignalProjection:
     columns : array, shape (n, p); weight : array, shape (n,)
         Whitened columns of the unknowns are ``columns`` times ``weight``, reading by reading.
     root : array, shape (p, p), lower triangle.
-    more : array, shape (k, n): rows of T for further columns.
+    more : array, shape (k, n): rows of T for further columns that are projected out.
     y_coordinates : array, shape (p + k,) = T @ y.
     """
 
@@ -95,7 +95,7 @@ class SignalProjection:
 
     @cached_property
     def leverage(self) -> F1:
-        """Leverage: share of every reading's noise that the fit absorbs."""
+        """Leverage: share of every reading's noise variance that the fit absorbs, shape (n,)."""
         out: F1 = np.einsum("kn,kn->n", self.more, self.more)
         for start in range(0, self.y.size, ROWS):
             at = slice(start, start + ROWS)
@@ -130,15 +130,15 @@ class WhitenedProblem:
 
     Attributes
     ----------
-    paths : lines of sight of the fitted machine.
-    gap : array, shape (n,): reading less the fitted simulation, mm.
-    use : array, shape (n,): 1, or 0 for readings that do not count (flagged, or lone ones far off).
+    paths : paths of the runs, with the bar directions of the fitted machine (`Baseline.along`).
+    gap : array, shape (n,): reading minus the fitted simulation, mm.
+    use : array, shape (n,): 1, or 0 for readings that do not count (flagged, or single laser outliers).
     theta : array, shape (p,): unknowns of the fitted simulation.
-    tangent : columns of the simulation's unknowns, whitened but for the size of the noise.
-    projection : of the whitened gap onto the complement of the simulation's unknowns.
+    tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
+    projection : whitened gap, and the operator that projects the simulation's unknowns out of it.
     also : array, shape (n, k): further columns to project out that are not part of the simulation (waves of a vibration), mm per mm.
-    column_cache : whitened columns of picks and their projection. banks : live banks of candidates of this problem. widths : columns of an
-        effect along one run, by label. All three are caches.
+    column_cache : whitened columns of picks and their projection. banks : live banks of candidates of this problem. widths : number of
+        columns of an effect along one run, by label. All three are caches.
     """
 
     case: Case
@@ -185,7 +185,7 @@ class WhitenedProblem:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives (n, p) in single precision: linearising about the perfect machine leaves a relative error of 1e-4 anyway."""
+    """Derivatives (n, p) in single precision, because linearising about the perfect machine has a relative error of 1e-4 anyway."""
 
     short: NDArray[np.float32]
 
@@ -258,7 +258,7 @@ def whiten(case: Case, base: Baseline) -> WhitenedProblem:
 
 
 def linearised(problem: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedProblem:
-    """One Gauss-Newton step of the simulation, jointly with columns of effects (mm per unit, n x k) that the step leaves outside."""
+    """One Gauss-Newton step of the simulation, fitted together with columns of effects (mm per unit, n x k), which stay in the gap."""
     base, tangent = problem.base, problem.tangent
     data = [r.data() for r in problem.runs]
     sd_mm = problem.sd_mm()[:, None]
@@ -292,7 +292,7 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
 
 
 def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]]) -> WhitenedProblem:
-    """The problem with the noise re-estimated after the effects ``found`` (raw columns, prior sd) were projected out too."""
+    """The problem with the noise re-estimated, with the effects ``found`` (raw columns, prior sd) projected out too."""
     for _ in range(ROUNDS):
         problem = with_projection(problem)
         projection = problem.projection

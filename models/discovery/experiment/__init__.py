@@ -1,1 +1,1 @@
-"""Which measurement would tell more."""
+"""Experiment design: which further measurement would separate the remaining explanations."""

@@ -1,4 +1,4 @@
-"""What a campaign lacks: the additions of run-format.md 5 as runs to be simulated, and the blind spots of a campaign that found nothing."""
+"""Additions to a campaign as runs to be simulated, and the blind spots of a campaign that found nothing."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_
 
 BAR_MIN, LASER_MIN, LINE_MIN, TOOL_MIN, WAIT_MIN, LENGTH_MIN = 10.0, 25.0, 20.0, 15.0, 120.0, 10.0
 """Minutes to set up: ball-bar; laser on one diagonal; laser or angular interferometer on one axis; another tool; a late repeat's wait; a
-length standard. Shop practice as ball-bar and laser makers state it (effects.md sources [R], [Opt]), rounded."""
+length standard. Shop practice as makers of ball-bars and lasers state it, rounded."""
 RUN_MIN = 1.0
 POSITION_S = 4.5
-"""A laser needs this long per position: move, dwell, read."""
+"""Time that a laser needs per position: move, dwell, read."""
 READINGS = 120
 MARGIN = 0.05
 LONGER_TOOL_MM = 100.0
@@ -33,24 +33,24 @@ SHORTEST_BAR_MM = 10.0
 OTHER_FEED = 1.3
 """Feeds that differ by a smaller factor count as one: feed-dependent effects then change too little to differ from geometry."""
 REPEAT_LATE_S = 3600.0
-"""A repeat counts as late after this time: axes and spindle warm up within 20 minutes to two hours (effects.md, thermal)."""
+"""A repeat counts as late after this time: axes and spindle warm up within 20 minutes to two hours."""
 SAME_MM = 2.0
-"""Two paths are the same when their extents agree to this in every direction: at another feed the readings lie elsewhere along it."""
+"""Two paths are the same when their extents agree to this along every axis; their single readings differ with the feed."""
 SAME_LOOK = 0.01
 """Beams whose unit vectors differ by less in every direction are parallel."""
-GROWS = "what grows with the feed (lag, servo mismatch, vibration of the drives) looks like geometry"
-TURNS = "what differs between the way there and the way back over the same points (lost motion, lateral play) looks like geometry"
-LENGTH = "what belongs to the bar (its length, its balls, its temperature) looks like an error of the machine"
-SLOW = "what comes slowly (axes, spindle and air that warm up) looks like geometry, or like a set-up"
+GROWS = "errors that grow with the feed (lag, servo mismatch, vibration of the drives) look like geometry"
+TURNS = "errors that differ between the two directions along a path (lost motion, lateral play) look like geometry"
+LENGTH = "errors of the bar (its length, its balls, its temperature) look like errors of the machine"
+SLOW = "slow changes (axes, spindle and air that warm up) look like geometry or like errors of the set-up"
 SCALE = "only the bar's calibrated length shows an error common to all scales, and the search does not use the bar's certificate"
-MOVING = "what shows in motion on a curve only (reversals of two axes, servo mismatch, lag) leaves no trace"
+MOVING = "errors that occur only in motion on a curve (reversals of two axes, servo mismatch, lag) leave no trace"
 
 
 @dataclass(frozen=True)
 class ExperimentOffer:
-    """One addition to a campaign (run-format.md 5): the runs to simulate, the minutes they take; ``why``: for people.
+    """One addition to a campaign: ``adds``: its name; the runs to simulate; the minutes they take; ``why``: description as text.
 
-    ``subtracted``: the second beam of an angular interferometer, a run for each of ``runs`` from whose readings its own are subtracted.
+    ``subtracted``: runs of an angular interferometer's second beam, whose readings are subtracted from those of ``runs``.
     ``knows_length``: it makes the bar's length known.
     """
 
@@ -68,7 +68,7 @@ class ExperimentOffer:
 
 
 def offers(case: Case) -> tuple[ExperimentOffer, ...]:
-    """Every addition that the identify runs lack."""
+    """Return every addition that the identify runs lack."""
     runs = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in runs if p.kind == "bar"], [p for p in runs if p.kind == "laser"]
     if not runs:
@@ -93,18 +93,18 @@ def offers(case: Case) -> tuple[ExperimentOffer, ...]:
 
 
 def one_feed(bars: list[Path]) -> bool:
-    """Whether ball-bar runs, one or more, have one feed."""
+    """Whether the ball-bar runs (at least one) all have the same feed."""
     feeds = [float(np.round(np.median(p.feed_mm_min))) for p in bars]
     return max(feeds) < OTHER_FEED * min(feeds)
 
 
 def one_way(bars: list[Path]) -> bool:
-    """Whether ball-bar runs go one way round."""
+    """Whether all ball-bar runs go in the same direction."""
     return len({float(np.sign(p.direction[0])) for p in bars}) < 2
 
 
 def one_radius(bars: list[Path]) -> bool:
-    """Whether ball-bar runs have one radius."""
+    """Whether all ball-bar runs have the same radius."""
     return len({round(p.radius_mm) for p in bars}) < 2
 
 
@@ -138,7 +138,7 @@ def _bar_variants(bars: list[Path], start: float) -> list[ExperimentOffer]:
 def _with_back(
     like: Path, bars: list[Path], make: Callable[[F2, float, str], CaseRun], start: float, label: str, q_mm: F2 | None = None
 ) -> tuple[CaseRun, ...]:
-    """A path and, where the campaign goes both ways, its way back."""
+    """A run along a path and, if the campaign has both directions, one back along it."""
     q = like.at.q_mm if q_mm is None else q_mm
     out = [make(q, start, label)]
     if not one_way(bars):
@@ -155,7 +155,7 @@ def _same_setup(path: Path, first: CaseRun) -> Path:
 
 
 def _fits(machine: Machine, centre_mm: F1, radius_mm: float) -> bool:
-    """Whether most of a hemisphere stays inside the strokes, whichever side helices open to."""
+    """Whether a sphere of this radius stays inside the strokes of at least two axes."""
     room = np.minimum(centre_mm - machine.stroke_mm[:, 0], machine.stroke_mm[:, 1] - centre_mm)
     return bool(np.sum(room >= radius_mm) >= 2)
 
@@ -182,7 +182,7 @@ def _run(path: Path) -> CaseRun:
 
 
 def _circles(like: Path, start: float, feed: float) -> tuple[CaseRun, ...]:
-    """Circles in the planes that fit, both ways, about the middle of the strokes."""
+    """Circles about the middle of the strokes, in both directions, in each plane in which they fit."""
     centre = like.machine.centre_mm
     out: list[CaseRun] = []
     radius = like.radius_mm if like.kind == "bar" else min(150.0, float(np.floor(0.45 * like.machine.length_mm.min())))
@@ -202,7 +202,7 @@ def _circles(like: Path, start: float, feed: float) -> tuple[CaseRun, ...]:
 
 
 def _ballbar(like: Path, start: float) -> list[ExperimentOffer]:
-    """None where the strokes have no room for a bar."""
+    """Ball-bar circles in three planes at two feeds; empty if the strokes have no room for a bar."""
     runs = _circles(like, start, 2.0 * FEED_MM_MIN) + tuple(
         replace(r, path=replace(r.path, label=f"{r.path.label}_slow", setup=f"{r.path.setup}_slow"))
         for r in _circles(like, start + 1500.0, FEED_MM_MIN)
@@ -252,7 +252,7 @@ def _line(like: Path, axis: int, start: float, label: str, tool_mm: F1 | None = 
 
 
 def _angles(like: Path, start: float) -> ExperimentOffer:
-    """An angular interferometer reads the difference of two beams; about both directions across each axis."""
+    """An angular interferometer, as the difference of two beams, about both directions across each axis."""
     one, two, t = [], [], start
     for a in range(3):
         for across in ((a + 1) % 3, (a + 2) % 3):
@@ -268,7 +268,7 @@ def _angles(like: Path, start: float) -> ExperimentOffer:
 
 
 def _late(known: list[Path], start: float) -> ExperimentOffer:
-    """The first paths again hours later, each in a set-up of its own."""
+    """The first paths repeated hours later, each in a set-up of its own."""
     runs = []
     for k, p in enumerate(_different(known)[:4]):
         runs.append(_again(p, start + LATE_S + 1500.0 * k, f"next_late_{k}", p.machine))
@@ -288,7 +288,7 @@ def _second_tool(known: list[Path], start: float) -> ExperimentOffer:
 
 
 def _different(known: list[Path]) -> list[Path]:
-    """One run of every set-up, in the order of time."""
+    """The first run of every set-up, in the order of time."""
     first: dict[str, Path] = {}
     for p in sorted(known, key=lambda p: float(p.at.t_s[0])):
         first.setdefault(p.setup, p)
@@ -302,9 +302,9 @@ def _again(p: Path, start: float, label: str, machine: Machine) -> CaseRun:
 
 
 def blind_spots(case: Case) -> tuple[BlindSpot, ...]:
-    """Blind spots of the fitted runs of a campaign, each with the measurement that would cover it.
+    """Return the blind spots of a campaign's identify runs, each with the measurement that would cover it.
 
-    Runs that were not fitted do not count: the search does not use them.
+    Other runs do not count, because the search does not use them.
     """
     paths = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in paths if p.kind == "bar"], [p for p in paths if p.kind == "laser"]
@@ -341,7 +341,7 @@ def _repeated_late(paths: list[Path]) -> bool:
 
 
 def _place(path: Path) -> F1:
-    """Signature of a path regardless of direction: extent along every axis, a bar's cup and radius, mm; a beam's direction, scaled."""
+    """Signature of a path regardless of direction, mm: extent along every axis; cup and radius of a bar, or scaled direction of a beam."""
     reach = [path.at.q_mm.min(axis=0), path.at.q_mm.max(axis=0)]
     if path.kind == "bar":
         return np.concatenate([*reach, path.centre_mm, [path.radius_mm]])

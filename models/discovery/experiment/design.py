@@ -1,8 +1,8 @@
 """Experiment design: the addition that best separates the remaining suspects, by simulation (T-optimal design, Atkinson and Fedorov).
 
-For every addition that the campaign lacks, each rival fits the suspect's signal over old and new runs with all unknowns free: the rival's
-coefficients, the present simulation, the set-ups. The residual, in sigmas of the noise, is the expected separation. The addition with the
-largest separation per minute is proposed, ball-bar and laser before optics and standards that few shops have.
+For every addition that the campaign lacks, each rival is fitted to the leading suspect's signal over old and new runs, with all unknowns
+free: the rival's coefficients, the present simulation, the set-ups. The residual, in sigmas of the noise, is the expected separation. The
+addition with the largest separation per minute is proposed; ball-bar and laser come before optics and standards that few shops have.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path, Places
 
 THIN = 100
-"""Readings kept of each old run after decimation; each represents those left out."""
+"""Approximate number of readings kept of each old run; each also represents those left out."""
 ENOUGH = 5.0
-"""Separations above this many sigmas count as this one."""
+"""Separations above this many sigmas count as this many."""
 WORTH, LEAST = 2.0, 0.02
-"""Sigmas that make a test worth its time; an addition below the second adds nothing."""
+"""Added sigmas from which a test is worth its time; added sigmas below which it is useless."""
 NOISE_MM = {"bar": 4e-4, "laser": 3e-4}
 LENGTH_MM = 3e-4
 SEPARATED = 4.0
 """A rival that is this many sigmas away is excluded."""
 WIDE = 10.0
-"""Priors of the simulation's unknowns are taken this much wider than usual, as in the search."""
+"""Factor on the priors of the simulation's unknowns, as in the search."""
 RIDGE = 1e-10
 
 
@@ -43,7 +43,7 @@ class SuspectEffect:
     Attributes
     ----------
     coefficients : array, shape (k,)
-        As found; used for the leading suspect only. None: typical strength.
+        As found, needed only for the leading suspect. None: typical strength.
     """
 
     effect: Effect
@@ -59,7 +59,7 @@ class SuspectEffect:
 
 @dataclass(frozen=True)
 class Prospect:
-    """Expected separation of the leader from each rival with an addition, and without it, sigmas, in the order of the rivals."""
+    """Expected separation of the leading suspect from each rival with an addition, and without it, sigmas, in the order of the rivals."""
 
     offer: ExperimentOffer
     sigmas: F1
@@ -72,7 +72,7 @@ class Prospect:
 
     @property
     def plain(self) -> bool:
-        """Whether ball-bar and laser suffice: no other tool holder, standard or optics."""
+        """Whether the addition needs only ball-bar or laser and separates every rival that is not separated already."""
         open_ = self.already < SEPARATED
         return not self.offer.special and bool((self.sigmas[open_] >= SEPARATED).all() and open_.any())
 
@@ -86,18 +86,18 @@ class Prospect:
 def propose(
     case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
 ) -> NextTest | None:
-    """The addition that best separates the leading suspect from its rivals, per minute.
+    """Propose the addition that separates the leading suspect from its rivals best per minute.
 
     Parameters
     ----------
     leader : the named suspect, with its coefficients.
     rivals : alternatives to it.
-    noise_mm : of one reading of "bar" and "laser"; instruments that the campaign lacks get usual ones.
+    noise_mm : noise of one reading of "bar" and "laser"; default: usual values.
 
     Returns
     -------
     NextTest or None
-        None without rivals, or if no addition separates anything. If none adds two sigmas: the one that adds most.
+        None without rivals, or if no addition separates anything. If none adds `WORTH` sigmas, the addition that adds most.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:
@@ -137,7 +137,7 @@ def prospects(
 
 
 def _with_setups(case: Case) -> Baseline:
-    """The present simulation with unknowns for every set-up; a new mounting always has an unknown cup, length and tilt."""
+    """The present simulation with set-up unknowns added, because a new mounting always has an unknown cup, length and tilt."""
     return baseline_of(replace(case, includes=case.includes | {"setup_centre_offset", "bar_length_error", "mirror_tilt"}))
 
 
@@ -171,7 +171,7 @@ class _Columns:
     def of(cls, base: Baseline, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], paths: tuple[Path, ...]) -> _Columns:
         own = leader.effect.signal(paths, leader.key, leader.values)
         given = usual(leader, own[0].shape[1]) if leader.coefficients is None else leader.coefficients
-        # columns of set-ups that are new: as large as those of the old ones
+        # Columns of new set-ups get the rms of the known coefficients.
         c = np.full(own[0].shape[1], float(np.sqrt(np.mean(given**2))))
         c[: given.size] = given[: c.size]
         found = tuple(tuple(r.effect.signal(paths, r.key, r.values)) for r in rivals)
@@ -189,7 +189,7 @@ class _Columns:
         return np.column_stack([jacobian, *(r[k] for r in self.rivals), self.leader[k]])
 
     def left(self, gram: F2, *, knows_length: bool = False) -> F1:
-        """Norm of the leader's signal that neither a rival nor the simulation can imitate, sigmas, by rival."""
+        """Norm of the part of the leader's signal that a rival and the simulation together cannot imitate, sigmas, by rival."""
         n, out = self.base.size, []
         sd = self.base.prior_sd * WIDE
         if knows_length:

@@ -1,1 +1,1 @@
-"""A signal that no effect of the catalogue explains: its shape and place."""
+"""Generic structures for deviations that no effect of the catalogue explains."""

@@ -1,8 +1,8 @@
-"""Starts of the search for unnamed structures: the few places, times and periods at which the residuals stand out.
+"""Starts of the search for unnamed structures: the few positions, times and periods at which the residuals stand out.
 
-A step may occur at any time, a surge have any period: thousands of starts, too many to project each onto the complement of the present
-model. The inner product of a candidate's column with the (already projected) residual needs no projection, only the column's norm does. So
-a scan with approximate norms finds the candidates' best starts, which then compete with their exact columns.
+A step may occur at any time and a wave have any period, which makes thousands of starts, too many to project each column. The inner product
+of a candidate's column with the (already projected) residual needs no projection of the column, only its norm does. So a scan with
+approximate norms finds the best starts, which then compete with their exact columns.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ PITCHES_MM = (6.0, 60.0)
 BURST_S = (0.35, 0.8, 1.8)
 BURST_HZ = (0.15, 8.0)
 CELL_MM = 14.0
-"""Distance between the centres of tried bumps."""
+"""Distance between the tried centres of bumps."""
 PLACES = 64
-"""Centres tried at once; each has hundreds of readings near it."""
+"""Centres processed at once; each has hundreds of readings near it."""
 
 
 @dataclass(frozen=True)
 class ScanResult:
-    """Residuals of some runs: ``rest`` whitened, ``sigma_mm`` of one reading of each run."""
+    """Residuals of some runs: ``rest``: whitened, one array (n,) per run; ``sigma_mm``: noise of one reading of each run."""
 
     paths: tuple[Path, ...]
     rest: tuple[F1, ...]
@@ -38,7 +38,7 @@ class ScanResult:
         return ScanResult(tuple(self.paths[k] for k in which), tuple(self.rest[k] for k in which), tuple(self.sigma_mm[k] for k in which))
 
     def stacked(self) -> tuple[F1, F2, F1]:
-        """Clock, look per sigma (n, 3) and rest of all runs."""
+        """Times, s, directions over noise (n, 3), 1/mm, and whitened residuals of all runs."""
         look = np.concatenate([p.look / s for p, s in zip(self.paths, self.sigma_mm, strict=True)])
         return np.concatenate([p.at.t_s for p in self.paths]), look, np.concatenate(self.rest)
 
@@ -55,7 +55,10 @@ def best(score: F1, count: int, apart: int) -> list[int]:
 
 
 def step_instants(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Times of a step per axis and, ``""``, in all directions at once: by set-up of a bar, by run of a laser, whose zero is new."""
+    """Best times of a step, s, by axis and (``""``) in all directions together.
+
+    A step lasts until the end of a ball-bar set-up or of a laser run, because each laser run sets its zero anew.
+    """
     groups: dict[str, list[int]] = {}
     for k, p in enumerate(scanned.paths):
         groups.setdefault(f"bar {p.setup}" if p.kind == "bar" else f"laser {p.label}", []).append(k)
@@ -76,7 +79,7 @@ def step_instants(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...
 
 
 def periods(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Periods on the clock, by axis and by instrument ("bar", "laser")."""
+    """Best periods in time, s, by axis and by instrument ("bar", "laser")."""
     t, look, rest = scanned.stacked()
     per_mm = np.concatenate([np.full(p.n, 1.0 / s) for p, s in zip(scanned.paths, scanned.sigma_mm, strict=True)])
     bar = np.concatenate([np.full(p.n, p.kind == "bar") for p in scanned.paths])
@@ -87,7 +90,7 @@ def periods(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
 
 
 def pitches(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Pitches of a wave along one axis in the direction of another, by component."""
+    """Best pitches of a wave along one axis in the direction of another, mm, by error motion."""
     q = np.concatenate([p.at.q_mm for p in scanned.paths])
     _, look, rest = scanned.stacked()
     out = {}
@@ -101,9 +104,9 @@ def pitches(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
 
 
 def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F1, bin_size: float) -> tuple[F1, F2]:
-    """Frequencies, and the reduction of chi-square by a wave in ``x`` of each, shape (columns, frequencies).
+    """Frequencies, and the reduction of chi-square by a wave in ``x`` at each, shape (columns, frequencies).
 
-    By a Fourier transform of readings that are binned in ``x``; lengths are those of an unprojected column.
+    It is a Fourier transform of readings binned in ``x``, with the norms of unprojected columns.
     """
     length = np.sum(columns**2, axis=0) / 2.0 + 1e-12
     cell = ((x - x.min()) / bin_size).astype(np.intp)
@@ -116,7 +119,7 @@ def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F
 
 
 def bursts(scanned: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Times, widths and frequencies of short oscillations in single bar runs: the values of the best few combinations."""
+    """Times (s), widths (s) and frequencies (Hz) of the strongest short oscillations in single ball-bar runs."""
     found: list[tuple[float, float, float, float]] = []
     for p, rest in zip(scanned.paths, scanned.rest, strict=True):
         if p.kind != "bar" or p.n < 20:
@@ -140,7 +143,7 @@ def bursts(scanned: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[fl
 
 
 def bumps(scanned: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
-    """Times at which the path passes the places where a bump would explain most."""
+    """Times (s) at which the path passes the positions where a bump would explain most."""
     q = np.concatenate([p.at.q_mm for p in scanned.paths])
     t, look, rest = scanned.stacked()
     _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
@@ -156,7 +159,7 @@ def bumps(scanned: ScanResult, widths_mm: tuple[float, ...], count: int) -> tupl
 
 
 def _bump_gains(places: F2, tree: scipy.spatial.cKDTree, look: F2, rest: F1, widths_mm: tuple[float, ...]) -> F1:
-    """Largest reduction of chi-square by a bump of any width at each place, shape (places,)."""
+    """Largest reduction of chi-square by a bump of one of the widths at each position, shape (places,)."""
     near = scipy.spatial.cKDTree(places).sparse_distance_matrix(tree, 2.5 * max(widths_mm), output_type="coo_matrix")
     total = np.zeros(len(places))
     for width in widths_mm:

@@ -1,7 +1,7 @@
-"""Structures without a name: effects that mean "unknown", compete with the catalogue in the same contest, and locate the gap.
+"""Structures without a name: generic effects that compete with the catalogue in the same search, mean "unknown" and locate the gap.
 
-Their signals are readings by kind of structure, whatever its cause. Without them four of five effects outside the catalogue get a wrong
-name (discovery.md 2, variant C).
+Each describes a kind of deviation (a step, a wave, a bump), whatever its cause. Without them, four of five effects outside the catalogue
+get a wrong name. A key names the axis (``"X"``) or the error motion (``"EYX"``: along X in direction Y).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from abbe.models.geometry.rotation import cross_matrix
 from abbe.models.machine import AXES
 
 UM = 1e-3
-"""Columns are mm per micrometre."""
+"""Columns of the signals are in mm per micrometre of strength."""
 SMOOTH_ORDERS = (2, 3, 4, 5, 6)
 ODD_ORDERS = (1, 2, 3)
-"""Without the constant: a jump at every reversal has a name, and a structure that includes it would replace the name."""
+"""Without order 0: a jump at every reversal has a name (lost motion), which a structure with this order would replace."""
 ARM_MM = 300.0
 """Rotations of a slip are stated as displacements at this distance, so that all its columns are in micrometres."""
 PREFIX = "unnamed_"
@@ -33,18 +33,18 @@ COMPONENTS = tuple(f"E{d}{a}" for a in AXES for d in AXES)
 CROSS = tuple(key for key in COMPONENTS if key[1] != key[2])
 LOBES = (3, 4, 5, 6)
 WIDTHS_MM = (13.0, 24.0)
-SOURCE = "effects.md 5; discovery.md 4, candidates"
+SOURCE = "generic structure, docs/decisions/0012-discovery.md"
 TOP = 6
 """Starts per label that a scan of the residuals keeps."""
 CLOCK_S = 30.0
-"""Margin of a stated time."""
+"""Margin on either side of a reported time."""
 NO_TEST = "measure again: nothing in the catalogue looks like this"
 DEPENDS: dict[str, tuple[str, ...]] = {
     "smooth": ("position",), "odd": ("position", "direction"), "wave": ("position",), "surge": ("time",), "step": ("time",),
     "slip": ("time",), "settling": ("time",), "bump": ("position",), "lobes": ("bar azimuth",), "burst": ("time",),
 }  # fmt: skip
 Starts = dict[str, dict[str, tuple[float, ...]]]
-"""Starts by parameter, ``"period_s"``, by key; ``"*"`` for all keys."""
+"""Starts by kind of structure, then by key (for ``"burst"`` by parameter)."""
 
 
 def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
@@ -53,7 +53,7 @@ def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A smooth function times the direction of the axis' last motion, orders 1 to 3."""
+    """A smooth function (Legendre orders 1 to 3) times the direction in which the axis last moved."""
 
     def deviation(p: Path, at: Places) -> F3:
         return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(p, at, key[2], ODD_ORDERS))
@@ -68,7 +68,7 @@ def wave(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def surge(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A wave of ``period_s`` on the clock: of an axis (``"X"``), or of the reading itself of ``"bar"`` or ``"laser"``."""
+    """A wave in time with period ``period_s``: of an axis (``"X"``), or of the reading of an instrument (``"bar"``, ``"laser"``)."""
     period = values["period_s"]
     if key in AXES:
         return read_together(paths, lambda at: _along(key, _turns(at.t_s / period)))
@@ -81,7 +81,7 @@ def step(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def slip(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """The work moves and turns at ``t0_s`` (a clamp gave way): three translations, three rotations about the middle of the strokes."""
+    """The workpiece side moves at ``t0_s`` (a clamp gave way): three translations, three rotations about the middle of the strokes."""
 
     def deviation(at: Places) -> F3:
         turned = -cross_matrix((at.q_mm - paths[0].machine.centre_mm) / ARM_MM)
@@ -101,7 +101,7 @@ def settling(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def bump(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Deviation in any direction near one place: where the campaign's path is at ``at_s``, Gaussian of ``width_mm``."""
+    """Deviation in any direction near one position, that of the campaign's path at ``at_s``; Gaussian with ``width_mm``."""
     centre = place_at(paths, values["at_s"])
 
     def deviation(at: Places) -> F3:
@@ -112,7 +112,7 @@ def bump(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def place_at(paths: tuple[Path, ...], at_s: float) -> F1:
-    """Commanded position at a time of the campaign's clock, between readings by interpolation, between runs that of the nearest one."""
+    """Commanded position (3,), mm, at a time of the campaign, interpolated between readings; between runs, that of the nearest run."""
 
     def apart(p: Path) -> float:
         return max(float(p.at.t_s[0]) - at_s, at_s - float(p.at.t_s[-1]), 0.0)
@@ -122,13 +122,13 @@ def place_at(paths: tuple[Path, ...], at_s: float) -> F1:
 
 
 def lobes(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """``"Z3"``: three lobes of the ball around Z, the same at every place: a wave in the bar's azimuth, as such and fading to the poles."""
+    """``"Z3"``: three lobes of the ball around Z, at every position: a wave in the bar's azimuth, the same at every latitude."""
     polar, number = AXES.index(key[0]), int(key[1:])
     return [UM * _lobed(p.look, polar, number) if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
 
 def lobe_latitude(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Freedom of form of lobes: their height differs with the bar's latitude."""
+    """Freedom of form of lobes: their height changes linearly with the sine of the bar's latitude."""
     polar, number = AXES.index(key[0]), int(key[1:])
     return [UM * _lobed(p.look, polar, number) * p.look[:, polar, None] if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
@@ -171,20 +171,20 @@ SIGNALS: dict[str, Signal] = {
 
 
 def is_unnamed(name: str) -> bool:
-    """Whether a name is that of a structure outside the catalogue."""
+    """Whether an effect's name is that of a structure outside the catalogue."""
     return name.startswith(PREFIX)
 
 
 def generic_rivals(
     case: Case, residuals: Mapping[str, F1] | None = None, sigma_mm: Mapping[str, float] | None = None
 ) -> tuple[Effect, ...]:
-    """Unnamed structures as effects, with starts for this campaign.
+    """Return the unnamed structures as effects, with starts for this campaign.
 
     Parameters
     ----------
     residuals : dict, optional
-        Whitened residuals of runs by label, shape (n,) each, zero at invalid readings. With them a scan finds the starts (call again when
-        the model has grown); without them the starts are a coarse grid.
+        Whitened residuals of runs by label, shape (n,) each, zero at invalid readings. With them a scan finds the starts; call again when
+        effects were added to the model. Without them the starts are a coarse grid.
     sigma_mm : dict, optional
         Noise of one reading of "bar" and "laser"; only needed with residuals.
 
@@ -205,7 +205,7 @@ def generic_rivals(
 
 
 def location_of(effect: Effect, key: str, values: Values, case: Case) -> Localization:
-    """Localization of an unnamed structure, from its parameters (time, place, period, lobes) and its columns (tests, axes).
+    """Locate an unnamed structure from its parameters (time, position, period, lobes) and its columns (tests, axes).
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def _scanned(scanned: ScanResult) -> Starts:
 
 
 def _coarse(paths: tuple[Path, ...]) -> Starts:
-    """Starts without any residual: borders and inside of runs, periods and pitches by resolution, places along the path."""
+    """Starts on a coarse grid without residuals: times within runs, periods, pitches, and positions along the path."""
     t = np.concatenate([np.linspace(p.at.t_s[0], p.at.t_s[-1], 6) for p in paths])
     instants = tuple(float(v) for v in t + 0.5)
     places = tuple(float(v) for p in _apart(paths) for v in np.linspace(p.at.t_s[0], p.at.t_s[-1], 24))
@@ -264,7 +264,7 @@ def _coarse(paths: tuple[Path, ...]) -> Starts:
 
 
 def _apart(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-    """One run of every different path; the way back and other feeds pass the same places."""
+    """One run of every different path; runs back or at another feed pass the same positions."""
     distinct: dict[tuple[float, ...], Path] = {}
     for p in paths:
         distinct.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)
@@ -276,12 +276,12 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     kinds = {p.kind for p in paths}
     out = [
         _effect("smooth", "smooth function of one axis", COMPONENTS, (), absorbed_by=("rigid21",)),
-        # along the axis itself this has a name: backlash that depends on the position, with its forms
+        # Along the axis itself this has a name: backlash that depends on the position.
         _effect("odd", "function of one axis that turns its sign with the direction", CROSS, ()),
         _effect("lobes", "ball out of round", tuple(f"{a}{n}" for a in AXES for n in LOBES), (), forms=(Form("latitude", lobe_latitude),)),
     ]
     clock, tau = (0.0, end), Parameter("tau_s", "s", 20.0, 900.0, 120.0, SOURCE, (120.0,))
-    # one effect per key where the scan gives every key its own starts: an effect has one set of starts for all its keys
+    # An effect has one set of starts for all its keys, so kinds with starts of their own for each key become one effect per key.
     for key in AXES:
         out.append(_effect("step", "step of one axis", (key,), (_par("t0_s", clock, starts["step"][key]),)))
         out.append(_effect("settling", "one axis wanders off", (key,), (_par("t0_s", clock, starts["settling"][key]), tau)))
@@ -307,7 +307,7 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
 
 
 def _resolved_s(paths: Sequence[Path]) -> float:
-    """Shortest period that the readings of the quickest run resolve: two intervals."""
+    """Shortest period that the fastest sampled run resolves: two intervals, s."""
     steps = [float(np.median(np.diff(p.at.t_s))) for p in paths if p.n > 1]
     return 2.0 * min(steps, default=np.inf)
 

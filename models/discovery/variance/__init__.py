@@ -1,1 +1,1 @@
-"""Variance effects: where, when and at which frequency readings scatter more than noise."""
+"""Variance effects: positions, times and frequencies at which readings scatter more than noise."""

@@ -21,9 +21,6 @@ from abbe.models.discovery.variance.spectrum import fast, gated_roughness, line_
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
-# Outliers caused by the machine's position, not by a lost beam: the readings nearby deviate as well.
-
-
 NEAR_MM, LOUD = 30.0, 3.0
 """Readings within `NEAR_MM` of each other belong to one place; each counts with at most `LOUD` standard deviations."""
 RATES = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.065])
@@ -32,27 +29,27 @@ SIZES = np.geomspace(1.5, 60.0, 24)
 SPREAD = 0.4
 """Relative standard deviation of the outliers' size."""
 SCALES = np.linspace(0.75, 1.1, 15)
-"""Tried ratios of the good readings' noise to the rms of all; with a fixed ratio, a wrong noise would look like outliers."""
+"""Tried ratios of the good readings' noise to its robust estimate; with a fixed ratio, a wrong noise would look like outliers."""
 UM = 1e3
 NAME_PRICE = 7.0
-"""Paid on top of the number of things tried, as natural logarithm: noise alone gains this with a probability of about exp(-7)."""
+"""Price of a name in log likelihood, beside the log of the number of trials: noise alone gains this with a probability of about exp(-7)."""
 OFF, PLACE_Z = 3.5, 4.0
-"""Standard deviations from which a reading is an outlier, and from which those near it prove that the place is the cause, not the beam (of
-13 campaigns with lost beams none above 1.2, of three with a bump none below 4.2)."""
+"""Standard deviations from which a reading is an outlier; from which the deviation of the readings near outliers proves that the position,
+not a lost beam, is the cause (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
 LEAST_LASER = 60
 """Minimum number of laser readings for estimating a rate of 1 in 100."""
 DRIVES = ("stick_slip", "vibration")
 OVERSHADOWS = 3.0
-"""Roughness of one axis shows a little along the others, a spectral line a little at low speed: a finding weaker by this factor counts as
-explained. As a consequence, a second vibration of less than about 0.6 of the first's size is not named."""
+"""Vibration or stick-slip of one axis shows a little along the others, so a finding whose evidence is weaker by this factor counts as
+explained. A second vibration of less than about 0.6 of the first's size is therefore not named."""
 SAW_P = 0.05
 CREEP_MM_S = 4.5
 
 
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
-    """Common deviation of the readings near the outliers, standard deviations, and the middle of the place, (3,) mm.
+    """Common deviation of the readings near the outliers, in standard deviations, and the centre of this position, (3,), mm.
 
-    A lost beam affects no readings nearby, nor at the same place at another time, so the first value is then within 3.
+    A lost beam affects neither neighbouring readings nor the same position at another time, so the first value is then within 3.
 
     Parameters
     ----------
@@ -61,7 +58,7 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
     rest : array, shape (n,)
         Whitened residuals; exact zeros are not readings.
     off : array of bool, shape (n,)
-        Which of them are outliers.
+        Which readings are outliers.
     """
     total = count = most = 0.0
     clipped, middle = np.clip(rest, -LOUD, LOUD), np.zeros(3)
@@ -76,12 +73,9 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
     return (total / np.sqrt(count) if count else 0.0), np.asarray(middle)
 
 
-# A few outliers: a mixture of noise and a wider distribution against noise alone.
-
-
 @dataclass(frozen=True)
 class Contaminated:
-    """Gain in log likelihood, share of outliers, their typical size (sigmas) and its uncertainty."""
+    """Mixture of noise and outliers: gain in log likelihood, share of outliers, their typical size (sigmas) and its uncertainty."""
 
     gain: float
     rate: float
@@ -90,7 +84,7 @@ class Contaminated:
 
 
 def contaminated(rest: F1) -> Contaminated:
-    """Best mixture of noise and outliers for whitened residuals, shape (n,); the noise's size is fitted with and without."""
+    """Fit a mixture of noise and outliers to whitened residuals, shape (n,), and compare it with fitted noise alone."""
     n = rest.size
     core = np.sort(np.abs(rest))[: max(int(0.9 * n), 1)]
     robust = float(np.median(core) / 0.6745 * 1.06)
@@ -124,7 +118,7 @@ class VarianceFinding:
     ----------
     name, key : of the catalogue, or ``unnamed_burst`` (a moment of one run) or ``unnamed_place`` (readings of a laser near one place).
     strength, u_strength : amplitude or typical size, um, with its standard uncertainty.
-    parameters : ``frequency_hz``; ``v_c`` (mm/s); ``rate``, share of readings that are off; or ``t0_s`` and ``width_s``.
+    parameters : ``frequency_hz``; ``v_c`` (mm/s); ``rate``, share of outliers; or ``t0_s`` and ``width_s``.
     evidence : log likelihood ratio less price; named when positive.
     """
 
@@ -150,14 +144,14 @@ def extra_variance(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """Variance effects with positive evidence, highest first; at most one of vibration and stick-slip per axis.
+    """Find variance effects with positive evidence, highest first; at most one of vibration and stick-slip per axis.
 
     Parameters
     ----------
     paths : runs.
     whitened : one array (n,) per run
-        Whitened residuals after removal of everything known of the mean; unit variance for noise alone. They must include outliers; exact
-        zeros count as no reading.
+        Whitened residuals of the mean model with all found effects; unit variance for noise alone. They must include outliers; exact zeros
+        count as no reading.
     sigma_mm : noise of one reading of each run.
     leverage : one array (n,) per run, optional
         Share of each reading's noise that the fit absorbed.
@@ -230,14 +224,14 @@ def _vibration(
     )
     size, u, v = line.amplitude_mm * UM, line.u_mm * UM, _creep(axis, paths)
     if v is not None and line.p_harmonics < SAW_P:
-        # at a single creeping speed a saw-tooth in position is one in time, and its fading with speed is unknown
+        # at a single creeping speed a saw-tooth in position is also one in time, and its decrease with speed is unknown
         size *= 0.5 * np.pi * np.e
         return [VarianceFinding("stick_slip", AXES[axis], size, size, {"v_c": v}, evidence, location)]
     return [VarianceFinding("vibration", AXES[axis], size, u, {"frequency_hz": line.frequency_hz}, evidence, location)]
 
 
 def _creep(axis: int, paths: tuple[Path, ...]) -> float | None:
-    """The one speed at which an axis creeps in all bar runs that move it, mm/s; None where it has others."""
+    """The single creeping speed of an axis in all bar runs that move it, mm/s; None if it also has other speeds."""
     speeds = [np.abs(p.at.v_mm_s[:, axis]) for p in paths if np.ptp(p.at.q_mm[:, axis]) > 0]
     if not speeds:
         return None

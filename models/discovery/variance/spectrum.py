@@ -1,7 +1,7 @@
-"""Structure in the variance of the residuals: a spectral line, and intermittent roughness.
+"""Structure in the variance of the residuals: a spectral line (vibration), and intermittent roughness.
 
-A line of all runs has one physical frequency, is aliased differently by every sampling rate, and has a phase per run. Residuals are rough
-while an axis creeps (stick-slip), or for some seconds of one run (interference).
+A line has one physical frequency in all runs; every sampling rate aliases it differently, and its phase differs from run to run. Residuals
+are rough while an axis creeps (stick-slip), or for some seconds of one run (interference).
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from abbe.models.probability import chi2_above
 HERTZ = (2.0, 75.0)
 PADDING = 4
 LOW_CYCLES, PER_TURN = 6.0, 2.0
-"""Aliased frequencies with fewer cycles per run, and per turn of the bar, belong to the residues of the mean."""
+"""Aliased frequencies below this many cycles per run plus this many per turn of the bar count as residues of the mean model."""
 LOBES_PER_TURN = 12.0
-"""Up to this many cycles per turn of the bar a line may be form of the balls or the machine: such runs do not prove a line."""
+"""Up to this many cycles per turn of the bar, a line may come from the form of balls or machine; such a run does not prove a line."""
 REGULAR = 0.02
-"""Sampling counts as regular when its steps differ by less than this share."""
+"""Sampling counts as regular when its steps differ by less than this fraction."""
 TOP = 24
 GATES_MM_S = (0.7, 0.9, 1.15, 1.45, 1.8, 2.25, 2.8, 3.5, 4.4)
 REFINED = 2
-"""Gates with the best scores that are fitted."""
+"""Number of gates with the best scores that are fitted."""
 LEAST_READINGS = 12.0
-"""A gate that fewer readings pass proves nothing."""
+"""A gate with fewer effective readings is not tried."""
 ALIKE = 1.94
 """Divisor for squared second differences, which are correlated from reading to reading for white noise."""
 FEW = 3
-"""The gain of this many readings does not count: a reversal that the mean misses by a reading is not roughness."""
+"""The gain of this many best readings does not count: a reversal that the mean model misses by one reading is not roughness."""
 WINDOWS_S = (1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """Gain in log likelihood (of the runs that prove it), how many frequencies were tried, frequency, amplitude with its uncertainty.
+    """A spectral line: gain in log likelihood (of the runs that prove it), number of frequencies tried, frequency, amplitude, uncertainty.
 
-    ``p_harmonics``: p-value of the power at twice to four times the frequency, which a saw-tooth has and a vibration has not.
+    ``p_harmonics``: p-value of the power at two to four times the frequency, which a saw-tooth has and a vibration does not have.
     """
 
     gain: float
@@ -54,9 +54,10 @@ class SpectralLine:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Of one run: |sum r u_a e^-iwt| / sigma and (sum u_a^2) / sigma^2 by folded frequency 0 .. rate; zero where it does not count.
+    """Spectrum of one run by aliased frequency 0 to ``rate_hz``, with residual r and direction u_a along the axis.
 
-    ``proves``: where a line cannot be a form that the bar meets at every turn.
+    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both zero where a frequency does not count. ``proves``:
+    frequencies at which a line cannot come from a form that the bar meets at every turn.
     """
 
     rate_hz: float
@@ -72,12 +73,12 @@ class _Spectrum:
 def line_of_axis(
     axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...], colour: Colour | None
 ) -> SpectralLine | None:
-    """The most likely line of an axis' vibration; None where no run could show one.
+    """Find the most likely spectral line of an axis' vibration; None if no run could show one.
 
     Parameters
     ----------
     rest : whitened residuals by run, shape (n,) each, high-passed (`fast`).
-    colour : of the noise that they were whitened with, which weakens or raises a line.
+    colour : noise with which they were whitened; whitening changes the height of a line.
     """
     spectra = [s for p, r, m in zip(paths, rest, sigma_mm, strict=True) if (s := _spectrum(axis, p, r, m, colour)) is not None]
     if not spectra:
@@ -100,7 +101,7 @@ def line_of_axis(
 
 
 def _harmonics(spectra: list[_Spectrum], f: float) -> float:
-    """Chance that noise alone has as much power at the harmonics of a line."""
+    """Probability that noise alone has as much power at the harmonics of a line."""
     total, freedom = 0.0, 0
     for s in spectra:
         for i in s.at(f * np.array([2.0, 3.0, 4.0])):
@@ -126,7 +127,7 @@ def _spectrum(axis: int, path: Path, rest: F1, sigma_mm: float, colour: Colour |
 
 
 def fast(path: Path, rest: F1) -> F1:
-    """High-passed residuals of a run: leakage of slow changes would raise every other frequency."""
+    """High-passed residuals of a run, because leakage of slow changes would raise all other frequencies."""
     n = rest.size
     x = np.arange(n) / max(n, 1)
     turns = 2.0 * np.pi * np.outer(x, np.arange(1, min(int(_low_cycles(path)), n // 6) + 1))
@@ -135,17 +136,17 @@ def fast(path: Path, rest: F1) -> F1:
 
 
 def _low_cycles(path: Path) -> float:
-    """Cycles per run up to which a frequency belongs to the mean: a few per turn of the bar."""
+    """Cycles per run below which a frequency counts as a residue of the mean model."""
     return LOW_CYCLES + PER_TURN * _turns_of_bar(path)
 
 
 def _turns_of_bar(path: Path) -> float:
-    """How far the bar turns along a run, turns."""
+    """Angle through which the bar turns along a run, in turns."""
     return float(np.linalg.norm(np.diff(path.look, axis=0), axis=1).sum()) / (2.0 * np.pi)
 
 
 def _noise_power(f: F1, colour: Colour) -> F1:
-    """Power of the noise per frequency (cycles per reading) over that of white noise of its size."""
+    """Ratio of the noise power at a frequency (cycles per reading) to that of white noise of the same variance."""
     s, m = colour.share, colour.memory
     return np.asarray(1.0 - s + s * (1.0 - m * m) / (1.0 - 2.0 * m * np.cos(2.0 * np.pi * f) + m * m))
 
@@ -169,7 +170,7 @@ def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Roughness:
-    """Gain in log likelihood, gates tried, gate, size of the saw-tooth (half its height) with its uncertainty, weight by run."""
+    """Stick-slip of one axis: gain in log likelihood, number of gates tried, gate ``v_c`` (mm/s), half height of the saw-tooth, weights."""
 
     gain: float
     tried: float
@@ -180,11 +181,11 @@ class Roughness:
 
 
 def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> dict[int, Roughness]:
-    """Most likely stick-slip speed of each axis, below which the readings are rougher; without axes that creep in no run.
+    """Find the most likely speed of each axis below which the readings are rougher; axes that never creep are left out.
 
-    A saw-tooth of half height h fades with speed as exp(-(v/v_c)^2) (Stribeck's curve) and has the variance h^2/3. Scatter along each axis
-    at any speed is fitted too (a vibration is not stick-slip). Deviations that are constant from reading to reading do not count: they may
-    be residues of the mean at a reversal.
+    A saw-tooth of half height h decreases with speed as exp(-(v/v_c)^2) (Stribeck's curve) and has the variance h^2/3. Scatter along each
+    axis at any speed is fitted too, because a vibration is not stick-slip. Deviations that are constant from reading to reading do not
+    count: they may be residues of the mean model at a reversal.
     """
     look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
     values = np.concatenate(rest)
@@ -212,7 +213,7 @@ def _readings(gate: F1) -> float:
 
 
 def _rough(rest: F1) -> F1:
-    """Square of the second differences, scaled to 1 for white noise; ends take their neighbours'."""
+    """Squared second differences, scaled to 1 for white noise; the two ends repeat their neighbours' values."""
     if rest.size < 3:
         return np.ones(rest.size)
     second = (rest[1:-1] - 0.5 * (rest[:-2] + rest[2:])) / np.sqrt(1.5)
@@ -221,7 +222,7 @@ def _rough(rest: F1) -> F1:
 
 @dataclass(frozen=True)
 class _RoughnessFit:
-    """Squared residuals with scatter along the axes fitted: what more scatter within a gate gains."""
+    """Squared residuals with the scatter along the axes fitted, to test for more scatter within a gate."""
 
     square: F1
     plain: F2
@@ -267,7 +268,7 @@ def _likelihood(square: F1, columns: F2, start: F1) -> F1:
 
 
 def loud_windows(paths: tuple[Path, ...], rest: tuple[F1, ...]) -> tuple[float, float, int, float, float, float] | None:
-    """The loudest stretch of a run: gain, stretches tried, run, middle, half length, extra variance in sigmas squared."""
+    """The window with the most scatter: gain, windows tried, index of the run, middle (s), half length (s), extra variance over noise."""
     best: tuple[float, float, int, float, float, float] | None = None
     tried = 0.0
     for k, (p, r) in enumerate(zip(paths, rest, strict=True)):

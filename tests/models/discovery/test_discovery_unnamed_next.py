@@ -30,7 +30,7 @@ def structure(label: str, **where: object) -> Structure:
     ("label", "adds", "words"),
     [
         ("unnamed_step:X", "longer_session", "3 times in one undisturbed set-up"),
-        ("unnamed_slip", "longer_session", "what recurs belongs to the machine"),
+        ("unnamed_slip", "longer_session", "if the deviation recurs, it belongs to the machine"),
         ("unnamed_settling:Z", "longer_session", "3 times in one undisturbed set-up"),
         ("unnamed_burst", "longer_session", "3 times in one undisturbed set-up"),
         ("unnamed_bump", "second_radius", "through the same place"),
