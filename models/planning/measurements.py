@@ -315,7 +315,7 @@ def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple
         found += [LineTest(a, (u, v)) for a in range(3) for u, v in product(EDGES, repeat=2)]
         found += [DiagonalTest(d, order) for d in DIAGONALS for order in (*ORDERS, "")]
     if not found:
-        raise ValueError("planner: the strokes are too short for a helix with any of the bars and for every laser path")
+        raise ValueError("planner: no helix with any of the bars and no laser path fits into the strokes")
     return tuple(found)
 
 

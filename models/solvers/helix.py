@@ -58,7 +58,7 @@ class HelixSolution:
             return ()
         return (
             f"the fit is badly conditioned: condition number {self.condition:.0f}, the limit is {CONDITION_LIMIT:.0f}. Set-up, scales and "
-            "squareness can hardly be distinguished; measure a helix of 3 or more turns over the whole hemisphere",
+            "squareness can hardly be distinguished; measure a helix of at least 3 turns over the whole hemisphere",
         )
 
 

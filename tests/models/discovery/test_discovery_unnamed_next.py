@@ -83,7 +83,7 @@ def test_a_moment_names_its_run_and_a_period_asks_for_what_is_not_there_yet() ->
 def test_a_poor_campaign_says_what_it_could_not_have_seen() -> None:
     found = {u.adds: u for u in blind_spots(case_of_paths(one_way(), *INCLUDES))}
     assert set(found) == {"second_feed", "opposite_direction", "second_radius", "laser_diagonals", "longer_session"}
-    assert "grows with the feed" in found["second_feed"].what
+    assert "grow with the feed" in found["second_feed"].what
     assert "1 h later" in found["longer_session"].because
     lasers = case_of_paths(tuple(p for p in campaign() if p.kind == "laser"), *INCLUDES)
     assert "ballbar" in {u.adds for u in blind_spots(lasers)}

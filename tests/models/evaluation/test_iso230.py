@@ -87,7 +87,7 @@ def test_any_number_of_positions_and_cycles_against_plain_loops(m, n, lost):
 def test_what_cannot_be_a_test_is_refused():
     with pytest.raises(ValueError, match="two or more"):
         approaches([[1.0]], [[1.0]])
-    with pytest.raises(ValueError, match="never read moving in -"):
+    with pytest.raises(ValueError, match="approached in - direction"):
         approaches([[1.0], [1.0]], [[1.0], [np.nan]])
     with pytest.raises(ValueError, match="growing"):
         approaches([[1.0], [1.0]], [[1.0], [1.0]], [5.0, 5.0])
@@ -207,5 +207,5 @@ def test_the_worst_diagonal_counts_and_a_missing_one_is_named():
     assert found.E_d[1].value_mm == pytest.approx(0.026)
     assert found.M_d[1].value_mm == pytest.approx(0.024)
     assert found.missing == ("ppn",)
-    with pytest.raises(ValueError, match="'ppp' is none of"):
+    with pytest.raises(ValueError, match="'ppp' is not one of"):
         diagonals({"ppp": line(0.0, 0.0)}, FACE)
