@@ -20,7 +20,7 @@ from abbe.service.storage.store import Store
 from abbe.simulators.cnc import bank
 from tests.faults.sequencer_world import bench
 
-SPEED = 50.0
+SPEED = 200.0
 PLACES = 24 if os.environ.get("ABBE_TEST_LONG") else 8
 """Eight are enough for the same limits."""
 

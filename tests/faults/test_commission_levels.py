@@ -27,8 +27,8 @@ from tests.faults.sequencer_world import bench
 from tests.patience import within
 
 STAGED, STAGED_RESULT = 3, 8
-SPEED = 6.0
-"""A move of 3 mm takes half a second of wall time: many requests."""
+SPEED = 12.0
+"""A move of 3 mm takes a quarter of a second of wall time: many requests."""
 
 
 @pytest.fixture
@@ -228,8 +228,10 @@ async def test_never_proved_is_for_attended_pushes_only_and_says_so(place):
         (TakesNothing, {"swap_compares"}, 2, "a correct activation is refused as well"),
     ],
 )
-async def test_a_controller_that_does_not_keep_a_promise_is_found_and_not_trusted_by_night(place, kind, lost, level, words):
+async def test_a_controller_that_does_not_keep_a_promise_is_found_and_not_trusted_by_night(place, monkeypatch, kind, lost, level, words):
     b, store = place
+    if kind is Everlasting:
+        monkeypatch.setattr("abbe.service.compensation.commission_levels.RUNS_OUT_S", 1.0)  # of a lease of 0.3 s
     before, comp = in_force(b), b.sim.world.controller.comp
     lies(b, kind)
     found = await commission_levels(b.session.controller, store, b.site)

@@ -26,8 +26,8 @@ from abbe.service.sequences.steps import CampaignPlan, RecordPath
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import MACHINE, AtStep, Bench, bench, number
 
-SPEED = 40.0
-FEED = 3000.0
+SPEED = 100.0
+FEED = 4500.0
 LONG_S = 2.0 * np.pi * 60.0 * 3.0 / (FEED / 60.0)
 
 
@@ -40,7 +40,7 @@ async def place(tmp_path: Path):
 
 
 def helix() -> CampaignPlan:
-    """About 23 s of path."""
+    """About 15 s of path."""
     one = Helix("test", "S", "identify", (300.0, 250.0, 100.0), 60.0, turns=3.0, chord_mm=3.0, feed_mm_min=FEED, rate_hz=200)
     return CampaignPlan("c", (one.plan(MACHINE),))
 
@@ -58,14 +58,18 @@ class After(AtStep):
         self._do = self._begin
 
     def _begin(self) -> None:
-        self._b.sim.pace(2.0 if self._after_s < 1.0 else 10.0)  # what a busy computer needs to notice must not be much of the path
         self.waiting = asyncio.get_running_loop().create_task(self._when())
 
     async def _when(self) -> None:
-        controller = self._b.sim.world.controller
-        while not controller.path_running or self._b.sim.world.time_s - controller.path_start_s < self._after_s:  # noqa: ASYNC110 - simulated time
-            await asyncio.sleep(0.001)
+        await self._on_path_for(self._after_s - 3.0)
+        self._b.sim.pace(2.0 if self._after_s < 1.0 else 10.0)  # what a busy computer needs to notice must not be much of the path
+        await self._on_path_for(self._after_s)
         self._do_it()
+
+    async def _on_path_for(self, seconds: float) -> None:
+        controller = self._b.sim.world.controller
+        while seconds > 0.0 and not (controller.path_running and self._b.sim.world.time_s - controller.path_start_s >= seconds):  # noqa: ASYNC110 - simulated time
+            await asyncio.sleep(0.001)
 
 
 def estop(b: Bench) -> Callable[[], None]:
@@ -112,8 +116,8 @@ def about_centre(run: Run) -> tuple[np.ndarray, np.ndarray]:
 async def test_broken_twice_it_reads_what_it_reads_in_one_go(place):
     b, store = place
     plan = helix()
-    await broken(b, store, plan, 9.0)
-    said = await resumed_item(b, store, plan, again_s=6.0)
+    await broken(b, store, plan, 6.0)
+    said = await resumed_item(b, store, plan, again_s=4.0)
     assert "test resumes at" in said
     await resumed_item(b, store, plan)
     assert [r.status for r in runs(store)] == ["failed", "failed", "complete"]
@@ -143,8 +147,9 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
     plan = helix()
     with pytest.raises(Interlock):
         await measure(
-            b.session, store, b.site, plan, options=MeasureOptions(After(plan, b, 9.0, lambda: b.sim.world.ballbar.push(out=True)))
+            b.session, store, b.site, plan, options=MeasureOptions(After(plan, b, 6.0, lambda: b.sim.world.ballbar.push(out=True)))
         )
+    b.sim.pace(SPEED)
     b.sim.world.ballbar.push(out=False)
     assert "test resumes at" in await resumed_item(b, store, plan)
     assert load_run(store, runs(store)[-1].id).columns.valid.all()
@@ -153,17 +158,17 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
 async def test_going_on_costs_a_stretch_and_not_the_path(place):
     b, store = place
     plan = helix()
-    await broken(b, store, plan, 15.0)
+    await broken(b, store, plan, 10.0)
     await resumed_item(b, store, plan)
     last = runs(store)[-1]
     driven_s = (last.end_doc["path_end_us"] - last.end_doc["path_start_us"]) * 1e-6
-    assert driven_s < LONG_S - 15.0 + 3.0
+    assert driven_s < LONG_S - 10.0 + 3.0
 
 
 async def test_nobody_vouches_and_it_begins_again(place):
     b, store = place
     plan = helix()
-    await broken(b, store, plan, 9.0)
+    await broken(b, store, plan, 6.0)
     said = await resumed_item(b, store, plan, decline)
     assert said.endswith("test begins again")
     assert "pieces" not in runs(store)[-1].start_doc["path"]
@@ -173,7 +178,7 @@ async def test_nobody_vouches_and_it_begins_again(place):
 async def test_a_knocked_cup_is_seen_on_the_stretch_and_nothing_is_joined(place):
     b, store = place
     plan = helix()
-    await broken(b, store, plan, 9.0)
+    await broken(b, store, plan, 6.0)
     bar = b.sim.world.ballbar
     outwards = b.sim.world.controller.position_mm - np.array([300.0, 250.0, 100.0])
     bar._cup_mm = bar._cup_mm + 0.004 * outwards / np.linalg.norm(outwards)
@@ -187,11 +192,12 @@ async def test_a_knocked_cup_is_seen_on_the_stretch_and_nothing_is_joined(place)
 async def test_a_box_restarted_in_a_pause_is_joined_to_nothing(place):
     b, store = place
     plan = helix()
-    control = After(plan, b, 9.0, lambda: control.pause())
+    control = After(plan, b, 6.0, lambda: control.pause())
     task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control, yes)))
     async for now in control.watch():
         if now.state == State.PAUSED:
             b.sim.box.restart(0xBA12)
+            b.sim.pace(SPEED)
             control.resume()
             break
     with pytest.raises(Rebooted):
@@ -204,10 +210,11 @@ async def test_a_box_restarted_in_a_pause_is_joined_to_nothing(place):
 async def test_a_pause_on_the_path_costs_a_stretch(place):
     b, store = place
     plan = helix()
-    control = After(plan, b, 9.0, lambda: control.pause())
+    control = After(plan, b, 6.0, lambda: control.pause())
     task = asyncio.create_task(measure(b.session, store, b.site, plan, options=MeasureOptions(control)))
     async for now in control.watch():
         if now.state == State.PAUSED:
+            b.sim.pace(SPEED)
             control.resume()
     await task
     assert [r.status for r in runs(store)] == ["aborted", "complete"]
@@ -218,7 +225,7 @@ async def test_a_pause_on_the_path_costs_a_stretch(place):
 async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_path):
     b, store = place
     plan = helix()
-    await broken(b, store, plan, 9.0)
+    await broken(b, store, plan, 6.0)
     await resumed_item(b, store, plan)
     folder = export_folder(store, plan.name, tmp_path / "out")
     with Store.open(f"sqlite:///{tmp_path / 'other.sqlite3'}") as other:
@@ -235,7 +242,7 @@ async def test_what_was_read_in_pieces_is_exported_once_and_solved(place, tmp_pa
 async def test_a_box_that_was_restarted_begins_again(place):
     b, store = place
     plan = helix()
-    await broken(b, store, plan, 9.0)
+    await broken(b, store, plan, 6.0)
     b.sim.box.restart(0xBA11)
     await b.session.need_ballbar().identify()  # as the next process does
     said = await resumed_item(b, store, plan)
@@ -260,6 +267,6 @@ async def test_a_door_that_somebody_vouches_for_suspends_and_the_path_goes_on(pl
         door(is_open=True)
         asyncio.get_running_loop().call_later(0.2, lambda: door(is_open=False))
 
-    await measure(b.session, store, site, plan, options=MeasureOptions(After(plan, b, 9.0, opened), yes))
+    await measure(b.session, store, site, plan, options=MeasureOptions(After(plan, b, 6.0, opened), yes))
     assert [r.status for r in runs(store)] == ["failed", "complete"]
     assert len(runs(store)[-1].start_doc["path"]["pieces"]) == 1

@@ -11,6 +11,7 @@ from abbe.drivers.links import modbus_link
 from abbe.drivers.links.modbus_link import ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import parse_url
 from tests.drivers.contract.link_peer import TIMEOUT_S, silent, times
+from tests.drivers.contract.link_peer import patient as patient  # fixture
 
 
 async def test_reads_and_writes(peer, link):

@@ -10,8 +10,9 @@ from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.drivers.links.modbus_link import ModbusLink
 from abbe.drivers.links.urls import parse_url
 from tests.drivers.contract.link_peer import TIMEOUT_S, silent
+from tests.drivers.contract.link_peer import patient as patient  # fixture
 
-AT_ONCE_S = 0.4
+AT_ONCE_S = 0.1
 
 
 async def test_hang_up_during_a_write_is_link_down_at_once(peer, link):
