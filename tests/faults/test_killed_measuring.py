@@ -23,7 +23,7 @@ from tests.patience import within
 from tests.scenarios.conftest import Sims, simulated
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
-KILLS = 100 if LONG else 12
+KILLS = 100 if LONG else 6
 SPEED = "60"
 LONGEST_S = 0.9
 """Kills fall into the first so many seconds of a process: long enough for a test or two, short enough for many kills in a campaign."""

@@ -140,7 +140,7 @@ async def test_m4_closed_and_reset():
 async def test_m5_slow_is_not_wrong():
     async def play(case: str) -> Observed:
         factor, how, name = case.split(" ", 2) if not case.split(" ", 1)[1].startswith("one of") else _spiked(case)
-        kind, timeout_s = KINDS[name], 0.4
+        kind, timeout_s = KINDS[name], 0.2
         seconds = float(factor) * timeout_s
         fault = Fault("latency", seconds=seconds, times=0) if how == "always" else Fault("latency", seconds=seconds, at=37)
         rounds = 1 if how == "always" else (3 if name == "motion command" else 100)

@@ -21,7 +21,7 @@ EFFECT_KEYS = {
     "snr_local", "snr_total", "share_touched", "where", "aliases", "explained_by_catalogue",
 }  # fmt: skip
 RUN_KEYS = {"test", "setup_id", "sigma_um", "deviation_mm", "clean_mm", "without_effect_mm", "xyz_mm", "info", "setup_seen"}
-SMALL = (31, 5)
+SMALL = (31, 3)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def documents(case: Case) -> str:
 
 
 def test_a_seed_decides_everything() -> None:
-    one, again, other = (make_case("c", seed, "double") for seed in (12, 12, 13))
+    one, again, other = (make_case("c", seed, "double") for seed in (5, 5, 7))
     assert documents(one) == documents(again)
     assert documents(one) != documents(other)
 

@@ -1,4 +1,4 @@
-"""Two years, twenty schedules, three zones: each slot that an independent oracle finds is in the ledger once, and none ends in silence.
+"""Two years, twenty schedules, three zones (with ABBE_TEST_LONG=1; every day two zones with half of the schedules each): each slot that an independent oracle finds is in the ledger once, and none ends in silence.
 
 In these years the clocks of the zones change eight times, somebody sets the computer's clock back by two hours, and the power is off for a
 minute, for eight hours (the night of an autumn change) and for three days (over a spring change), each time in the middle of whatever runs.
@@ -60,6 +60,8 @@ MAINTENANCE = (("0 14 * * 3", 3.0), ("0 2 1 * *", 1.5))
 
 def timetable(zone: str) -> list[Schedule]:
     by_cron = [Schedule(f"s{k:02}", cron, zone, "r", grace, catch_up=how) for k, (cron, how, grace) in enumerate(CRONS)]  # type: ignore[arg-type]
+    if not LONG:
+        by_cron = by_cron[ZONES.index(zone) :: len(ZONES)]
     hourly = [Schedule("i12", "", zone, "r", 300, every_h=12.0), Schedule("i7", "", zone, "r", 900, every_h=7.5, catch_up="once")]
     if LONG:
         by_cron[13] = replace(by_cron[13], cron="*/15 * * * *")
@@ -167,7 +169,7 @@ async def _set_back(world: World, at: datetime, length: timedelta, until: dateti
 def judge(world: World, expected: dict[str, list[datetime]]) -> None:
     slots = {(name, slot) for name, found in expected.items() for slot in found}
     states, reasons = world.ledger.states, world.ledger.reasons
-    assert len(slots) > 12_000
+    assert len(slots) > (12_000 if LONG else 6_000)
     assert set(states) == slots, "exactly the slots of the oracle, each once"
     runs = Counter((name, slot) for name, slot, _ in world.started)
     assert max(runs.values()) == 1, "nothing ran twice"
