@@ -1,4 +1,6 @@
-"""Two years, twenty schedules, three zones (with ABBE_TEST_LONG=1; every day two zones with half of the schedules each): each slot that an independent oracle finds is in the ledger once, and none ends in silence.
+"""Two years, twenty schedules, three zones: each slot that an independent oracle finds is in the ledger once, and none ends in silence.
+
+All of them with ``ABBE_TEST_LONG=1``; every day two zones share the schedules.
 
 In these years the clocks of the zones change eight times, somebody sets the computer's clock back by two hours, and the power is off for a
 minute, for eight hours (the night of an autumn change) and for three days (over a spring change), each time in the middle of whatever runs.
