@@ -1,1 +1,1 @@
-"""The papers that the product rests on: their equations and experiments as printed."""
+"""The papers on which Abbe rests: their equations and experiments, with errata; printed forms are named ``..._printed``."""

@@ -1,1 +1,1 @@
-"""Computed numbers beside numbers from outside: the print of four papers (`papers`) and independent vector files (`vectors`)."""
+"""Comparison of computed numbers with those printed in four papers (`papers`) and those in independent vector files (`vectors`)."""

@@ -1,4 +1,7 @@
-"""A number from outside compared with the computed one. Only this module decides the status of a number."""
+"""Comparison of a number from outside with the computed one, and its status.
+
+``math.md`` is the mathematical specification that comes with the vector files, not part of this repository; it adds numbers to the papers.
+"""
 
 from __future__ import annotations
 
@@ -35,28 +38,30 @@ class Erratum:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One number from outside with the computed one.
+    """Comparison of one number from outside with the computed one.
 
     Attributes
     ----------
     location : str
         Table, equation or section of the number.
     expected : Printed or Given
-        The printed number; in an own check the number that went in and must come back. In ``unit``.
+        The printed number; in an own check, the input that must come back. In ``unit``.
     computed : Computed or None
         In ``unit``; None for an input, and if the paper lacks the inputs.
     how : str
         Inputs and function of the computation.
     why : str
-        Why the number differs or cannot be computed, or what the comparison shows. Never empty for a number that is not computed.
+        Why the number differs or cannot be computed, or what the comparison shows; required if the number is not computed.
+    erratum : Erratum or None
+        Misprint that may explain a difference.
     series : str
-        Column of the number; a column with one status is shown in one line.
+        Column of the number; text output shows a column with one status in one line.
     again : bool
-        A further view of a printed number that is compared elsewhere; not counted.
+        Whether another row already counts the printed number.
     source : "paper" | "math.md" | "own check"
-        Source of the expected number. An own check tries a function on a paper's numbers; it proves nothing about the paper.
+        Source of the expected number. An own check tests a function with a paper's numbers and proves nothing about the paper.
     given : bool
-        An input, or zero by construction: not computed, so no evidence.
+        Whether the number is an input, or zero by construction, and so is not computed.
     """
 
     location: str
@@ -73,7 +78,7 @@ class Comparison:
     given: bool = False
 
     def __post_init__(self) -> None:
-        """Check that a number without computation has a reason, and a computed one an origin and is not an input."""
+        """Check that a number which is not computed has a reason, and that a computed one says how and is not an input."""
         name = f"{self.location}: {self.quantity}"
         if self.computed is None and not self.why:
             raise ValueError(f"{name} is not computed and has no reason")
@@ -96,9 +101,9 @@ class Comparison:
     def status(self) -> Status:
         """Status of the number.
 
-        Reproduced: equal to the last printed digit. Consistent: not equal, but within the rounding of the inputs, so print and computation
-        neither confirm nor refute each other to the last digit; also if that assumes padded zeros (noted in `remark`), and for a bound
-        that holds, since a bound confirms no digit. Input: given, not computed. An own check holds or fails.
+        Reproduced: equal to the last printed digit. Consistent: not equal, but within the rounding of the inputs, possibly under the
+        assumption of padded zeros (see `remark`); also a bound that holds, since it confirms no digit. Differs: farther apart. Input:
+        given, not computed. Not reproducible: inputs are not printed. An own check holds or fails.
         """
         if self.fit is None:
             return "input" if self.given else "not reproducible"
@@ -108,7 +113,7 @@ class Comparison:
 
     @property
     def within(self) -> float | None:
-        """Largest difference allowed by this status; None for a bound and without a computation."""
+        """Largest difference that this status allows; None for a bound and without a computation."""
         if self.computed is None or self.expected.bound:
             return None
         if self.fit == "padding":
@@ -117,7 +122,7 @@ class Comparison:
 
     @property
     def remark(self) -> str:
-        """Basis of the status if it is more than a comparison of digits; else empty."""
+        """Basis of the status if it does not follow from the digits alone; else empty."""
         if self.computed is None:
             return ""
         if self.expected.bound:
@@ -131,7 +136,7 @@ class Comparison:
 
     @property
     def explained(self) -> bool | None:
-        """Whether the erratum gives the printed number without an assumption about zeros (see `gap`)."""
+        """Whether the erratum explains the printed number without an assumption about padded zeros (see `gap`); None if not computable."""
         return None if self.again_fit is None else self.again_fit not in ("padding", "no")
 
     @property
@@ -149,7 +154,7 @@ class Comparison:
         }[self.again_fit]
 
     def to_document(self) -> dict[str, Any]:
-        """JSON value for ``--json``."""
+        """Return the JSON value for ``--json``."""
         if self.source == "own check":
             return self._check_document()
         expected, computed = self.expected, self.computed
@@ -196,7 +201,7 @@ class Comparison:
 
 
 def stated(location: str, quantity: str, unit: str, number: Printed, value: float, how: str) -> Comparison:
-    """Row for a number stated in math.md. If it differs, double rounding in math.md is tried as explanation."""
+    """Compare a number stated in math.md; if it differs, test whether double rounding explains it."""
     computed = Computed(value)
     if agrees(computed, number):
         return Comparison(location, quantity, unit, number, computed, how, source="math.md")

@@ -19,15 +19,16 @@ INTRODUCTION = (
     " Reproduced: computed from independent inputs and equal to the last printed digit. Consistent: not equal to that digit, but no farther"
     " apart than the rounding of the printed inputs allows (column “within”), or a bound that holds, or equal only under an assumption that"
     " the row names. Differs: farther apart. Input: given, or zero by construction, so there is nothing to compute. Not reproducible: the"
-    " paper does not print the necessary inputs. Own checks are listed separately and not counted."
+    " paper does not print the necessary inputs. Rows “math.md” compare numbers of the mathematical specification that comes with the"
+    " vector files. They and own checks are not counted."
 )
-CHECKS = "An own check computes numbers that went in and must come back: it tries Abbe's functions and reproduces nothing printed."
+CHECKS = "An own check puts numbers of the paper into Abbe's functions and computes them back: it tests these functions, not the paper."
 _UNIT_AFTER = re.compile(r"(?<=\d) (?=(?:µm|mm|nm|µrad|mrad|rad|°|%)(?!\w))")
-"""Space between a number and its unit, at which a line must not break."""
+"""Space between a number and its unit, where a line must not break."""
 
 
 def papers_report(found: Sequence[PaperResult]) -> Document:
-    """Report of papers. Equal results give equal bytes."""
+    """Return the report of papers; equal results give equal bytes."""
     summary = [(f.title, *(str(n) for n in f.counts().values())) for f in found]
     return Document(
         kind="papers",
@@ -51,7 +52,7 @@ def _paper(found: PaperResult) -> Section:
 
 
 def _table(expected: str, comparisons: Sequence[Comparison], notes: dict[str, int]) -> TextTable:
-    """Table of comparisons; ``notes``: the numbered notes so far, extended by those of the table."""
+    """Return the table of comparisons, and add its notes to ``notes``, the numbered notes of the section."""
     rows = []
     for comparison in comparisons:
         line = line_of(comparison)
@@ -64,5 +65,5 @@ def _table(expected: str, comparisons: Sequence[Comparison], notes: dict[str, in
 
 
 def _unbroken(text: str) -> str:
-    """Text with non-breaking spaces between numbers and units."""
+    """Put non-breaking spaces between numbers and units."""
     return _UNIT_AFTER.sub("\u00a0", text)

@@ -21,23 +21,23 @@ FORMAT = "abbe-papers/1"
 
 @dataclass(frozen=True, slots=True)
 class PaperResult:
-    """One paper with its comparisons: the printed numbers, those that math.md adds, and own checks, each counted separately."""
+    """One paper with its comparisons: printed numbers, numbers of math.md (see `comparison`), and own checks, counted separately."""
 
     paper: Paper
     title: str
     comparisons: tuple[Comparison, ...]
 
     def of(self, *sources: Source) -> list[Comparison]:
-        """Comparisons with numbers of these sources, one source after the other."""
+        """Return the comparisons with numbers of these sources, one source after the other."""
         return [c for source in sources for c in self.comparisons if c.source == source]
 
     @property
     def numbers(self) -> list[Comparison]:
-        """The printed numbers, then those that math.md adds."""
+        """The comparisons with printed numbers, then with those of math.md."""
         return self.of("paper", "math.md")
 
     def counts(self, source: Source = "paper") -> dict[Status, int]:
-        """Count of numbers of a source by status."""
+        """Count the numbers of a source by status."""
         counted = [c.status for c in self.of(source) if not c.again]
         return {status: counted.count(status) for status in STATUSES[source]}
 
@@ -57,7 +57,7 @@ class PaperResult:
 def results(papers: Iterable[Paper] = tuple(TITLES)) -> list[PaperResult]:
     """Compute the numbers of papers, in the order of `TITLES`."""
     wanted = set(papers)
-    # Load a paper's module on demand: scipy loads slowly.
+    # Import a paper's module on demand, because scipy loads slowly.
     return [
         PaperResult(paper, title, tuple(import_module(f"abbe.service.reference.papers.{paper}").comparisons()))
         for paper, title in TITLES.items()

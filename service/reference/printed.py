@@ -1,4 +1,4 @@
-"""A printed number, whose digits define its rounding, and its comparison with a computed one."""
+"""Printed numbers, whose digits define their rounding, and their agreement with computed ones."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from decimal import Decimal
 from typing import ClassVar, Literal, TypeAlias
 
 Fit = Literal["equal", "rounding", "padding", "bound", "no"]
-"""Equal to the last printed digit; within the rounding of the inputs; the same if trailing zeros are padding; below a bound; different."""
+"""Equal to the last printed digit; within the rounding of the inputs; only if trailing zeros are padding; bound holds; different."""
 
 FLOAT = 1e-12
-"""Relative tolerance for binary arithmetic in a decimal comparison."""
+"""Relative tolerance for the rounding of float64 in a comparison of decimal digits."""
 OPERANDS = "rounding of the printed operands"
 
 
@@ -25,11 +25,11 @@ class Printed:
     text : str
         Digits as printed, e.g. ``"-8.5619E-05"``; trailing zeros count.
     bound : bool
-        The paper prints an upper bound, not the number.
+        Whether the paper prints an upper bound instead of the number.
     last : str, optional
         Unit of the last digit if the text does not show it: ``"0.1"`` for a ``"0"`` in a column of tenths.
     digits, padding : int and str, optional
-        Number of significant digits if the zeros after them are padding, and the reason. An assumption, which never makes a number
+        Number of significant digits if the zeros after them are padding, and the reason. As an assumption, it never makes a number
         reproduced.
     """
 
@@ -71,7 +71,7 @@ class Printed:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A number that goes into a computation and must come back within a tolerance; both in the unit of the comparison."""
+    """An input that a computation must return within a tolerance; both in the unit of the comparison."""
 
     value: float
     tolerance: float
@@ -95,7 +95,7 @@ class Given:
 
     @property
     def rounding_if_padded(self) -> float:
-        """Largest accepted difference: no digit is printed."""
+        """Largest accepted difference; without printed digits the same as `rounding`."""
         return self.tolerance
 
     @property
@@ -111,12 +111,12 @@ def _half(exponent: int) -> float:
 
 
 def printed(*texts: str) -> tuple[Printed, ...]:
-    """Several printed numbers, e.g. a row of a table."""
+    """Return several printed numbers, e.g. a row of a table."""
     return tuple(Printed(t) for t in texts)
 
 
 def values(numbers: tuple[Printed, ...]) -> list[float]:
-    """Values of printed numbers."""
+    """Return the values of printed numbers."""
     return [n.value for n in numbers]
 
 
@@ -127,11 +127,11 @@ class Computed:
     Attributes
     ----------
     allowance : float
-        Largest error from its inputs or its method (rounded operands, neglected second order), zero if they are exact.
+        Largest error from inputs or method (rounded operands, neglected second order); zero if they are exact.
     because : str
         Sources of the allowance.
     allowance_if_padded, padding : float and str
-        Allowance if trailing zeros of an input are padding, and the reason; not less than ``allowance``, equal without such inputs.
+        Allowance if trailing zeros of an input are padding, and the reason; not used without such inputs.
     """
 
     value: float
@@ -142,9 +142,9 @@ class Computed:
 
 
 def fit(computed: Computed, number: Expected) -> Fit:
-    """Agreement of a computed number with the printed one.
+    """Return how a computed number agrees with the printed one.
 
-    A bound limits the size of the number; it is rounded itself, so the size may exceed it by half a unit of its last digit.
+    A bound limits the absolute value. As it is rounded itself, the value may exceed it by half a unit of its last digit.
     """
     slack = FLOAT * max(abs(computed.value), abs(number.value))
     if number.bound:
@@ -158,19 +158,19 @@ def fit(computed: Computed, number: Expected) -> Fit:
 
 
 def agrees(computed: Computed, number: Expected) -> bool:
-    """Whether a computed number equals the printed one, to the digit or within the rounding of its inputs, without any assumption."""
+    """Tell whether a computed number equals the printed one or lies within the rounding of its inputs, without padded zeros."""
     return fit(computed, number) not in ("padding", "no")
 
 
 def within_if_padded(computed: Computed, number: Expected) -> float:
-    """Largest allowed difference if trailing zeros of printed numbers are padding."""
+    """Return the largest allowed difference if trailing zeros of printed numbers are padding."""
     return number.rounding_if_padded + max(computed.allowance, computed.allowance_if_padded)
 
 
 def computed_from(function: Callable[..., float], *inputs: Printed, because: str = OPERANDS) -> Computed:
-    """Value of a function of printed numbers, with the effect of their rounding as allowance.
+    """Evaluate a function of printed numbers, with the effect of their rounding as allowance.
 
-    The allowance is the first-order worst case: the sum over the inputs of the larger change for a shift by half a unit of the last digit.
+    The allowance is the first-order worst case: the sum, over the inputs, of the larger change by half a unit of the last digit up or down.
     """
     at = [p.value for p in inputs]
     value = function(*at)

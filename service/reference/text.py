@@ -1,4 +1,4 @@
-"""Comparisons as text: numbers with their significant digits, columns of a table in one line, notes."""
+"""Comparisons as lines of text: numbers with their significant digits, whole columns in one line, notes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from abbe.service.reference.printed import FLOAT, OPERANDS, Expected
 
 NONE = "–"
 _HYPHEN = re.compile(r"(?<![\w.])-(?=\d)|(?<=\de)-(?=\d)")
-"""A hyphen that stands for a minus sign."""
+"""A hyphen used as a minus sign."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class TextLine:
 
 
 def digits_like(value: float, number: Expected) -> str:
-    """A computed value with one digit more than the printed number, in the same notation."""
+    """Return a computed value as text with one digit more than the printed number, in the same notation."""
     text = (number.last or number.text).lower()
     mantissa, _, exponent = text.partition("e")
     decimals = len(mantissa.partition(".")[2]) + 1
@@ -38,12 +38,12 @@ def digits_like(value: float, number: Expected) -> str:
 
 
 def short(value: float) -> str:
-    """Two significant digits."""
+    """Return a number as text with two significant digits."""
     return minus("0" if value == 0.0 else f"{value:.1e}" if not 1e-3 <= abs(value) < 1e5 else f"{value:.2g}")
 
 
 def note(row: Comparison) -> str:
-    """Basis and reason of the status, and the effect of the erratum."""
+    """Return basis and reason of the status, and the effect of the erratum."""
     parts = [part for part in (row.remark, row.why) if part]
     if row.erratum is not None:
         again = ""
@@ -56,14 +56,14 @@ def note(row: Comparison) -> str:
 
 
 def lines(rows: Sequence[Comparison]) -> Iterator[TextLine]:
-    """Lines of a table; neighbouring rows of one series and one status become one line with its worst difference."""
+    """Yield the lines of a table; neighbouring rows of one series and status become one line with the largest difference."""
     for _, group in groupby(rows, key=lambda r: (r.series, r.status) if r.series else (id(r), r.status)):
         members = list(group)
         yield line_of(members[0]) if len(members) == 1 else _column(members)
 
 
 def line_of(row: Comparison) -> TextLine:
-    """Line of one comparison."""
+    """Return the line of one comparison."""
     expected = ("< " if row.expected.bound else "") + minus(row.expected.text)
     return TextLine(row.location, f"{row.quantity}{_unit(row.unit)}", expected, *_computed_cells(row), row.status, note(row))
 
@@ -99,7 +99,7 @@ def _unit(unit: str) -> str:
 
 
 def minus(text: str) -> str:
-    """A number in print: a real minus sign unless it is zero, a small e."""
+    """Typeset a number: a true minus sign, none for zero, and a small e."""
     text = text.replace("E", "e")
     zero = text.startswith("-") and not any(c in "123456789" for c in text.partition("e")[0])
     return text[1:] if zero else text.replace("-", "−")

@@ -1,4 +1,4 @@
-"""Computed against stored numbers: comparisons, deviations, and numbers that the file's inputs do not determine."""
+"""Comparison of computed numbers with those stored in vector files, and a record of those that cannot be computed."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from abbe.service.reference.vector_file import VectorCase
 
 Unit = Literal["mm", "rad", "1"]
 LIMIT: dict[str, float] = {"mm": 1e-9, "rad": 1e-12, "1": np.inf}
-"""Largest accepted deviation, unless a coarser rounding of the vector is stated (issue: 1e-9 mm, 1e-12 rad)."""
+"""Largest accepted deviation, unless the stored number is stated to be rounded more coarsely."""
 RELATIVE = 1e-11
-"""Share of the stored value. An altered 8th digit changes an output by 1e-8 or more; the margin catches most altered inputs."""
+"""Accepted deviation as a share of the stored value, far below the 1e-8 of an altered eighth digit."""
 
 
 @dataclass
 class Quantity:
     """All comparisons of one quantity of one file.
 
-    ``floor`` is the rounding of the stored number in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation does
-    not exceed the larger of ``floor`` and ``relative`` times the stored value, nor the larger of ``floor`` and LIMIT. Comparisons of one
-    quantity may have different roundings; the largest is shown. ``allowed`` is the tolerance at the largest deviation (``worst``).
+    ``floor`` is the rounding of the stored numbers in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation
+    exceeds neither the larger of ``floor`` and ``relative`` times the stored value nor the larger of ``floor`` and LIMIT. If comparisons
+    have different roundings, the largest is kept. ``worst`` names the place of the largest deviation, ``allowed`` is the tolerance there.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Quantity:
         return not self.failures
 
     def to_document(self) -> dict[str, Any]:
-        """JSON value for ``--json``; a deviation that is not finite (nothing was computed) is null."""
+        """Return the JSON value for ``--json``; a deviation that is not finite (nothing was computed) is null."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -79,15 +79,15 @@ class Checks:
     file: str
     quantities: dict[str, Quantity] = field(default_factory=dict)
     forms: dict[str, Quantity] = field(default_factory=dict)
-    """Inputs that are only checked for their form."""
+    """Numbers that are only checked for their form (`check_form`)."""
     not_computable: list[NotComputable] = field(default_factory=list)
     assumptions: list[str] = field(default_factory=list)
-    """Facts of the layout that the file does not state, found by trial."""
+    """Assumptions about the file that it does not state, found by trial."""
     unread: list[str] = field(default_factory=list)
     refused: str = ""
-    """Why a public function refused the inputs of the file; else empty."""
+    """Why a function refused inputs of the file; else empty."""
     error: str = ""
-    """Why the file is unusable (unreadable, another layout); else empty. Earlier comparisons remain valid."""
+    """Why the file is unusable (unreadable, unknown layout); else empty. Comparisons made before remain valid."""
 
     def compare(
         self,
@@ -105,27 +105,27 @@ class Checks:
         Parameters
         ----------
         name : str
-            Quantity; the same name in every case of a file.
+            Name of the quantity, the same in every case of a file.
         computed : array_like
-            From the public functions, using the inputs of the case only.
+            Computed from the inputs of the case only.
         stored : VectorCase
             Part of the file with the expected value.
         floor : float
             Rounding of the stored value in ``unit``.
         rounding : str
-            Reason of the floor.
+            Reason for the floor.
         relative : float
-            Rounding as a share of the stored value: larger for ill-conditioned figures, smaller for plain sums.
+            Rounding as a share of the stored value: larger for ill-conditioned results, smaller for plain sums.
         """
         self._compare(self.quantities, Quantity(name, unit, floor, rounding, relative), computed, stored)
 
     def check_form(
         self, name: str, expected: ArrayLike, stored: VectorCase, *, unit: Unit = "1", floor: float = 1e-18, rounding: str = ""
     ) -> None:
-        """Check the form of numbers that are not computed: printed digits, a rotation, a grid.
+        """Check the form of numbers that are not computed, e.g. that a matrix is a rotation.
 
-        ``expected`` comes from the stored numbers themselves, so the result is reported separately. Parameters as in `compare`, without a
-        relative tolerance.
+        ``expected`` comes from the stored numbers themselves, so the result is reported separately. The other parameters are those of
+        `compare`.
         """
         self._compare(self.forms, Quantity(name, unit, floor, rounding, 0.0), expected, stored)
 
@@ -158,17 +158,17 @@ class Checks:
             q.failures.append(f"{stored.label}{index}: stored {float(expected.ravel()[i])!r}, computed {float(got.ravel()[i])!r}")
 
     def assume(self, text: str) -> None:
-        """Record a fact of the layout that the file does not state, found by trial: the figures agree only with it."""
+        """Record an assumption about the file, found by trial, without which the numbers do not agree."""
         if text not in self.assumptions:
             self.assumptions.append(text)
 
     def leave_out(self, name: str, part: VectorCase, why: str) -> None:
-        """Record that numbers of a file cannot be computed from its inputs, and why."""
+        """Record why a part of the file cannot be computed from its inputs."""
         self.not_computable.append(NotComputable(name, part.skip(), why))
 
     @property
     def ok(self) -> bool:
-        """Whether every comparison and form holds, every number was used, no input was refused, and the file was readable."""
+        """Whether all comparisons and forms hold, every number was used, no input was refused, and the file was readable."""
         passed = all(q.ok for q in (*self.quantities.values(), *self.forms.values()))
         return passed and bool(self.quantities) and not (self.error or self.refused or self.unread)
 

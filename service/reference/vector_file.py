@@ -1,4 +1,4 @@
-"""Access to a vector file that records every number read, so that unread numbers are detected."""
+"""Access to a vector file that records which numbers were read, to find those that no comparison uses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Path = tuple[str | int, ...]
 Shape = tuple[int | None, ...]
 
 
-LAYOUT = "compare the file with the layout of shared/vectors"
+LAYOUT = "compare the file with the layout of the reference vectors"
 
 
 class VectorResult(set[Path]):
-    """Paths of the numbers read so far, and the last part accessed, for messages."""
+    """Paths of the numbers read so far, and of the last part accessed (for messages)."""
 
     last: Path = ()
 
@@ -31,7 +31,7 @@ class VectorCase:
     ----------
     value : JSON value
     path : tuple of keys and indices from the top of the file, the file name first
-    read : paths of the numbers read so far, shared by all parts of a file
+    read : VectorResult, shared by all parts of a file
     """
 
     def __init__(self, value: Any, path: Path, read: VectorResult | None = None) -> None:
@@ -46,11 +46,11 @@ class VectorCase:
 
     @property
     def last(self) -> str:
-        """Part of the file accessed last."""
+        """Path of the part of the file accessed last."""
         return "/".join(str(p) for p in self._read.last or self.path)
 
     def at(self, *keys: str | int) -> VectorCase:
-        """Part under nested keys or indices; raises `FileFormatError` if it is missing."""
+        """Return the part under nested keys or indices; raises `FileFormatError` if it is missing."""
         here: Any = self.value
         for k, key in enumerate(keys):
             try:
@@ -62,35 +62,35 @@ class VectorCase:
         return VectorCase(here, (*self.path, *keys), self._read)
 
     def has(self, key: str) -> bool:
-        """Whether an object holds a key."""
+        """Tell whether this part is an object with a key."""
         return isinstance(self.value, dict) and key in self.value
 
     def keys(self) -> list[str]:
-        """Keys of an object, in file order.
+        """Return the keys of an object, in file order.
 
         Raises
         ------
         FileFormatError
-            It is not an object, or an empty one, which would skip the comparison silently.
+            This part is not an object, or an empty one, for which the comparison would be skipped silently.
         """
         if not isinstance(self.value, dict):
             raise FileFormatError(f"{self.label}: expected an object, got {type(self.value).__name__}", LAYOUT)
         if not self.value:
-            raise FileFormatError(f"{self.label}: expected at least one key, the object is empty", LAYOUT)
+            raise FileFormatError(f"{self.label}: the object is empty, expected at least one key", LAYOUT)
         return list(self.value)
 
     def items(self) -> Iterator[tuple[str, VectorCase]]:
-        """Keys and parts of a non-empty object, in file order."""
+        """Yield keys and parts of a non-empty object, in file order."""
         for key in self.keys():
             yield key, self.at(key)
 
     def named(self, *names: str) -> Iterator[tuple[str, VectorCase]]:
-        """Keys and parts, in the order of ``names``, of an object that must have exactly these keys.
+        """Yield keys and parts, in the order of ``names``, of an object that must have exactly these keys.
 
         Raises
         ------
         FileFormatError
-            It is not an object, or one of the keys is missing or unknown.
+            This part is not an object, or a key is missing or unknown.
         """
         unknown = [key for key in self.keys() if key not in names]
         if unknown:
@@ -99,21 +99,21 @@ class VectorCase:
             yield name, self.at(name)
 
     def parts(self, *, or_none: bool = False) -> list[VectorCase]:
-        """Elements of a list.
+        """Return the elements of a list.
 
         Raises
         ------
         FileFormatError
-            It is not a list, or (unless ``or_none``) an empty one, which would skip the comparison silently.
+            This part is not a list, or (unless ``or_none``) an empty one, for which the comparison would be skipped silently.
         """
         if not isinstance(self.value, list):
             raise FileFormatError(f"{self.label}: expected a list, got {type(self.value).__name__}", LAYOUT)
         if not self.value and not or_none:
-            raise FileFormatError(f"{self.label}: expected at least one element, the list is empty", LAYOUT)
+            raise FileFormatError(f"{self.label}: the list is empty, expected at least one element", LAYOUT)
         return [self.at(k) for k in range(len(self.value))]
 
     def number(self, *keys: str | int) -> float:
-        """One finite number under nested keys; raises `FileFormatError` if it is missing or not finite."""
+        """Return one finite number under nested keys; raises `FileFormatError` if it is missing or not finite."""
         part = self.at(*keys) if keys else self
         values = list(_leaves(part.value, part.path))
         if len(values) != 1 or isinstance(part.value, (list, dict)):
@@ -121,15 +121,15 @@ class VectorCase:
         return float(part.array())
 
     def whole(self, *keys: str | int) -> int:
-        """One whole number under nested keys; raises `FileFormatError` if it is missing or has a fraction."""
+        """Return one whole number under nested keys; raises `FileFormatError` if it is missing or has a fraction."""
         part = self.at(*keys)
         value = part.number()
         if value != int(value):
-            raise FileFormatError(f"{part.label}: expected a whole number, got {value!r}", "")
+            raise FileFormatError(f"{part.label}: expected a whole number, got {value!r}", LAYOUT)
         return int(value)
 
     def array(self, *keys: str | int, shape: Shape | None = None) -> F1:
-        """Finite numbers of a (nested) list as an array of float64.
+        """Return the finite numbers of a (nested) list as an array of float64.
 
         Parameters
         ----------
@@ -161,14 +161,14 @@ class VectorCase:
         return found
 
     def text(self, *keys: str | int) -> str:
-        """A string under nested keys."""
+        """Return a string under nested keys; raises `FileFormatError` if it is missing or not a string."""
         part = self.at(*keys) if keys else self
         if not isinstance(part.value, str):
             raise FileFormatError(f"{part.label}: expected a text, got {type(part.value).__name__}", LAYOUT)
         return part.value
 
     def skip(self) -> int:
-        """Mark all numbers of this part as read without a comparison; return their count. For `Checks.not_computable` only.
+        """Mark all numbers of this part as read without a comparison, and return their count; only for `Checks.leave_out`.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class VectorCase:
         return len(numbers)
 
     def unread(self) -> list[str]:
-        """Unread numbers of this part."""
+        """Return the paths of the unread numbers of this part."""
         return [
             "/".join(map(str, path))
             for path, value in _leaves(self.value, self.path)

@@ -1,4 +1,4 @@
-"""Check of the vector files of a folder: every stored number beside the one computed from the file's own inputs."""
+"""Check of the vector files of a folder: compare every stored number with the one computed from the file's own inputs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ READERS: dict[str, Callable[[VectorCase, Checks], None]] = {
 
 
 def vector_files(folder: Path) -> list[Path]:
-    """Vector files of a folder, sorted by name.
+    """Return the vector files of a folder, sorted by name.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def vector_files(folder: Path) -> list[Path]:
 
 
 def check_file(path: Path) -> Checks:
-    """Check one vector file. An unusable file (no reader, unreadable, another layout) is recorded in ``error``: others still run."""
+    """Check one vector file; if it is unusable (no reader, unreadable, unknown layout), say why in ``error`` of the result."""
     checks = Checks(path.name)
     try:
         _read(path, checks)
@@ -62,7 +62,7 @@ def check_file(path: Path) -> Checks:
 
 
 def document(checked: list[Checks]) -> dict[str, Any]:
-    """JSON document for ``--json``."""
+    """Return the JSON document for ``--json``."""
     missing = missing_files(checked)
     complete = not missing and not any(c.error for c in checked)
     files = [c.to_document() for c in checked]
@@ -70,7 +70,7 @@ def document(checked: list[Checks]) -> dict[str, Any]:
 
 
 def missing_files(checked: list[Checks]) -> list[str]:
-    """Known vector files that were not checked."""
+    """Return the names of known vector files that were not checked."""
     return sorted(set(READERS) - {c.file for c in checked})
 
 
@@ -79,14 +79,14 @@ def _read(path: Path, checks: Checks) -> None:
         raise FileFormatError(f"{path}: there is no reader for this name", f"known names: {', '.join(READERS)}")
     case = VectorCase(_document(path), (path.name,))
     try:
-        # A failed computation becomes a deviation in the result, not a warning of numpy on stderr.
+        # A failed computation appears as a deviation in the result, not as a numpy warning on stderr.
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             READERS[path.name](case, checks)
     except (LookupError, TypeError, RecursionError) as error:
         # The layout differs: a number in place of a list, or an unknown key.
         what = f"{type(error).__name__} {error}".strip()
-        raise FileFormatError(f"{path}: another layout than expected at {case.last} ({what})", LAYOUT) from None
+        raise FileFormatError(f"{path}: the layout differs from the expected one at {case.last} ({what})", LAYOUT) from None
     except (ValueError, ArithmeticError) as error:  # numpy's LinAlgError is a ValueError
         checks.refused = f"{case.last}: {error}"
     checks.unread = case.unread()

@@ -1,1 +1,1 @@
-"""Kwon 2004: the 3-PUU parallel machine, its frames, response surface and kinematic calibration (math.md 6)."""
+"""Kwon 2004: the 3-PUU parallel machine, its frames, response surface and kinematic calibration."""

@@ -1,9 +1,11 @@
-"""Kinematic calibration: geometric parameters of every leg from commands and CMM points, the step that Kwon's paper leaves open.
+"""Kinematic calibration: estimate the geometric parameters of every leg from commands and CMM points.
 
-The paper supposes that errors of the kinematic parameters cause the position errors (4.2), and fits a surface to them. Here the 18
-parameters themselves are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.kinematics`) together with the unknown
-placement on the CMM, with a stated prior for each: what the points do not carry stays at its prior and is named. Points worse than stated
-and a prior that the points contradict are detected, widened and reported (`weigh`).
+Kwon's paper leaves this step open: it supposes that errors of the kinematic parameters cause the position errors (4.2), but fits a surface
+to them. Here the 18 parameters are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.kinematics`), together with the
+unknown placement on the CMM. Each parameter has a stated prior; the result names the parameters that rest on it. If the points scatter more
+than stated or contradict the prior, `weigh` widens the uncertainty of the points or of the prior, and the result reports it.
+
+"Carried" directions of parameter space are those about which the points say more than the prior.
 """
 
 from __future__ import annotations
@@ -23,11 +25,11 @@ from abbe.models.solvers.least_squares import Combination, Identifiability, Para
 CONFLICT = 0.01
 """Probability below which the deviations contradict the stated prior."""
 UNSEEN = 1e-9
-"""Singular values below this share of the largest leave no trace (as abbe.models.solvers.least_squares)."""
+"""Singular values below this share of the largest count as zero (as in abbe.models.solvers.least_squares)."""
 SPATIAL = 3
-"""Coordinates of a point."""
+"""Number of coordinates of a point."""
 STRAY = 0.01
-"""Probability that any point of a good set is called outlying."""
+"""Probability that a set without outliers has a point which is called outlying."""
 FRAME_NAMES = ("shift x", "shift y", "shift z", "turn a", "turn b", "turn c")
 PARAMETERS = parameter_names()
 TOLERANCE_MM, TOLERANCE_RAD = 0.05, 0.5e-3
@@ -45,10 +47,10 @@ class PriorTest:
     Attributes
     ----------
     chi2 : float
-        Sum of squares of the deviations found, in the directions that the points carry better than the stated prior, each in units of the
-        size that the stated prior lets expect.
+        Sum of squares of the estimated deviations in the carried directions, each in units of the standard deviation expected from the
+        stated prior and the noise.
     dof : int
-        Number of these directions. The prior of all others cannot be tested.
+        Number of carried directions. The prior of the others cannot be tested.
     p : float
         Probability of a larger chi2 if the true deviations came from the stated prior; 1 when nothing is carried.
     """
@@ -59,7 +61,7 @@ class PriorTest:
 
     @property
     def conflict(self) -> bool:
-        """p below 0.01."""
+        """Whether p is below 0.01."""
         return self.p < CONFLICT
 
 
@@ -70,13 +72,13 @@ class Weights:
     Attributes
     ----------
     variance_factor : float
-        Factor, 1 or more, for the variance of the points: the residual that no parameter can follow, over its degrees of freedom.
+        Factor, 1 or more, on the variance of the points: the part of the misfit that no parameter can explain, over its degrees of freedom.
     prior_factor : float
-        Factor, 1 or more, for all prior standard deviations alike, since the points cannot judge each by itself. It brings
-        ``test.chi2`` down to its dof or, from twice the dof on, to dof - 2 (dof / 2 below 4), because a factor that was itself estimated
-        from so few directions is too small as often as too large.
+        Common factor, 1 or more, on all prior standard deviations, since the points cannot judge each by itself. It brings ``test.chi2``
+        down to dof or, if that is at least twice the dof, to dof - 2 (dof / 2 if dof is below 4), because a factor estimated from few
+        directions is too small as often as too large.
     carried : int
-        Directions about which the points say more than the prior, with both factors.
+        Number of carried directions, with both factors.
     test : PriorTest
         Test of the prior as stated, with the noise already scaled.
     """
@@ -88,10 +90,10 @@ class Weights:
 
 
 def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
-    """Weights from whitened, linear observations ``observed = design @ (theta, placement) + noise``.
+    """Estimate the weights from whitened, linear observations ``observed = design @ (theta, placement) + noise``.
 
-    With the placement projected out and theta in units of its prior, every singular direction gives one number of the variance
-    ``variance_factor + (prior_factor x singular value)^2``; the rest of the observations is noise alone.
+    With the placement projected out and theta in units of its prior, every singular direction gives one number with the variance
+    ``variance_factor + (prior_factor x singular value)^2``; the rest of the observations is pure noise.
 
     Parameters
     ----------
@@ -118,12 +120,12 @@ def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
 
 
 def outlying_points(residual: F2) -> tuple[int, ...]:
-    """Rows whose residual exceeds the others' by more than chance: 99 of 100 sets of good points have none.
+    """Return the rows with outlying residuals; 99 of 100 sets of good points have none.
 
     Parameters
     ----------
     residual : array, shape (n, 3)
-        In units of the stated uncertainty; the median length of all rows, where it is larger than that lets expect, sets the scale.
+        In units of the stated uncertainty. If their median length is larger than expected, it sets the scale.
     """
     length2 = (residual**2).sum(axis=1)
     scale = max(1.0, float(np.median(length2) / scipy.special.chdtri(SPATIAL, 0.5)))
@@ -132,13 +134,13 @@ def outlying_points(residual: F2) -> tuple[int, ...]:
 
 
 def _prior_factor(y2: F1, s2: F1, variance: float) -> float:
-    """Smallest factor of the prior, 1 or more, for which the sum of y^2 / (variance + factor^2 s^2) is not above its target."""
+    """Return the smallest prior factor, 1 or more, for which the sum of y^2 / (variance + factor^2 s^2) does not exceed its target."""
     if y2.size == 0:
         return 1.0
     size, at_one = float(y2.size), float((y2 / (variance + s2)).sum())
     if at_one <= size:
         return 1.0
-    # Gradual, so that an iteration cannot swing between two targets.
+    # Changes gradually, so that an iteration cannot oscillate between two targets.
     target = size - min(2.0, 0.5 * size) * min(at_one / size - 1.0, 1.0)
 
     def excess(factor2: float) -> float:
@@ -148,7 +150,7 @@ def _prior_factor(y2: F1, s2: F1, variance: float) -> float:
     return float(np.sqrt(scipy.optimize.brentq(excess, 1.0, 2.0 * at_one / target, xtol=1e-12, rtol=1e-12)))
 
 
-# Commands with their CMM points, and how such points depend on parameters and placement, in units of their uncertainty.
+# Commands and their CMM points, and the dependence of such points on parameters and placement.
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class PlaneReadings:
     lambda_mm : array, shape (n, 3)
         Commands of the drives.
     measured_mm : array, shape (n, 3)
-        Ball centres, CMM coordinates.
+        Ball centres in CMM coordinates.
     u_point_mm : float
         Standard uncertainty of one coordinate of one measured point.
     u_lambda_mm : float
@@ -178,25 +180,27 @@ class PlaneReadings:
     u_lambda_mm: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check once."""
+        """Check shapes and uncertainties."""
         lam, measured = poses("lambda_mm", self.lambda_mm), poses("measured_mm", self.measured_mm)
         if lam.shape != measured.shape:
             raise ValueError(f"readings: {lam.shape[0]} commands do not fit {measured.shape[0]} measured points")
         if not (0.0 < self.u_point_mm < np.inf and 0.0 <= self.u_lambda_mm < np.inf):
-            raise ValueError("readings: u_point_mm must be positive and u_lambda_mm not negative")
+            raise ValueError("readings: u_point_mm must be positive, u_lambda_mm must not be negative, and both must be finite")
         object.__setattr__(self, "lambda_mm", lam)
         object.__setattr__(self, "measured_mm", measured)
 
 
 def point_design(geometry: Geometry, lambda_mm: F2, pivot_mm: F1 | None) -> F3:
-    """Derivatives of the ball centre in base axes, shape (n, 3, 18), or (n, 3, 24) with shifts and turns about base axes through a pivot.
+    """Return the derivatives of the ball centre by the 18 parameters and, with a pivot, by shifts and turns of the placement.
+
+    Base axes; shape (n, 3, 18), or (n, 3, 24) with a pivot.
 
     Parameters
     ----------
     geometry : Geometry
     lambda_mm : array, shape (n, 3)
     pivot_mm : array, shape (3,), or None
-        Base coordinates; None when the placement is known.
+        Base coordinates of the point through which the axes of the turns run; None if the placement is known.
     """
     p = forward(geometry, lambda_mm)
     design = parameter_design(geometry, lambda_mm, p)
@@ -210,7 +214,7 @@ def point_design(geometry: Geometry, lambda_mm: F2, pivot_mm: F1 | None) -> F3:
 
 
 def whitened(geometry: Geometry, readings: PlaneReadings, frame: F2, pivot_mm: F1 | None) -> tuple[F2, F1]:
-    """Design (3n, 18 or 24) and misfit (3n,) of the readings in units of their standard uncertainty.
+    """Return the design matrix (3n, 18 or 24) and the misfit (3n,) of the readings in units of their standard uncertainty.
 
     Each point has the covariance u_point^2 I + u_lambda^2 J J', J = dP/dlambda.
     """
@@ -224,7 +228,7 @@ def whitened(geometry: Geometry, readings: PlaneReadings, frame: F2, pivot_mm: F
 
 
 def moved_frame(frame: F2, move: F1, pivot_mm: F1) -> F2:
-    """Placement after a shift and a turn (mm, rad, base axes) about a pivot in base coordinates, shape (4, 4)."""
+    """Return the placement after a shift and a turn (mm, rad, base axes) about a pivot in base coordinates, shape (4, 4)."""
     step = np.eye(4)
     step[:3, :3] = rotation_matrix(move[None, 3:])[0]
     step[:3, 3] = pivot_mm + move[:3] - step[:3, :3] @ pivot_mm
@@ -233,7 +237,7 @@ def moved_frame(frame: F2, move: F1, pivot_mm: F1) -> F2:
 
 @dataclass(frozen=True)
 class KwonCalibration:
-    """Identified machine.
+    """Result of `calibrate`.
 
     Attributes
     ----------
@@ -244,20 +248,20 @@ class KwonCalibration:
     pivot_mm : array (3,) or None
         Point of the base frame about which the turns of ``frame`` are uncertain; None when the frame was given.
     estimate : ParameterEstimate
-        Deviations from nominal (mm, rad) with covariance, names PARAMETERS, then FRAME_NAMES when the frame was unknown (increments about
-        ``frame``, so zero). Residuals and chi2 are in units of the stated uncertainty; the covariance is that of the fit with
-        ``variance_factor`` on the points and ``prior_factor`` on the prior, and EVERY uncertainty is conditional on that prior.
+        Deviations from nominal (mm, rad) with covariance, named PARAMETERS. If the frame was unknown, FRAME_NAMES follow: increments about
+        ``frame``, which are zero. Residuals and chi2 are in units of the stated uncertainty. The covariance includes ``variance_factor``
+        and ``prior_factor``, and EVERY uncertainty is conditional on the prior.
     identifiability : Identifiability
-        Rank of the 18 parameters in units of their priors, frame projected out; ``hidden``: combinations without any trace in the points.
+        Rank of the 18 parameters in units of their priors, frame projected out; ``hidden``: combinations that leave no trace in the points.
     carried : int
-        Directions of parameter space about which the points say more than the prior.
+        Number of carried directions.
     residual_mm : array, shape (n, 3)
         Measured minus modelled, CMM axes.
     prior_test : PriorTest
         Whether the points contradict the prior as it was stated.
     prior_factor : float
-        By how much all prior standard deviations were widened, 1 or more: as much as the deviations in the carried directions demand. The
-        prior of the other directions is widened alike, which nothing can check.
+        Factor, 1 or more, by which all prior standard deviations were widened to explain the deviations in the carried directions. No data
+        can check it for the other directions.
     outlying : tuple of int
         Rows of points that stand out from the others. They are not left out.
     """
@@ -280,13 +284,13 @@ class KwonCalibration:
 
     @property
     def statement(self) -> str:
-        """Basis of the figures, in one sentence."""
+        """What the uncertainties rest on, as text."""
         return "; ".join([*self._identified(), *self._warnings(), "every stated uncertainty is conditional on the prior"])
 
     def _identified(self) -> list[str]:
         n, identified = len(PARAMETERS), self.identifiability
         parts = [
-            f"the points see {identified.rank} of {n} combinations of parameters and carry {self.carried} of them better than the prior",
+            f"the points see {identified.rank} of {n} combinations of parameters, and {self.carried} of them better than the prior",
             f"single values that rest on the prior: {', '.join(self.on_prior) or 'none'}",
         ]
         hidden = ", ".join(_combination(h) for h in identified.hidden)
@@ -297,13 +301,13 @@ class KwonCalibration:
         warnings = []
         if test.conflict:
             warnings.append(
-                f"the points CONTRADICT the prior (chi2 {test.chi2:.4g} in {test.dof} carried directions, p = {test.p:.2g}): "
+                f"the points CONTRADICT the prior (chi2 {test.chi2:.4g} with {test.dof} degrees of freedom, p = {test.p:.2g}): "
                 "the machine deviates more than the prior allows"
             )
         if self.prior_factor > 1.0:
-            warnings.append(f"all prior standard deviations were widened by {self.prior_factor:.3g}, as the carried directions demand")
+            warnings.append(f"all prior standard deviations were multiplied by {self.prior_factor:.3g} to explain these deviations")
         if factor > 1.0:
-            warnings.append(f"the points scatter {np.sqrt(factor):.3g} times as much as stated and were weighed so")
+            warnings.append(f"the points scatter {np.sqrt(factor):.3g} times as much as stated, and their uncertainty was increased so")
         if self.outlying:
             rows = ", ".join(str(i) for i in self.outlying[:SHOWN])
             more = f" and {len(self.outlying) - SHOWN} more" if len(self.outlying) > SHOWN else ""
@@ -315,18 +319,18 @@ class KwonCalibration:
         return from_frame(self.frame, forward(self.geometry, lambda_mm))
 
     def u_predict_mm(self, lambda_mm: F2) -> F2:
-        """Standard uncertainty of `predict_mm` along the CMM axes, from parameters and frame together, shape (n, 3)."""
+        """Return the standard uncertainty of `predict_mm` along the CMM axes, mm, shape (n, 3), from parameters and frame."""
         design = self.frame[:3, :3] @ point_design(self.geometry, poses("lambda_mm", lambda_mm), self.pivot_mm)
         return np.asarray(np.sqrt(np.einsum("ncp,pq,ncq->nc", design, self.estimate.covariance, design)))
 
     def corrected_lambda_mm(self, p_mm: F2) -> F2:
-        """Commands that bring the real machine to positions in base coordinates, shape (n, 3); errors as `inverse`."""
+        """Return the commands that bring the real machine to positions in base coordinates, shape (n, 3); raises as `inverse`."""
         return inverse(self.geometry, p_mm)
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorLeft:
-    """Length of position errors (rms and largest, mm) by the nominal and by the calibrated geometry, best-fit rigid motion removed."""
+    """Length of the position errors (rms and maximum, mm) with the nominal and the calibrated geometry, rigid motion removed."""
 
     before_rms_mm: float
     before_max_mm: float
@@ -335,34 +339,33 @@ class ErrorLeft:
 
 
 def default_prior() -> F1:
-    """Prior standard deviations of R1 .. dz3, shape (18,): 0.05 mm and 0.5 mrad, ordinary making and assembly; give your own."""
+    """Return prior standard deviations of R1 .. dz3 for ordinary manufacture and assembly, 0.05 mm and 0.5 mrad, shape (18,)."""
     return np.array([TOLERANCE_RAD if name.startswith("th") else TOLERANCE_MM for name in PARAMETERS])
 
 
 def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = None, frame: F2 | None = None) -> KwonCalibration:
-    """Most probable parameters, given normal priors about nominal; Gauss-Newton on the exact forward solution.
+    """Estimate the most probable parameters for normal priors about nominal, by Gauss-Newton on the exact forward solution.
 
-    Noise and prior are widened where the points demand it (`weigh`): the noise by what no parameter can
-    follow, all prior standard deviations by one common factor, until the deviations in the carried directions are as large as the prior
-    lets expect. A contradiction (p < 0.01) is in ``prior_test`` and in the statement.
+    `weigh` widens noise and prior if the points demand it. ``prior_test`` and ``statement`` of the result report a contradiction between
+    points and prior (p < 0.01).
 
     Parameters
     ----------
     nominal : Geometry
     readings : PlaneReadings
     prior_sd : array, shape (18,), optional
-        Positive standard deviations of the deviations from nominal, order of PARAMETERS; default `default_prior`. Some combinations leave
-        no trace in positions at all (R with r for theta_p = theta_b; dz with the height of the frame), so a prior is always needed.
+        Positive prior standard deviations of the deviations from nominal, in the order of PARAMETERS; default `default_prior`. A prior is
+        always needed, because some combinations leave no trace in positions (R with r for theta_p = theta_b; dz with the frame's height).
     frame : array, shape (4, 4), optional
-        Known placement, from the base frame to the CMM; estimated without a prior when not given.
+        Known placement, from the base frame to the CMM. Default: estimated, without a prior.
 
     Raises
     ------
     NotSettled
-        The iteration does not come to rest.
+        The iteration does not converge.
     PoseError, CollinearPoints
-        A command has no position (for the nominal geometry or one tried on the way), or the points lie on a line and cannot place the
-        machine.
+        A command has no position (with the nominal geometry or during the iteration), or the points lie on a line and do not determine the
+        placement.
     ValueError
         A prior is not positive, or the frame is not a rigid motion.
     """
@@ -381,17 +384,17 @@ def calibrate(nominal: Geometry, readings: PlaneReadings, prior_sd: F1 | None = 
         current_frame = current_frame if pivot is None else moved_frame(current_frame, move, pivot)
         if (np.abs(step) <= SETTLED * np.sqrt(np.diag(estimate.covariance))).all():
             return _result(_with(nominal, theta), readings, current_frame, pivot, (estimate, prior, weights))
-    raise NotSettled(f"calibration: not settled after {ITERATIONS} steps; the points do not fit the nominal machine")
+    raise NotSettled(f"calibration: no convergence after {ITERATIONS} steps; the points do not fit the nominal machine")
 
 
 def error_left(nominal: Geometry, calibrated: Geometry, lambda_mm: F2, measured_mm: F2) -> ErrorLeft:
-    """Position error before and after calibration; use points that the calibration did not use.
+    """Return the position errors before and after calibration, at points that the calibration did not use.
 
     Parameters
     ----------
     nominal, calibrated : Geometry
     lambda_mm, measured_mm : arrays, shape (n, 3)
-        Commands and CMM points; each geometry is placed by its own best fit.
+        Commands and CMM points. Each geometry is placed by its own best fit.
     """
     before = best_fit_errors(forward(nominal, lambda_mm), measured_mm)
     after = best_fit_errors(forward(calibrated, lambda_mm), measured_mm)
@@ -405,7 +408,7 @@ def _with(nominal: Geometry, theta: F1) -> Geometry:
 def _step(
     geometry: Geometry, readings: PlaneReadings, frame: F2, pivot: F1 | None, known: tuple[F1, F1]
 ) -> tuple[ParameterEstimate, Weights]:
-    """One linearised fit about the present geometry and frame, points and prior weighted by `weigh`."""
+    """Return a linearised fit about the present geometry and frame, weighted by `weigh`."""
     theta, prior = known
     design, misfit = whitened(geometry, readings, frame, pivot)
     free = design.shape[1] - prior.size
@@ -414,7 +417,7 @@ def _step(
     weights = weigh(design, observed, prior)
     sd = np.concatenate([weights.prior_factor * prior, np.full(free, np.inf)])
     fit = solve_map(names, design, observed, np.full(misfit.size, np.sqrt(weights.variance_factor)), sd)
-    # The noise is scaled already, and a factor over all would widen the prior with it.
+    # The noise is scaled already; `solve_map` would scale the prior too.
     covariance, chi2 = fit.covariance / fit.variance_factor, fit.chi2 * weights.variance_factor
     return replace(fit, covariance=covariance, chi2=chi2, variance_factor=weights.variance_factor), weights
 
@@ -433,7 +436,7 @@ def _result(
 
 
 def _combination(hidden: Combination) -> str:
-    """All parameters that a hidden combination moves together."""
+    """Return the parameters of a hidden combination as text."""
     return " with ".join(hidden.members)
 
 

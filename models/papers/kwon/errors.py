@@ -1,5 +1,5 @@
-"""Errors of a parallel machine or its data. All are ValueErrors whose one line names the pose and the leg."""
-# ruff: noqa: N818 - the names say what is geometrically wrong, as math.md 6 lists it
+"""Errors of a parallel machine or its data: ValueErrors whose message names the pose and the leg."""
+# ruff: noqa: N818 - the names say what is geometrically wrong
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ Fault = tuple[type["PoseError"], NDArray[np.bool_], str]
 
 
 class KwonError(ValueError):
-    """Base of this package's errors."""
+    """Base class of the errors of this package."""
 
 
 class PoseError(KwonError):
-    """An error of single poses.
+    """A fault of one or more poses.
 
     Attributes
     ----------
     rows : tuple of int
-        Pose rows concerned, from 0.
+        Rows of the poses, from 0.
     legs : tuple of int
-        Leg numbers concerned (1, 2, 3), row by row; empty where the whole platform is meant.
+        Leg (1, 2, 3) of each row; empty if the whole platform is concerned.
     """
 
     rows: tuple[int, ...] = ()
@@ -32,11 +32,11 @@ class PoseError(KwonError):
 
 
 class UnreachableLeg(PoseError):
-    """C^2 < D: a leg is too short for the pose, the inverse solution does not exist (math.md 6)."""
+    """C^2 < D: a leg is too short for the pose, and there is no inverse solution."""
 
 
 class SerialSingularity(PoseError):
-    """C^2 = D: the link stands perpendicular to its rail; the two inverse solutions meet and the leg cannot push along its link."""
+    """C^2 = D: a link is perpendicular to its rail, the two inverse solutions coincide, and the drive cannot move the link lengthwise."""
 
 
 class NoForwardSolution(PoseError):
@@ -44,7 +44,7 @@ class NoForwardSolution(PoseError):
 
 
 class CollinearSphereCentres(PoseError):
-    """det of the 2 x 2 matrix of (4) is 0: the sphere centres lie on a line seen from above (for equal commands: vertical links)."""
+    """The determinant of the matrix in (4) is 0: seen from above, the sphere centres lie on a line (equal commands: vertical links)."""
 
 
 class ParallelSingularity(PoseError):
@@ -56,19 +56,19 @@ class LinksHorizontal(ParallelSingularity):
 
 
 class PlatformBelow(PoseError):
-    """h < 0: the platform is below the sphere centres, the other assembly of the same links, which `forward` never returns."""
+    """h < 0: the platform is below the sphere centres. `forward` never returns this other assembly of the links."""
 
 
 class CollinearPoints(KwonError):
-    """Points that are to define a frame lie on a line (or coincide): sin(theta) = 0 in (14), (16)."""
+    """The points that should define a frame lie on a line or coincide: sin(theta) = 0 in (14), (16)."""
 
 
 class SurfaceNotDetermined(KwonError):
-    """The points do not determine the cubic response surface, or leave no residual to judge it by."""
+    """The points do not determine the cubic response surface, or leave no residual to judge it."""
 
 
 class ExtrapolationRefused(KwonError):
-    """A response surface was asked for a height or a place at which nothing was measured."""
+    """A response surface is evaluated where nothing was measured."""
 
 
 class NotSettled(KwonError):
@@ -76,20 +76,20 @@ class NotSettled(KwonError):
 
 
 def refuse(kind: type[PoseError], bad: NDArray[np.bool_], text: str) -> None:
-    """Raise ``kind`` when any pose is bad.
+    """Raise ``kind`` if any pose is bad.
 
     Parameters
     ----------
     kind : type
     bad : bool array, shape (n, 3) for pose x leg or (n,) for poses
     text : str
-        What is wrong, in the words of the user.
+        Description of the fault for the user.
     """
     refuse_first((kind, bad, text))
 
 
 def refuse_first(*faults: Fault) -> None:
-    """Raise the first kind that any pose shows, and count the poses that only the others concern.
+    """Raise the first fault that occurs in any pose; the message counts the poses that have only later faults.
 
     Parameters
     ----------

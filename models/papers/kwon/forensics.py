@@ -1,4 +1,4 @@
-"""Conclusions from printed coefficients of a response surface: the plane they were fitted on, their in-plane form, their sums on a grid."""
+"""Analysis of printed response-surface coefficients: the plane on which they were fitted, their form on a plane, their sums on a grid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.models.papers.kwon.layout import CUBIC, IN_PLANE, Exponents, regressor
 
 INDEX = {term: i for i, term in enumerate(CUBIC)}
 LADDER: tuple[tuple[int, int], ...] = tuple((INDEX[(i, j, k + 1)], INDEX[(i, j, k)]) for i, j, k in CUBIC if (i, j, k + 1) in INDEX)
-"""Pairs of coefficients whose quotient is Z in a minimum-norm solution on one plane: beta_3/beta_0, beta_5/beta_1, .. (math.md 6)."""
+"""Pairs of coefficients whose quotient is Z in a minimum-norm solution on one plane: beta_3/beta_0, beta_5/beta_1, ..."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class ImpliedPlane:
     z_mm, mean_mm, sd_mm : float
         Median, mean and standard deviation of the quotients.
     ratios_mm : tuple of ((component, upper index, lower index), quotient)
+        Quotients of the coefficient pairs in `LADDER`.
     """
 
     z_mm: float
@@ -51,10 +52,10 @@ class GridSums:
 
 
 def minimum_norm(in_plane: F1, z_mm: float) -> F1:
-    """The 20 coefficients of smallest norm that give an in-plane cubic on the plane Z = z: what a pseudo-inverse of (28) returns.
+    """Return the 20 coefficients of smallest norm that equal an in-plane cubic on the plane Z = z, as a pseudo-inverse in (28) does.
 
-    On one plane the columns of (27) are in-plane monomials times 1, z, z^2, z^3, so every in-plane coefficient is shared out in the
-    proportion z^k / sum z^2k: neighbours then have the quotient z.
+    On one plane the columns of (27) are in-plane monomials times 1, z, z^2, z^3. So an in-plane coefficient is divided in the proportion
+    z^k / sum z^2k, and neighbouring coefficients have the quotient z.
 
     Parameters
     ----------
@@ -75,13 +76,13 @@ def minimum_norm(in_plane: F1, z_mm: float) -> F1:
 
 
 def in_plane_coefficients(beta: F1, z_mm: float) -> F1:
-    """Coefficients of the ten monomials of X, Y that 20 coefficients give on the plane Z = z, shape (10,), order of IN_PLANE."""
+    """Return the coefficients of the ten monomials of X, Y to which 20 coefficients reduce on the plane Z = z, in the order of IN_PLANE."""
     values = _sized(beta, len(CUBIC))
     return np.array([sum(values[INDEX[(i, j, k)]] * z_mm**k for k in range(4 - i - j)) for i, j, _ in IN_PLANE])
 
 
 def implied_plane(beta: F2, leave_out: tuple[tuple[int, int], ...] = ()) -> ImpliedPlane:
-    """Plane that the quotients of neighbouring coefficients imply.
+    """Return the plane that the quotients of neighbouring coefficients imply.
 
     Parameters
     ----------
@@ -93,11 +94,11 @@ def implied_plane(beta: F2, leave_out: tuple[tuple[int, int], ...] = ()) -> Impl
     Raises
     ------
     ValueError
-        Another shape, or nothing to divide.
+        The shape is wrong, or no quotient is left.
     """
     rows = np.atleast_2d(np.asarray(beta, dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != len(CUBIC):
-        raise ValueError(f"implied plane: expected 20 coefficients a row, got shape {rows.shape}")
+        raise ValueError(f"implied plane: expected 20 coefficients per row, got shape {rows.shape}")
     bad = set(leave_out)
     pairs = [(c, up, low) for c in range(rows.shape[0]) for up, low in LADDER if (c, up) not in bad and (c, low) not in bad]
     ratios = tuple((pair, float(rows[pair[0], pair[1]] / rows[pair[0], pair[2]])) for pair in pairs if rows[pair[0], pair[2]] != 0.0)
@@ -109,7 +110,7 @@ def implied_plane(beta: F2, leave_out: tuple[tuple[int, int], ...] = ()) -> Impl
 
 
 def square_grid(half_mm: float = 1.0, step_mm: float = 0.25, z_mm: float = 0.0) -> F2:
-    """Points of the square |x|, |y| <= half at one height, y fastest, shape (n, 3); the paper's is +-1 mm in steps of 0.25 mm."""
+    """Return grid points of the square |x|, |y| <= half at one height, y fastest, shape (n, 3); the paper's has +-1 mm and 0.25 mm."""
     steps = round(2.0 * half_mm / step_mm)
     if steps < 1 or abs(steps * step_mm - 2.0 * half_mm) > 1e-9 * half_mm:
         raise ValueError(f"square grid: {step_mm:g} mm does not divide {2.0 * half_mm:g} mm")
@@ -119,17 +120,17 @@ def square_grid(half_mm: float = 1.0, step_mm: float = 0.25, z_mm: float = 0.0) 
 
 
 def grid_sums(in_plane: F1, half_mm: float = 1.0, step_mm: float = 0.25) -> GridSums:
-    """Largest value and sums of squares of an in-plane cubic on a square grid: for comparison with a printed analysis of variance."""
+    """Return the largest value and the sums of squares of an in-plane cubic on a square grid, to compare with a printed ANOVA."""
     values = regressors(square_grid(half_mm, step_mm), IN_PLANE) @ _sized(in_plane, len(IN_PLANE))
     return GridSums(values.size, float(np.abs(values).max()), float(((values - values.mean()) ** 2).sum()), float((values**2).sum()))
 
 
 def coefficients_from_planes(first: F1, z1_mm: float, second: F1, z2_mm: float, digits: int) -> F1:
-    """Printed coefficients recovered from their exact in-plane form on two planes, using that they were printed with few digits.
+    """Recover printed coefficients with few digits from their exact in-plane form on two planes.
 
-    From the highest power of Z down: two planes give the two highest powers as if the rest were zero, the highest is rounded to the
-    digits in print, taken off, and so on. Works while the lower powers contribute less than the rounding, as in a minimum-norm solution
-    far from Z = 0; beta_0 ends below the rounding of float64 and is only an order of magnitude.
+    It starts with the highest power of Z: the two planes determine its coefficient as if the lower powers were zero; the coefficient is
+    rounded to the printed digits and subtracted. This works while lower powers contribute less than the rounding, as in a minimum-norm
+    solution far from Z = 0. beta_0 falls below the rounding of float64, and only its order of magnitude is right.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ def coefficients_from_planes(first: F1, z1_mm: float, second: F1, z2_mm: float, 
 
 
 def ladder_name(pair: tuple[int, int]) -> str:
-    """A quotient of LADDER as people read it: ``X Z / X``."""
+    """Return the name of a quotient of LADDER: ``X Z / X``."""
     return f"{term_name(CUBIC[pair[0]])} / {term_name(CUBIC[pair[1]])}"
 
 

@@ -1,6 +1,6 @@
-"""Frames from three points and from all points, the position errors that each gives, and the scatter of repeated readings.
+"""Frames from three points and from all points, the position errors in each, and the scatter of repeated readings.
 
-Source: Kwon 2004 (12)-(25) and 4.2 (Figs 13 and 14), math.md 6.
+Source: Kwon 2004 (12)-(25) and 4.2 (Figs 13 and 14).
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ FLAT = 1e-6
 """sin(theta) below which three points count as lying on a line."""
 
 DATUM = (
-    "Errors in the three-point frame depend on its datum: by construction e(P1) = 0, e(P2) = (e_x, 0, 0), e(P3) = (e_x, e_y, 0): six "
-    "errors are zero whatever the machine does. The best-fit errors do not single out any point."
+    "Errors in the three-point frame depend on its datum: by construction e(P1) = 0, e(P2) = (e_x, 0, 0), e(P3) = (e_x, e_y, 0), so six "
+    "errors are zero for any machine. The best-fit errors treat all points alike."
 )
 
 RIGID = 1e-6
-"""How far the columns of a placement may be from unit length and right angles: a matrix typed with seven digits passes."""
+"""Tolerance for unit length and right angles of the columns of a placement; a matrix typed with seven digits passes."""
 COVERAGE = 2.0
 """The paper states repeatability as 2 standard deviations."""
 
@@ -39,7 +39,7 @@ class PositionErrors:
     three_point_rms_mm, best_fit_rms_mm : float
         Root mean square of the error vectors' lengths.
     datum : str
-        What the three-point errors cannot show.
+        Note on what the three-point errors cannot show.
     """
 
     three_point_mm: F2
@@ -50,12 +50,12 @@ class PositionErrors:
 
 
 def three_point_frame(points_mm: F2) -> F2:
-    """Frame of three points: origin P1, x towards P2, y in their plane, z = x cross y; (12)-(17) and (18)-(21) with columns [x y z P1].
+    """Return the frame of three points, (12)-(21): origin P1, x towards P2, y in their plane, z = x × y.
 
     Parameters
     ----------
     points_mm : array, shape (3, 3)
-        P1, P2, P3 as rows; the designed ones have P1P2 perpendicular to P1P3, measured ones need not.
+        P1, P2, P3 as rows. P1P2 need not be perpendicular to P1P3.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def three_point_frame(points_mm: F2) -> F2:
     Raises
     ------
     CollinearPoints
-        Two of them coincide or all lie on a line (sin theta below 1e-6).
+        Two points coincide, or all lie on a line (sin theta below 1e-6).
     """
     p = poses("points_mm", points_mm)
     if p.shape[0] != 3:
@@ -80,7 +80,7 @@ def three_point_frame(points_mm: F2) -> F2:
 
 
 def best_fit_frame(nominal_mm: F2, measured_mm: F2) -> F2:
-    """Rigid motion (rotation and shift, no mirror) that brings nominal points closest to measured ones, least squares.
+    """Return the rigid motion (no mirroring) that brings nominal points closest to measured ones, by least squares.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def best_fit_frame(nominal_mm: F2, measured_mm: F2) -> F2:
     Raises
     ------
     CollinearPoints
-        The points lie on a line, so that the turn about it is undetermined.
+        The points lie on a line, so that the rotation about it is undetermined.
     """
     a, b = _pair(nominal_mm, measured_mm)
     ca, cb = a.mean(axis=0), b.mean(axis=0)
@@ -105,14 +105,14 @@ def best_fit_frame(nominal_mm: F2, measured_mm: F2) -> F2:
 
 
 def nearest_rotation(matrix: F2) -> F2:
-    """Rotation nearest to a (3, 3) matrix (largest trace of the product), mirror excluded."""
+    """Return the rotation (no mirroring) nearest to a (3, 3) matrix."""
     u, _, vt = np.linalg.svd(matrix)
     flip = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     return np.asarray((u * flip) @ vt)
 
 
 def checked_frame(name: str, frame: F2) -> F2:
-    """Homogeneous matrix of a rigid motion, shape (4, 4), float64.
+    """Return a homogeneous matrix, shape (4, 4), as float64; check that it is a rigid motion.
 
     Raises
     ------
@@ -125,26 +125,26 @@ def checked_frame(name: str, frame: F2) -> F2:
     if not np.isfinite(t).all() or (t[3] != [0.0, 0.0, 0.0, 1.0]).any():
         raise ValueError(f"{name}: expected finite numbers with the last row 0 0 0 1")
     if np.abs(t[:3, :3].T @ t[:3, :3] - np.eye(3)).max() > RIGID:
-        raise ValueError(f"{name}: it scales or shears, a placement only turns and shifts")
+        raise ValueError(f"{name}: the matrix scales or shears, but a placement only turns and shifts")
     if np.linalg.det(t[:3, :3]) < 0.0:
-        raise ValueError(f"{name}: it mirrors, a placement only turns and shifts")
+        raise ValueError(f"{name}: the matrix mirrors, but a placement only turns and shifts")
     return t
 
 
 def into_frame(frame: F2, points_mm: F2) -> F2:
-    """T^-1 P: points in the coordinates of a frame, (22), (23); shape (n, 3)."""
+    """Return points in the coordinates of a frame, T^-1 P, (22), (23); shape (n, 3)."""
     result: F2 = (poses("points_mm", points_mm) - frame[:3, 3]) @ frame[:3, :3]
     return result
 
 
 def from_frame(frame: F2, points_mm: F2) -> F2:
-    """T P: points of a frame in outer coordinates, shape (n, 3)."""
+    """Return points of a frame in outer coordinates, T P, shape (n, 3)."""
     result: F2 = poses("points_mm", points_mm) @ frame[:3, :3].T + frame[:3, 3]
     return result
 
 
 def three_point_errors(nominal3_mm: F2, measured3_mm: F2, nominal_mm: F2, measured_mm: F2) -> F2:
-    """Errors e = T_m^-1 mP - T_d^-1 dP in the reference frame, (24) with T_mr_dr = I (math.md 3, K (24)); shape (n, 3), mm.
+    """Return the errors e = T_m^-1 mP - T_d^-1 dP in the reference frame, (24) with T_mr_dr = I; shape (n, 3), mm.
 
     Parameters
     ----------
@@ -156,6 +156,7 @@ def three_point_errors(nominal3_mm: F2, measured3_mm: F2, nominal_mm: F2, measur
     Raises
     ------
     CollinearPoints
+        The three datum points lie on a line.
     """
     nominal, measured = _pair(nominal_mm, measured_mm)
     return into_frame(three_point_frame(measured3_mm), measured) - into_frame(three_point_frame(nominal3_mm), nominal)
@@ -168,7 +169,7 @@ def best_fit_errors(nominal_mm: F2, measured_mm: F2) -> F2:
 
 
 def position_errors(nominal3_mm: F2, measured3_mm: F2, nominal_mm: F2, measured_mm: F2) -> PositionErrors:
-    """Both kinds of position error with the statement what the datum hides; parameters as `three_point_errors`."""
+    """Return both kinds of position error; parameters as in `three_point_errors`."""
     three = three_point_errors(nominal3_mm, measured3_mm, nominal_mm, measured_mm)
     best = best_fit_errors(nominal_mm, measured_mm)
     return PositionErrors(three, best, rms(three), rms(best))
@@ -216,7 +217,7 @@ class Repeatability:
 
 @dataclass(frozen=True, slots=True)
 class ResidualStatistics:
-    """Residuals of one component beside the repeatability.
+    """Residuals of one error component, compared with the repeatability.
 
     Attributes
     ----------
@@ -225,7 +226,7 @@ class ResidualStatistics:
     ratio : float
         Residual variance over repeatability variance.
     p : float
-        Probability of a larger ratio if the surface lacked nothing: small means that scatter alone does not explain the residuals.
+        Probability of a larger ratio if the surface is complete; small means that scatter alone does not explain the residuals.
     """
 
     sd_mm: float
@@ -235,7 +236,7 @@ class ResidualStatistics:
 
 
 def repeatability(readings_mm: F3) -> Repeatability:
-    """Scatter of repeated visits.
+    """Return the scatter of repeated visits.
 
     Parameters
     ----------
@@ -256,7 +257,7 @@ def repeatability(readings_mm: F3) -> Repeatability:
 
 
 def residual_statistics(residual_mm: F1, df_res: int, repeat_sd_mm: float, repeat_dof: int) -> ResidualStatistics:
-    """Test of lack of fit for single readings: whether the residuals of a surface exceed the repeatability.
+    """Test the lack of fit: whether the residuals of a surface exceed the repeatability.
 
     Parameters
     ----------
@@ -269,13 +270,13 @@ def residual_statistics(residual_mm: F1, df_res: int, repeat_sd_mm: float, repea
     Raises
     ------
     ValueError
-        A number of degrees of freedom is below 1, the repeatability is not positive and finite, or the residuals are none or not finite.
+        Degrees of freedom are below 1, the repeatability is not positive and finite, or the residuals are empty or not finite.
     """
     if df_res < 1 or repeat_dof < 1 or not 0.0 < repeat_sd_mm < np.inf:
-        raise ValueError("residual figures: degrees of freedom must be 1 or more and the repeatability positive and finite")
+        raise ValueError("residual statistics: degrees of freedom must be 1 or more, and the repeatability positive and finite")
     residual = np.asarray(residual_mm, dtype=np.float64)
     if residual.ndim != 1 or residual.size == 0 or not np.isfinite(residual).all():
-        raise ValueError(f"residual figures: expected finite residuals of shape (n,), got shape {residual.shape} or a value not finite")
+        raise ValueError(f"residual statistics: expected finite residuals of shape (n,), got shape {residual.shape} or a value not finite")
     variance = float((residual**2).sum()) / df_res
     ratio = variance / repeat_sd_mm**2
     return ResidualStatistics(

@@ -1,6 +1,6 @@
 """The translational 3-PUU machine: geometry (nominal or with errors per leg), forward and inverse kinematics, Jacobian, sensitivities.
 
-Source: Kwon 2004 (1)-(11), math.md 6 with errata.
+Source: Kwon 2004 (1)-(11), with errata.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from abbe.models.papers.kwon.errors import (
 LEGS = 3
 THIRDS = np.array([0.0, 2.0 * np.pi / 3.0, 4.0 * np.pi / 3.0])
 PER_LEG = ("R", "r", "l", "thb", "thp", "dz")
-"""Parameters that may differ from leg to leg, in the letters of math.md 6."""
+"""Parameters that may differ from leg to leg: the fields of `Geometry` in short, see `FIELDS`."""
 FIELDS = {"R": "R_mm", "r": "r_mm", "l": "l_mm", "thb": "theta_b_rad", "thp": "theta_p_rad", "dz": "dz_mm"}
 COMMON = ("l_up_mm", "l_dw_mm", "theta_rad", "le_mm")
 Branch = Literal["outside", "folded"]
-"""Base joint outside the platform joint (C + root, the machine as built) or inside it (C - root, the folded assembly)."""
+"""Base joint farther out than the platform joint (C + root, the machine as built) or farther in (C - root, the folded assembly)."""
 SINGULAR = 1e-6
-"""Sine or cosine below which links count as horizontal or perpendicular: well above the rounding of a root (1e-8), 0.2 seconds of arc."""
+"""Sine or cosine below which links count as horizontal or perpendicular: 0.2 arc seconds, well above the rounding of a root (1e-8)."""
 
 
 def _zeros() -> F1:
@@ -43,10 +43,10 @@ def _zeros() -> F1:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Three linear drives on a base, three links of constant length, a platform that only translates (Kwon 2004, 2.1, Fig. 2).
+    """Geometry of the machine: three linear drives, three links of constant length, a platform that only translates (Kwon 2.1, Fig. 2).
 
     Base frame: origin in the base plane at the middle of the drives, z up, drive 1 along +x. A drive moves its joint by ``lambda`` TOWARDS
-    the origin. Values of one leg may be given as one number for all legs.
+    the origin. One number for a parameter of the legs holds for all legs.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ class Geometry:
     le_mm : float
         Ball centre above the platform.
     theta_b_rad, theta_p_rad : array, shape (3,)
-        Directions of the drives and of the platform's corners about z; 0, 120, 240 degrees when not given.
+        Directions of the drives and of the platform's corners about z; default 0, 120, 240 degrees.
     dz_mm : float or array, shape (3,)
-        Base joint above the base plane, + up.
+        Height of the base joints above the base plane.
 
     Raises
     ------
@@ -79,7 +79,7 @@ class Geometry:
     dz_mm: F1 = field(default_factory=_zeros)
 
     def __post_init__(self) -> None:
-        """Spread single numbers over the legs and check once."""
+        """Expand single numbers to all legs and check the values."""
         for name in FIELDS.values():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in ((), (LEGS,)):
@@ -96,25 +96,25 @@ class Geometry:
 
     @property
     def r_hat_mm(self) -> F1:
-        """Eq (7) for every leg: platform centre to upper joint in plan, shape (3,)."""
+        """Horizontal distance from the platform centre to the upper joint, (7), shape (3,)."""
         value: F1 = self.r_mm + self.l_up_mm * np.cos(self.theta_rad)
         return value
 
     @property
     def reach_mm(self) -> F1:
-        """R - l_dw cos(theta): eq (8) at lambda = 0, shape (3,)."""
+        """Horizontal distance from the origin to the lower joint at lambda = 0, (8), shape (3,)."""
         value: F1 = self.R_mm - self.l_dw_mm * np.cos(self.theta_rad)
         return value
 
     @property
     def lift_mm(self) -> F1:
-        """(l_up + l_dw) sin(theta) + l_e + dz: height of the sphere centres, shape (3,)."""
+        """Height of the sphere centres, (l_up + l_dw) sin(theta) + l_e + dz, shape (3,)."""
         value: F1 = (self.l_up_mm + self.l_dw_mm) * np.sin(self.theta_rad) + self.le_mm + self.dz_mm
         return value
 
     @property
     def rails(self) -> F2:
-        """Unit vectors outwards along the rails, shape (3 legs, 3)."""
+        """Unit vectors along the rails, outwards, shape (3 legs, 3)."""
         return _in_plan(self.theta_b_rad)
 
     @property
@@ -123,7 +123,7 @@ class Geometry:
         return _in_plan(self.theta_p_rad)
 
     def centres_mm(self, lambda_mm: F2) -> F3:
-        """Centres (-A, -B, lift) of the spheres on which the ball centre lies, shape (n, 3 legs, 3); (5), (6) of Kwon.
+        """Return the centres (-A, -B, lift) of the spheres on which the ball centre lies, (5), (6), shape (n, 3 legs, 3).
 
         Parameters
         ----------
@@ -135,12 +135,12 @@ class Geometry:
         return centres
 
     def with_errors(self, errors: dict[str, F1]) -> Geometry:
-        """Same machine with deviations (actual - nominal) added.
+        """Return the machine with deviations (actual - nominal) added.
 
         Parameters
         ----------
         errors : dict
-            From names of PER_LEG to one number or shape (3,), mm or rad.
+            Names of PER_LEG to deviations, mm or rad: one number or shape (3,).
 
         Raises
         ------
@@ -154,13 +154,7 @@ class Geometry:
 
 
 def poses(name: str, value: F2) -> F2:
-    """Finite float64 array of shape (n, 3).
-
-    Raises
-    ------
-    ValueError
-        It has another shape or holds something that is not finite.
-    """
+    """Return a float64 array; ValueError if its shape is not (n, 3) or a number is not finite."""
     array = np.asarray(value, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != LEGS:
         raise ValueError(f"{name}: expected numbers of shape (n, 3), got shape {array.shape}")
@@ -176,9 +170,9 @@ def _in_plan(angle_rad: F1) -> F2:
 
 
 def forward(geometry: Geometry, lambda_mm: F2) -> F2:
-    """Ball centre for commands of the drives: where three spheres meet, above their centres.
+    """Return the ball centre for commands of the drives: the intersection of three spheres, above their centres.
 
-    Exact for legs that differ from each other; for equal dz it is eq (4) with the factor 1/2 that the paper lost (math.md 3, K (4)).
+    It is exact for different legs. For equal dz it is (4) with the factor 1/2 that the paper lost.
 
     Parameters
     ----------
@@ -198,7 +192,7 @@ def forward(geometry: Geometry, lambda_mm: F2) -> F2:
     u = centre[:, 1:] - centre[:, :1]
     collinear = _collinear(geometry, u)
     line = collinear[1]
-    u = np.where(line[:, None, None], np.eye(3)[:2], u)  # any plane: so that the other poses can still be judged
+    u = np.where(line[:, None, None], np.eye(3)[:2], u)  # any plane will do; the other poses are still judged
     # In the plane of the centres: 2 u_i . q = |u_i|^2 + l_1^2 - l_i^2, q from the first centre.
     square = 0.5 * ((u**2).sum(axis=2) + geometry.l_mm[0] ** 2 - geometry.l_mm[1:] ** 2)
     gram = u @ np.swapaxes(u, 1, 2)
@@ -213,9 +207,9 @@ def forward(geometry: Geometry, lambda_mm: F2) -> F2:
 
 
 def forward_as_printed(geometry: Geometry, lambda_mm: F2) -> F2:
-    """Eq (4) exactly as Kwon printed it, without the factor 1/2: WRONG, for comparison only (math.md 3, K (4)).
+    """Evaluate (4) exactly as Kwon printed it, without the factor 1/2: WRONG, for comparison only.
 
-    Parameters and result as `forward`; of the legs' differences the printed equation knows only R, r and the angles.
+    Parameters and result as in `forward`, but only R, r and the angles may differ between legs.
 
     Raises
     ------
@@ -234,9 +228,9 @@ def forward_as_printed(geometry: Geometry, lambda_mm: F2) -> F2:
 
 
 def inverse(geometry: Geometry, p_mm: F2, branch: Branch = "outside") -> F2:
-    """Commands of the drives that bring the ball centre to a position: (9)-(11).
+    """Return the commands of the drives that bring the ball centre to a position, (9)-(11).
 
-    The paper calls (9) a forward solution; it is the inverse one, and its root is right for base joints outside (math.md 3, K (9), (11)).
+    Erratum: the paper calls (9) a forward solution. Its sign of the root holds for the branch ``outside``.
 
     Parameters
     ----------
@@ -285,7 +279,7 @@ def inverse(geometry: Geometry, p_mm: F2, branch: Branch = "outside") -> F2:
 
 
 def links(geometry: Geometry, lambda_mm: F2, p_mm: F2) -> F3:
-    """Link vectors from the lower to the upper joint, s2 - s1 of (2), (3), shape (n, 3 legs, 3), mm; eq (1) demands the length l.
+    """Return the link vectors from the lower to the upper joint, s2 - s1 of (2), (3), shape (n, 3 legs, 3), mm; (1): their length is l.
 
     Parameters
     ----------
@@ -305,12 +299,12 @@ def links(geometry: Geometry, lambda_mm: F2, p_mm: F2) -> F3:
 
 
 def link_determinant(vectors_mm: F3) -> F1:
-    """det[l1 l2 l3] of unit link vectors, shape (n,): 0 is a parallel singularity, +-1 three perpendicular links."""
+    """Return det[l1 l2 l3] of the unit link vectors, shape (n,): 0 at a parallel singularity, +-1 for perpendicular links."""
     return np.asarray(np.linalg.det(vectors_mm / np.linalg.norm(vectors_mm, axis=2)[..., None]))
 
 
 def jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> F3:
-    """dP/dlambda, shape (n, 3 coordinates, 3 legs): l_i . dP = -(l_i . b_i) dlambda_i (math.md 6).
+    """Return dP/dlambda, shape (n, 3 coordinates, 3 legs), from l_i . dP = -(l_i . b_i) dlambda_i, b_i the direction of the rail.
 
     Parameters
     ----------
@@ -330,12 +324,12 @@ def jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> F3:
 
 
 def inverse_jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> F3:
-    """dlambda/dP, shape (n, 3 legs, 3 coordinates).
+    """Return dlambda/dP, shape (n, 3 legs, 3 coordinates).
 
     Raises
     ------
     SerialSingularity
-        A link stands perpendicular to its rail.
+        A link is perpendicular to its rail.
     """
     v = links(geometry, lambda_mm, forward(geometry, lambda_mm) if p_mm is None else p_mm)
     along_rail = (v * geometry.rails).sum(axis=2)
@@ -345,7 +339,7 @@ def inverse_jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) 
 
 
 def solve_links(vectors_mm: F3, pull: F2) -> F3:
-    """Move of the ball centre, shape (n, 3, 3 legs), for one leg's constraint changed at a time: l_i . dP = pull_i.
+    """Solve l_i . dP = pull_i for the move dP of the ball centre, one leg at a time; shape (n, 3, 3 legs).
 
     Raises
     ------
@@ -360,7 +354,7 @@ def solve_links(vectors_mm: F3, pull: F2) -> F3:
 
 
 def square_commands(geometry: Geometry, half_mm: float, z_mm: float) -> tuple[float, float]:
-    """Smallest and largest command needed at the corners of the square |x|, |y| <= half at one height.
+    """Return the smallest and largest command at the corners of the square |x|, |y| <= half at one height.
 
     Raises
     ------
@@ -373,7 +367,7 @@ def square_commands(geometry: Geometry, half_mm: float, z_mm: float) -> tuple[fl
 
 
 def _collinear(geometry: Geometry, u: F3) -> Fault:
-    """Seen from above: that is the determinant of (4), scaled by the longer distance."""
+    """Find poses whose sphere centres lie on a line seen from above, by the scaled determinant of (4)."""
     det = u[:, 0, 0] * u[:, 1, 1] - u[:, 0, 1] * u[:, 1, 0]
     longest = (u[..., :2] ** 2).sum(axis=2).max(axis=1)
     bad = np.abs(det) <= SINGULAR * np.maximum(longest, SINGULAR * geometry.l_mm[0] ** 2)
@@ -389,7 +383,7 @@ def _flat(geometry: Geometry, bad: NDArray[np.bool_]) -> Fault:
 
 
 def _up(u: F3) -> F2:
-    """Unit normal of the plane of the sphere centres, the upward one; along z where they lie on a line and span no plane."""
+    """Return the upward unit normal of the plane of the sphere centres; z if they lie on a line."""
     normal = np.cross(u[:, 0], u[:, 1])
     length = np.linalg.norm(normal, axis=1)[:, None]
     unit = np.where(length > 0.0, normal / np.where(length > 0.0, length, 1.0), np.array([0.0, 0.0, 1.0]))
@@ -397,7 +391,7 @@ def _up(u: F3) -> F2:
 
 
 def _above_centres(geometry: Geometry, lambda_mm: F2, p_mm: F2) -> F1:
-    """Height of positions above the plane of the sphere centres, shape (n,): h itself when all dz are equal."""
+    """Return the height of positions above the plane of the sphere centres, shape (n,); h if all dz are equal."""
     centre = geometry.centres_mm(lambda_mm)
     if (geometry.dz_mm == geometry.dz_mm[0]).all():
         level: F1 = p_mm[:, 2] - centre[:, 0, 2]
@@ -406,11 +400,11 @@ def _above_centres(geometry: Geometry, lambda_mm: F2, p_mm: F2) -> F1:
 
 
 def parameter_jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> dict[str, F3]:
-    """dP/d(parameter of a leg) at fixed commands, for every name of PER_LEG.
+    """Return dP/d(parameter of a leg) at fixed commands, for every name of PER_LEG.
 
-    From l.l = l^2 for each leg: l.dP = l dl + l.b dR - l.p dr + lambda_hat l.t_b dthb - r_hat l.t_p dthp + l_z dz, with b, p the unit
-    vectors of rail and corner and t_b, t_p those turned by +90 degrees about z (math.md 6, there for theta_p = theta_b, so p = b).
-    An offset of the command is dR with the sign reversed; errors of theta, l_up, l_dw, l_e act through R, r and dz: no column of their own.
+    For each leg, l.l = l^2 gives l.dP = l dl + l.b dR - l.p dr + lambda_hat l.t_b dthb - r_hat l.t_p dthp + l_z dz. b and p are the unit
+    vectors of rail and corner, t_b and t_p the same turned by +90 degrees about z. An offset of the command acts as -dR; errors of theta,
+    l_up, l_dw and l_e act through R, r and dz and have no columns.
 
     Parameters
     ----------
@@ -443,16 +437,16 @@ def parameter_jacobian(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None
 
 
 def parameter_names() -> tuple[str, ...]:
-    """Names of the 18 columns of `parameter_design`: R1 R2 R3 r1 .. dz3."""
+    """Return the names of the 18 columns of `parameter_design`: R1 R2 R3 r1 .. dz3."""
     return tuple(f"{name}{leg}" for name in PER_LEG for leg in (1, 2, 3))
 
 
 def parameter_design(geometry: Geometry, lambda_mm: F2, p_mm: F2 | None = None) -> F3:
-    """`parameter_jacobian` side by side, shape (n, 3 coordinates, 18)."""
+    """Return `parameter_jacobian` as one array, shape (n, 3 coordinates, 18)."""
     parts = parameter_jacobian(geometry, lambda_mm, p_mm)
     return np.concatenate([parts[name] for name in PER_LEG], axis=2)
 
 
 def _turned(unit: F2) -> F2:
-    """Turned by +90 degrees about z."""
+    """Turn unit vectors by +90 degrees about z."""
     return np.stack([-unit[:, 1], unit[:, 0], np.zeros(unit.shape[0])], axis=1)

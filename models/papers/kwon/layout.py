@@ -1,7 +1,4 @@
-"""The 20 cubic monomials of the response surface in the order of Kwon's (27), and what a set of measured points can tell about them.
-
-Rank of the monomials, planes and heights of the points, terms that can be fitted.
-"""
+"""The 20 cubic monomials of the response surface in the order of Kwon's (27), and which of them a set of measured points determines."""
 
 from __future__ import annotations
 
@@ -18,34 +15,33 @@ CUBIC: tuple[Exponents, ...] = (
     *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
     *((1, 1, 1), (2, 1, 0), (2, 0, 1), (1, 2, 0), (1, 0, 2), (0, 2, 1), (0, 1, 2), (3, 0, 0), (0, 3, 0), (0, 0, 3)),
 )
-"""Exponents of X, Y, Z for beta_0 .. beta_19; beta_16 belongs to Y Z^2, the paper prints Z Y^2 twice (math.md 3, K (27))."""
+"""Exponents of X, Y, Z for beta_0 .. beta_19. Erratum: beta_16 belongs to Y Z^2, but the paper prints Z Y^2 twice."""
 
 IN_PLANE: tuple[Exponents, ...] = tuple(
     (i, j, 0) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2), (2, 1), (1, 2), (3, 0), (0, 3))
 )
 """The ten monomials of X and Y."""
 MOST_PLANES = 3
-"""Four planes carry a full cubic, fewer do not (math.md 6)."""
+"""Four planes carry a full cubic, fewer do not."""
 NO_SLOPE = 1e-12
-"""Below this a slope is the rounding of its computation."""
+"""A smaller slope is rounding."""
 STEEPEST = 1.0 + 1e-9
-"""Planes are described along an axis that they face: no slope above 1. Every plane has such an axis."""
+"""Largest slope of a plane over the axis that it faces; every plane has an axis with slopes up to 1."""
 RANK_TOLERANCE = 1e-3
-"""Singular values below this share of the largest do not count: a coefficient would be a thousand times worse than a reading."""
+"""Singular values below this share of the largest do not count: the coefficient would be a thousand times less certain than a reading."""
 FLATNESS = 5e-3
-"""How far points may be off a plane and still lie on it, by default: this share of the second largest half width of X, Y, Z (of a square
-of +-1 mm: 5 um). A stage of 1 um leaves commanded positions off their plane, and what so little height tells is worth nothing: an error
-that changes by 10 um per mm of height changes by 0.05 um over it."""
+"""Default tolerance of a plane, as a share of the second largest half width of X, Y, Z: 5 um for a square of +-1 mm. A stage with errors of
+1 um leaves its plane, but so little height tells nothing: an error of 10 um per mm of height changes by 0.05 um over it."""
 
 
 def term_name(term: Exponents) -> str:
-    """Usual notation: ``1``, ``X``, ``X Y^2``."""
+    """Return a monomial in usual notation: ``1``, ``X``, ``X Y^2``."""
     parts = [f"{letter}^{k}" if k > 1 else letter for letter, k in zip("XYZ", term, strict=True) if k]
     return " ".join(parts) or "1"
 
 
 def regressors(points_mm: F2, terms: tuple[Exponents, ...]) -> F2:
-    """Values of monomials at points: the matrix P_e that (28) needs (the paper prints [X, Y, Z] only, math.md 3, K (28)).
+    """Return the values of monomials at points: the matrix P_e in (28), for which the paper prints only [X, Y, Z].
 
     Parameters
     ----------
@@ -64,10 +60,10 @@ def regressors(points_mm: F2, terms: tuple[Exponents, ...]) -> F2:
 
 
 def term_matrix(terms: tuple[Exponents, ...], shift_mm: F1, scale_mm: F1) -> F2:
-    """Matrix from coefficients of centred and scaled monomials to those of raw ones.
+    """Return the matrix M from coefficients of centred and scaled monomials to those of raw ones.
 
-    With u = (x - shift) / scale, a polynomial sum c_t u^t equals sum (M c)_s x^s over the same terms, for a set of terms that contains
-    every divisor of each of its terms (CUBIC, IN_PLANE and CUBIC up to a power of Z do).
+    With u = (x - shift) / scale, sum c_t u^t equals sum (M c)_s x^s over the same terms. The set of terms must contain every divisor of
+    each term, as CUBIC, IN_PLANE and CUBIC up to a power of Z do.
 
     Parameters
     ----------
@@ -87,21 +83,21 @@ def term_matrix(terms: tuple[Exponents, ...], shift_mm: F1, scale_mm: F1) -> F2:
     return out
 
 
-# Whether points lie on one plane or on two or three parallel ones: what a grid of commands gives, horizontal, tilted or upright.
+# Grids of commands lie on one plane, or on two or three parallel ones: horizontal, tilted or upright.
 
 
 @dataclass(frozen=True)
 class Planes:
-    """Parallel planes, one height each.
+    """Parallel planes.
 
     Attributes
     ----------
     axis : int
         Coordinate that the planes face: 2 for Z, 1 for Y, 0 for X.
     slope : array, shape (3,)
-        Rise of that coordinate per mm of each other one; 0 for the axis itself.
+        Slope of the planes over the other two coordinates; 0 for the axis itself.
     levels_mm : tuple of float
-        Rising values of coordinate - slope . point, 1 to 3 of them.
+        Offset (coordinate - slope . point) of each plane, rising, 1 to 3 of them.
     """
 
     axis: int
@@ -109,12 +105,12 @@ class Planes:
     levels_mm: tuple[float, ...]
 
     def offset_mm(self, points_mm: F2) -> F1:
-        """Coordinate - slope . point, shape (n,): on a plane it is that plane's level."""
+        """Return coordinate - slope . point, shape (n,); for points on a plane it is the level of the plane."""
         result: F1 = points_mm[:, self.axis] - points_mm @ self.slope
         return result
 
     def snapped(self, points_mm: F2) -> F2:
-        """Points moved along the axis onto the nearest plane, shape (n, 3)."""
+        """Return the points moved along the axis onto the nearest plane, shape (n, 3)."""
         levels = np.asarray(self.levels_mm)
         nearest = levels[np.abs(self.offset_mm(points_mm)[:, None] - levels).argmin(axis=1)]
         moved = points_mm.copy()
@@ -128,18 +124,18 @@ class Planes:
 
     @property
     def tilt_text(self) -> str:
-        """Text of the slope, empty for planes square to the axis."""
+        """Text of the slope; empty for planes perpendicular to the axis."""
         return "".join(f" {s:+.4g} {letter}" for s, letter in zip(self.slope, "XYZ", strict=True) if s)
 
 
 def parallel_planes(points_mm: F2, tolerance_mm: float) -> Planes | None:
-    """The fewest parallel planes (at most 3) on which the points lie, or None.
+    """Return the fewest parallel planes (at most 3) on which the points lie, or None.
 
     Parameters
     ----------
     points_mm : array, shape (n, 3)
     tolerance_mm : float
-        How far a point may be off its plane along the axis; neighbouring planes must leave a gap of more than twice that.
+        Largest distance of a point from its plane along the axis. The gap between neighbouring planes must be more than twice that.
     """
     for count in range(1, MOST_PLANES + 1):
         for axis in (2, 1, 0):
@@ -151,10 +147,10 @@ def parallel_planes(points_mm: F2, tolerance_mm: float) -> Planes | None:
 
 
 def _common_slope(points_mm: F2, axis: int, count: int) -> F1:
-    """Slope that ``count`` parallel planes would have.
+    """Return the slope s of ``count`` parallel planes c = s.p + w_k, c being the coordinate of the axis.
 
-    On planes c = s.p + w_k the product of (c - s.p - w_k) vanishes: c^count is a combination of the monomials with lower powers of c, in
-    which (other coordinate) c^(count - 1) has the coefficient count x slope.
+    On the planes the product of (c - s.p - w_k) over k vanishes. So c^count is a combination of monomials with lower powers of c, in which
+    (other coordinate) c^(count - 1) has the coefficient count x slope.
     """
     middle = points_mm.mean(axis=0)
     size = float(np.abs(points_mm - middle).max()) or 1.0
@@ -173,7 +169,7 @@ def _monomial(powers: dict[int, int]) -> Exponents:
 
 
 def _levels(offset_mm: F1, tolerance_mm: float, count: int) -> tuple[float, ...]:
-    """Middle of each group of values, if they form ``count`` groups no wider than twice the tolerance and apart by more; else empty."""
+    """Return the middle of each group if the values form ``count`` groups within, and gaps above, twice the tolerance; else empty."""
     values = np.sort(offset_mm)
     groups = np.split(values, np.flatnonzero(np.diff(values) > 2.0 * tolerance_mm) + 1)
     if len(groups) != count or any(g[-1] - g[0] > 2.0 * tolerance_mm for g in groups):
@@ -183,23 +179,23 @@ def _levels(offset_mm: F1, tolerance_mm: float, count: int) -> tuple[float, ...]
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of points, and the terms they allow.
+    """Arrangement of points, and the terms that it allows to fit.
 
     Attributes
     ----------
     n : int
-        Points.
+        Number of points.
     rank : int
-        Of the 20 cubic monomials on centred and scaled coordinates: 10 on one plane, 16 on two, 19 on three, 20 on four (math.md 6).
+        Rank of the 20 cubic monomials on centred and scaled coordinates: 10 on one plane, 16 on two, 19 on three, 20 on four.
     planes : Planes or None
-        The one, two or three parallel planes on which all points lie, horizontal, tilted or upright; None when they do not.
+        The one, two or three parallel planes on which all points lie, if any.
     low_mm, high_mm : array, shape (3,)
         Range of X, Y, Z.
     terms : tuple of (i, j, k)
-        Monomials to fit: on one plane facing Z the ten of X, Y; on h parallel planes those with a power of the coordinate that they face
-        below h; else all 20. Points on other surfaces (crossing planes, a sphere) get all 20, which they do not determine.
+        Monomials to fit: on h parallel planes, those with a power below h of the coordinate that the planes face (on one plane facing Z the
+        ten of X, Y); else all 20. Points on other surfaces (crossing planes, a sphere) get all 20 but do not determine them.
     tolerance_mm : float
-        How far a point may be off a plane and still lie on it.
+        Largest distance of a point from its plane.
     """
 
     n: int
@@ -221,7 +217,7 @@ class Layout:
 
     @property
     def heights_mm(self) -> tuple[float, ...]:
-        """Different Z of the points, where they are at most 3 and no plane is tilted; empty otherwise."""
+        """The Z of the horizontal planes on which all points lie; empty without such planes."""
         return self.planes.levels_mm if self.planes and self.planes.axis == 2 and not self.planes.slope.any() else ()
 
     @property
@@ -243,15 +239,14 @@ class Layout:
 
 
 def layout(points_mm: F2, tolerance_mm: float | None = None) -> Layout:
-    """Analyse the points; values are not needed.
+    """Analyse where points lie and which terms they allow to fit.
 
     Parameters
     ----------
     points_mm : array, shape (n, 3)
         Where the errors were measured (commanded positions).
     tolerance_mm : float, optional
-        How far a point may be off a plane and still lie on it; FLATNESS times the second largest half width when not given. No two points
-        of one plane are farther apart along its axis than twice the tolerance.
+        Largest distance of a point from its plane along the axis; default: FLATNESS times the second largest half width.
 
     Raises
     ------
@@ -271,17 +266,16 @@ def layout(points_mm: F2, tolerance_mm: float | None = None) -> Layout:
 
 
 def rank_of(points_mm: F2, terms: tuple[Exponents, ...] = CUBIC) -> int:
-    """Rank of monomials at points: singular values above RANK_TOLERANCE of the largest, on centred and scaled coordinates."""
+    """Return the rank of monomials at points, on centred and scaled coordinates with RANK_TOLERANCE."""
     shift, scale = centring(points_mm)
     s = np.linalg.svd(regressors((points_mm - shift) / scale, terms), compute_uv=False)
     return int((s > RANK_TOLERANCE * s[0]).sum())
 
 
 def centring(points_mm: F2) -> tuple[F1, F1]:
-    """Middle and scale of the points along X, Y, Z, each shape (3,).
+    """Return the middle and the scale of the points along X, Y, Z, shape (3,) each.
 
-    The scale is the half width, but no less than FLATNESS of the second largest: a spread that is flat for the others must not be blown up
-    to their size.
+    The scale is the half width, but at least FLATNESS times the second largest half width, so that a tiny width is not magnified.
     """
     low, high = points_mm.min(axis=0), points_mm.max(axis=0)
     half = 0.5 * (high - low)

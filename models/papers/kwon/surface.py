@@ -1,6 +1,6 @@
 """Cubic response surface of one error component: fit, coefficients, analysis of variance, prediction with uncertainty.
 
-Source: Kwon 2004 (26)-(28), math.md 6. The degrees of freedom follow from the points.
+Source: Kwon 2004 (26)-(28). The degrees of freedom follow from the points.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from abbe.models.papers.kwon.layout import RANK_TOLERANCE, Exponents, Layout, ce
 from abbe.models.solvers.least_squares import analyse
 
 ROUNDING = 1000.0 * float(np.finfo(np.float64).eps)
-"""Scatter below this share of the root mean square of the values is what the computation itself leaves (2e-13; 3e-11 mm of 150 mm)."""
+"""Scatter below this share of the rms of the values is rounding of the computation (2e-13, or 3e-11 mm for 150 mm)."""
 MARGIN = 0.1
-"""How far outside the measured range a surface may be asked for by default, as a share of the half width (of +-1 mm: 0.1 mm)."""
+"""Default margin for predictions outside the measured range, as a share of the half width (0.1 mm for +-1 mm)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Anova:
-    """Table 2 corrected: regression and residual about the mean.
+    """Analysis of variance about the mean, as in Table 2 with its errata corrected.
 
     Attributes
     ----------
@@ -34,10 +34,10 @@ class Anova:
     df_reg, df_res : int
         rank - 1 and N - rank.
     f, p : float
-        (SSR/df_reg) / (SSE/df_res) and the probability of a larger F by chance. The paper calls F the ratio of residual to regression:
-        it is the other way round. Infinite and 0 for no residual at all; both NaN where the values do not vary (`undefined`).
+        (ss_reg/df_reg) / (ss_res/df_res), and the probability of a larger F by chance. The paper wrongly calls F the ratio of residual to
+        regression. Without residual they are infinite and 0; if the values do not vary both are NaN (`undefined`).
     r2 : float
-        SSR / (SSR + SSE); 0 where the values do not vary.
+        ss_reg / (ss_reg + ss_res); 0 if the values do not vary.
     """
 
     ss_reg: float
@@ -56,32 +56,32 @@ class Anova:
 
     @property
     def ms_res(self) -> float:
-        """Mean square of the residual: the remaining variance."""
+        """Mean square (variance) of the residual."""
         return self.ss_res / self.df_res
 
     @property
     def residual_sd(self) -> float:
-        """Remaining standard deviation, in the unit of the values."""
+        """Standard deviation of the residual, in the unit of the values."""
         return float(np.sqrt(self.ms_res))
 
     @property
     def undefined(self) -> str:
-        """Reason why there is no F, in one line; empty if there is one."""
-        return "the values do not vary beyond rounding: there is nothing to explain, F is 0/0" if np.isnan(self.f) else ""
+        """Reason why F is undefined; empty if it is not."""
+        return "the values do not vary beyond rounding, so F is 0/0" if np.isnan(self.f) else ""
 
     def critical(self, alpha: float = 0.01) -> float:
-        """F that chance exceeds with probability alpha."""
+        """Return the F that chance exceeds with probability alpha."""
         return critical_f(self.df_reg, self.df_res, alpha)
 
     def significant(self, alpha: float = 0.01) -> bool:
-        """Whether the regression explains more than chance would, at the level alpha; never where F is `undefined`."""
+        """Tell whether the regression explains more than chance at the level alpha; False if F is `undefined`."""
         return bool(self.p < alpha)
 
 
 def anova(values: F1, fitted: F1, rank: int) -> Anova:
-    """Analysis of variance of a least-squares fit that contains a constant.
+    """Return the analysis of variance of a least-squares fit that contains a constant.
 
-    Sums that rounding alone could make, below n (ROUNDING x root mean square of the values)^2, are zero.
+    Sums below n (ROUNDING x rms of the values)^2 are rounding and count as zero.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def anova(values: F1, fitted: F1, rank: int) -> Anova:
     Raises
     ------
     SurfaceNotDetermined
-        rank is below 2 or leaves no residual degree of freedom.
+        The rank is below 2 or leaves no residual degree of freedom.
     ValueError
         Shapes differ or a value is not finite.
     """
@@ -109,18 +109,18 @@ def anova(values: F1, fitted: F1, rank: int) -> Anova:
 
 
 def anova_from_sums(ss_reg: float, ss_res: float, df_reg: int, df_res: int, ss_tot: float | None = None) -> Anova:
-    """Analysis of variance from given sums, e.g. printed ones; the total is their sum when it is not given.
+    """Return the analysis of variance of given sums, e.g. printed ones; the default total is their sum.
 
     Raises
     ------
     SurfaceNotDetermined
-        A number of degrees of freedom is below 1.
+        Degrees of freedom are below 1.
     ValueError
         A sum is negative or not finite.
     """
     if df_reg < 1 or df_res < 1:
         raise SurfaceNotDetermined(
-            f"analysis of variance: {df_reg} regression and {df_res} residual degrees of freedom, both must be 1 or more"
+            f"analysis of variance: {df_reg} degrees of freedom of the regression and {df_res} of the residual, both must be 1 or more"
         )
     if not (np.isfinite([ss_reg, ss_res]).all() and ss_reg >= 0.0 and ss_res >= 0.0):
         raise ValueError("analysis of variance: sums of squares must be finite and not negative")
@@ -133,7 +133,7 @@ def anova_from_sums(ss_reg: float, ss_res: float, df_reg: int, df_res: int, ss_t
 
 
 def critical_f(df_reg: int, df_res: int, alpha: float = 0.01) -> float:
-    """F(df_reg, df_res, alpha): the value that chance exceeds with probability alpha."""
+    """Return F(df_reg, df_res, alpha), the value that chance exceeds with probability alpha."""
     if not 0.0 < alpha < 1.0 or df_reg < 1 or df_res < 1:
         raise ValueError(f"critical F: alpha {alpha:g} must lie in (0, 1) and {df_reg}, {df_res} degrees of freedom be 1 or more")
     return float(scipy.special.fdtri(df_reg, df_res, 1.0 - alpha))
@@ -141,12 +141,12 @@ def critical_f(df_reg: int, df_res: int, alpha: float = 0.01) -> float:
 
 @dataclass(frozen=True)
 class SurfacePrediction:
-    """Surface at some points.
+    """Prediction of a surface at points.
 
     Attributes
     ----------
     value, u_surface, u_reading : array, shape (n,)
-        Value; its standard uncertainty; standard uncertainty of one new reading there (surface and residual scatter together).
+        Value, its standard uncertainty, and that of a new reading there, which adds the residual scatter.
     """
 
     value: F1
@@ -156,12 +156,12 @@ class SurfacePrediction:
 
 @dataclass(frozen=True)
 class SphereSurface:
-    """A fitted surface.
+    """A fitted cubic response surface.
 
     Attributes
     ----------
     layout : Layout
-        Where the points lie: plane, rank, terms.
+        Planes of the points, rank and terms.
     shift_mm, scale_mm : array, shape (3,)
         Centre and half width used for the fit.
     scaled : array, shape (p,)
@@ -188,7 +188,7 @@ class SphereSurface:
 
     @property
     def coefficients(self) -> F1:
-        """Coefficients of the raw monomials of X, Y, Z in mm, shape (p,). On planes they hold on and between those planes only."""
+        """Coefficients of the raw monomials of X, Y, Z in mm, shape (p,); if the points lie on planes, valid on and between them only."""
         value: F1 = term_matrix(self.terms, self.shift_mm, self.scale_mm) @ self.scaled
         return value
 
@@ -199,14 +199,14 @@ class SphereSurface:
         return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", m, self.unscaled_cov, m) * self.anova.ms_res))
 
     def predict(self, points_mm: F2, margin: float = MARGIN) -> SurfacePrediction:
-        """Value and uncertainty at points.
+        """Return value and uncertainty at points.
 
         Parameters
         ----------
         points_mm : array, shape (n, 3)
         margin : float
-            How far X and Y (Z too, where the planes face X or Y) may lie outside the measured range, as a share of its half width. There
-            is not a margin across the planes or in height: nothing was measured there.
+            Allowed distance of X and Y outside the measured range, as a share of its half width (Z too, if the planes face X or Y). There
+            is no margin across the planes or in height, where nothing was measured.
 
         Raises
         ------
@@ -248,11 +248,11 @@ class SphereSurface:
 
 
 def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) -> SphereSurface:
-    """Least-squares cubic surface with the terms that the points can carry.
+    """Fit a cubic surface by least squares, with the terms that the planes of the points allow.
 
-    Points on one plane Z = a + bX + cY give the ten monomials of X and Y and the plane is reported; 20 coefficients of (27) have only
-    rank 10 there and P'P of (28) has no inverse (math.md 3, K (28)). Two or three parallel planes, tilted or upright ones too, give 16 or
-    19 terms; the planes alone decide that. Too few lines within a plane (X^3 on three columns) are refused, not fitted with fewer terms.
+    Points on one plane Z = a + bX + cY allow the ten monomials of X and Y: there the 20 coefficients of (27) have rank 10, and P'P of (28)
+    has no inverse. Two or three parallel planes, also tilted or upright ones, allow 16 or 19 terms. Too few lines within a plane (X^3 on
+    three columns) are refused.
 
     Parameters
     ----------
@@ -260,13 +260,13 @@ def fit_surface(points_mm: F2, values: F1, tolerance_mm: float | None = None) ->
     values : array, shape (n,)
         One error component.
     tolerance_mm : float, optional
-        How far a point may be off a plane and still lie on it; default as in `layout`: 1/200 of the second largest half width.
+        Largest distance of a point from its plane; default as in `layout`.
 
     Raises
     ------
     SurfaceNotDetermined
-        There are not more points than terms, or the points do not determine a combination of terms (its singular value is below
-        ``RANK_TOLERANCE`` times the largest one); the error lists the terms that cannot be separated.
+        There are not more points than terms, or the points do not determine a combination of terms (singular value below RANK_TOLERANCE
+        times the largest); the error lists these terms.
     ValueError
         Shapes differ or a value is not finite.
     """

@@ -1,1 +1,1 @@
-"""Pahk 1995: measurement off the origin, random errors, volumetric map and space diagonals (math.md 2)."""
+"""Pahk 1995, cited as P (equation): measurement off the origin, random errors, volumetric map and space diagonals."""

@@ -1,7 +1,7 @@
-"""Length deviation of lines through the volume, the four space diagonals first, with random error (math.md 2.2; P section 4).
+"""Length deviation of the four space diagonals and of other lines through the volume, with random error (P section 4).
 
-Section 4 prints three squareness errors and four diagonal deviations of two machines; the curves of all other errors are lost.
-`best_assignment` tries whether the printed diagonals can come from squareness only (math.md 8).
+Section 4 prints three squareness errors and four diagonal deviations of two machines, but not the curves of the other errors.
+`best_assignment` tests whether squareness alone can explain the printed diagonals.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ class LengthDeviation:
 
 
 def length_deviation(ends_mm: F2, deviations_mm: F2) -> LengthDeviation:
-    """Deviation of a length from the deviations of its two ends.
+    """Return the deviation of a length from the deviations of its two ends.
 
     Parameters
     ----------
     ends_mm, deviations_mm : arrays, shape (2, 3)
-        Start and end: nominal positions and actual minus nominal.
+        Nominal positions of start and end, and their deviations (actual minus nominal).
 
     Raises
     ------
@@ -55,12 +55,12 @@ def length_deviation(ends_mm: F2, deviations_mm: F2) -> LengthDeviation:
         raise ValueError("length: expected two different ends and their deviations, each of shape (2, 3)")
     way, change = ends[1] - ends[0], off[1] - off[0]
     actual, nominal = float(np.linalg.norm(way + change)), float(np.linalg.norm(way))
-    # |w + c| - |w| = c (2w + c) / (|w + c| + |w|): no two metres are subtracted to get a micrometre.
+    # |w + c| - |w| = c (2w + c) / (|w + c| + |w|), without the difference of two long lengths.
     return LengthDeviation(float(way @ change) / nominal, float(change @ (2.0 * way + change)) / (actual + nominal))
 
 
 def motions_length(kind: PahkType, ends_mm: F2, motions: F3, probe_mm: F1 | None = None, form: Form = "first") -> LengthDeviation:
-    """Deviation of a length of a machine whose ISO motions at the two ends are known, shape (2, 3 axes, 6)."""
+    """Return the deviation of a length from the machine's ISO motions at its two ends, shape (2, 3 axes, 6)."""
     ends = np.asarray(ends_mm, dtype=np.float64)
     machine = pahk_machine(kind, np.array([[0.0, 1.0]] * 3), probe_mm)
     return length_deviation(ends, chain_deviation_mm(machine, ends, motions, form))
@@ -69,7 +69,7 @@ def motions_length(kind: PahkType, ends_mm: F2, motions: F3, probe_mm: F1 | None
 def space_diagonals(
     kind: PahkType, tables: ParameterTables, probe_mm: F1 | None = None, *, box_mm: F2 | None = None, form: Form = "first"
 ) -> dict[str, LengthDeviation]:
-    """Length deviations of the four space diagonals.
+    """Return the length deviations of the four space diagonals.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def space_diagonals(
     box_mm : array, shape (3, 2), optional
         Default: the whole range of the tables.
     form : "first", "vector", "zyx" or "small"
-        How the deviations of the ends come about.
+        Kinematics of the deviations at the ends (`Form`).
 
     Returns
     -------
@@ -98,18 +98,18 @@ def space_diagonals(
 
 
 def length_random_error_mm(kind: PahkType, ends_mm: F2, random: tuple[RandomErrors, RandomErrors], probe_mm: F1 | None = None) -> float:
-    """Random error of a length: n . (deviation at the end - at the start) differentiated with respect to every variable.
+    """Return the random error of a length, n . (deviation at the end - deviation at the start).
 
-    One variable with one combined coefficient: each squareness, and each function of an axis that stands at the same place at both ends.
-    Two variables: a function at two different positions, each end with its own R. Functions that are zero by definition at one end (at
-    their reference) have R = 0 there: say so in ``random``.
+    Each squareness, and each function of an axis that has the same position at both ends, is one variable with one combined coefficient.
+    A function at two positions is two variables, each with the R of its end;
+    R must be 0 where a function is zero by definition.
 
     Parameters
     ----------
     ends_mm : array, shape (2, 3)
         Commanded start and end.
     random : two RandomErrors
-        At start and end, in the same coverage, with the same squareness; equal also for axes that stand still.
+        At start and end, with the same coverage; equal for squareness and for axes at rest.
     probe_mm : array, shape (3,), optional
 
     Returns
@@ -128,7 +128,7 @@ def length_random_error_mm(kind: PahkType, ends_mm: F2, random: tuple[RandomErro
     shared = shared_variables(ends)
     start, end = random[0].vector, random[1].vector
     if random[0].coverage != random[1].coverage or not np.array_equal(start[shared], end[shared]):
-        raise ValueError("length: both ends need the same coverage, and one value for squareness and for functions of resting axes")
+        raise ValueError("length: both ends need the same coverage, and the same R for squareness and for functions of axes at rest")
     way = ends[1] - ends[0]
     gain = np.einsum("i,nip->np", way / np.linalg.norm(way), parameter_jacobian(kind, ends, probe_mm))
     one = (gain[1] - gain[0]) * end
@@ -137,13 +137,13 @@ def length_random_error_mm(kind: PahkType, ends_mm: F2, random: tuple[RandomErro
 
 
 def shared_variables(ends_mm: F2) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which of the 21 parameters are the same variable at both ends of a length, shape (21,): squareness, and functions of axes at rest."""
+    """Return which of the 21 parameters are one variable for both ends of a length, shape (21,): squareness, functions of axes at rest."""
     rest = np.repeat(ends_mm[0] == ends_mm[1], 3)
     return np.concatenate([rest, rest, np.ones(3, dtype=bool)])
 
 
 def squareness_diagonals_mm(type_name: str, volume_mm: F1, squareness_rad: F1) -> dict[str, float]:
-    """Length deviations of the four body diagonals when squareness is the only error.
+    """Return the length deviations of the four body diagonals if squareness is the only error.
 
     Parameters
     ----------
@@ -157,12 +157,12 @@ def squareness_diagonals_mm(type_name: str, volume_mm: F1, squareness_rad: F1) -
     Returns
     -------
     dict
-        By diagonal (``ppp``, ``npp``, ``pnp``, ``ppn``), mm, actual minus nominal, first order: n . (deviation at the end - at the start).
+        By diagonal (``ppp``, ``npp``, ``pnp``, ``ppn``): actual minus nominal, mm, first order.
 
     Raises
     ------
     ValueError
-        No such type, or wrong shapes.
+        The type does not exist, or a shape is wrong.
     """
     kind = pahk_type(type_name)
     box = np.stack([np.zeros(3), np.asarray(volume_mm, dtype=np.float64)], axis=1)
@@ -175,9 +175,10 @@ def squareness_diagonals_mm(type_name: str, volume_mm: F1, squareness_rad: F1) -
 
 
 def best_assignment(type_name: str, volume_mm: F1, squareness_rad: F1, diagonals_mm: Sequence[float]) -> tuple[float, dict[str, float]]:
-    """Smallest misfit between four diagonal deviations of unknown order and three squareness errors.
+    """Return the smallest misfit between four diagonal deviations in unknown order and three squareness errors.
 
-    All 24 orders and both senses of angle are tried; every trial gives its squareness by the scale-free contrasts (math.md 5.3).
+    It tries all 24 orders and both signs of the angles. Each trial computes squareness by the scale-free contrasts
+    (`abbe.models.solvers.step_diagonal.squareness_contrast`).
 
     Parameters
     ----------
@@ -189,7 +190,7 @@ def best_assignment(type_name: str, volume_mm: F1, squareness_rad: F1, diagonals
     Returns
     -------
     misfit_rad, order
-        Root of the sum of the squared differences to the given squareness in the best trial, and that trial's diagonals by name.
+        Root of the sum of the squared differences from the given squareness in the best trial, and its diagonals by name.
     """
     volume = np.asarray(volume_mm, dtype=np.float64)
     c0y, b0z, a0z = iso_squareness(pahk_type(type_name), squareness_rad)

@@ -1,9 +1,9 @@
-"""Parameter-offset (Abbe) transformation of all ten types from one derivation (math.md 2.1; P (9), (10), (A3), (A6), (A9)).
+"""Parameter-offset (Abbe) transformation of all ten types from one derivation (P (9), (10), (A3), (A6), (A9)).
 
-An instrument cannot stand at the origin: along axis j it measures the deviation on the line through (Xo, Yo, Zo), which holds the axis' own
-function AND levers times angular errors. Rule G gives what it sees for any chain. Because rule G is linear, the part that the angular
-errors alone cause IS the transformation: subtract it and the functions refer to the origin. So the ten printed sets of rules are one
-function here, and the terms that the paper lost (the slopes m[.], XoEy(Y) in (A3), signs in (A6), (A9), math.md 3) cannot get lost.
+An instrument cannot stand at the origin. Along axis j it measures the deviation on the line through (Xo, Yo, Zo), which contains the
+functions of the axis AND angular errors times levers. Rule G (docs/explanation/conventions.md) gives this deviation for any chain. It is
+linear, so the part caused by angular errors alone can be subtracted; the rest refers to the origin. One function thus replaces ten printed
+sets of rules, which have errata: missing slopes m[.], a missing XoEy(Y) in (A3), wrong signs in (A6), (A9).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine,
 from abbe.models.papers.pahk.volume_map import ParameterTables, Triple
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
-"""Axes whose lines alpha, beta1, beta2 compare."""
+"""The two axes of alpha, beta1 and beta2."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class OffsetSetup:
     Parameters
     ----------
     offset_mm : array, shape (3,) or (3 lines, 3)
-        (Xo, Yo, Zo): commanded position of the axes that stand still, one for all three lines or one per measured line. Squareness takes
-        the slopes of both lines at their own offsets, as math.md 2.1 asks where they share no point.
+        (Xo, Yo, Zo): commanded position of the axes at rest, one for all three lines or one per line. Squareness uses the slope of each
+        line at its own offset.
     probe_mm : array, shape (3,)
         Probe offset (Xp, Yp, Zp).
     table_point_mm : array, shape (3,), optional
-        A reflector fixed on the table at this point of the workpiece frame. Lines of workpiece-side axes then use it as lever (less the
-        travel of carriages nearer the workpiece) and the terms "own travel x own angle" of math.md 2.1 vanish. Without it the
-        functional point is the probe tip. Lines of tool-side axes are always of the tip.
+        Position, in the workpiece frame, of a reflector fixed on the table. Lines of workpiece-side axes then refer to it (less the travel
+        of carriages nearer the workpiece), which removes the terms "own travel x own angle". By default, and always for lines of tool-side
+        axes, the functional point is the probe tip.
 
     Raises
     ------
@@ -50,7 +50,7 @@ class OffsetSetup:
     table_point_mm: F1 | None = None
 
     def __post_init__(self) -> None:
-        """Check and normalise once: one offset per line."""
+        """Check the numbers and expand the offset to one per line."""
         offset = np.asarray(self.offset_mm, dtype=np.float64)
         points = [np.asarray(p, dtype=np.float64) for p in (self.probe_mm, self.table_point_mm) if p is not None]
         if offset.shape not in ((3,), (3, 3)) or any(p.shape != (3,) for p in points):
@@ -64,7 +64,7 @@ class OffsetSetup:
 
 
 def line_positions_mm(tables: ParameterTables, setup: OffsetSetup, axis: int) -> F2:
-    """Commanded positions of the measuring line of an axis, shape (n_axis, 3): that axis over its table, the others at the offset."""
+    """Return the commanded positions of the measuring line of an axis, shape (n_axis, 3): the other axes stand at the offset."""
     x = tables.positions_mm[axis]
     axes: F2 = np.repeat(setup.offset_mm[axis][None], x.size, axis=0)
     axes[:, axis] = x
@@ -72,14 +72,14 @@ def line_positions_mm(tables: ParameterTables, setup: OffsetSetup, axis: int) ->
 
 
 def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, axis: int, still_rad: F2 | None = None) -> F2:
-    """Deviation (actual minus nominal, rule G) along the measuring line of an axis.
+    """Return the deviation (actual minus nominal, rule G) along the measuring line of an axis.
 
     Parameters
     ----------
     axis : int
         0, 1, 2 for the line along X, Y, Z.
     still_rad : array, shape (3 axes, 3), optional
-        E of each axis at the offset where it stands still. Default: linear between the tabulated values.
+        E of each axis at its offset position. Default: interpolated linearly in the tables.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: OffsetSetu
     axes = line_positions_mm(tables, setup, axis)
     n = axes.shape[0]
     d, e = np.zeros((n, 3, 3)), np.empty((n, 3, 3))
-    # What the resting axes are displaced by is the same all along the line: no measurement of this line sees it.
+    # The displacement by the axes at rest is constant along the line, so no measurement of the line shows it.
     e[:] = tables.at(axes)[1] if still_rad is None else np.asarray(still_rad, dtype=np.float64)
     d[:, axis], e[:, axis] = tables.d_mm[axis], tables.e_rad[axis]
     motions = motions_from_pahk(kind, axes, d, e, tables.squareness_rad)
@@ -107,11 +107,11 @@ def line_deviation_mm(kind: PahkType, tables: ParameterTables, setup: OffsetSetu
 
 
 def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
-    """Readings of instruments on the lines of a set-up for parameters that refer to the origin.
+    """Return the parameters as instruments measure them on the lines of a set-up, from parameters that refer to the origin.
 
-    Definition (math.md 2.1): positioning is the deviation along the line less its value at the start; straightness the deviation across
-    less its least-squares line, as the table's own motion on a workpiece-side axis; squareness minus the sum of the two slopes, in the
-    type's sign of alpha. Angles are the same everywhere.
+    Positioning is the deviation along the line less its value at the start. Straightness is the deviation across the line less its
+    least-squares line, for a workpiece-side axis as the table's own motion. Squareness is minus the sum of the two slopes, with the sign of
+    alpha of the type. Angles are the same on all lines.
 
     Parameters
     ----------
@@ -141,26 +141,25 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, sti
 
 
 def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
-    """Corrections of values measured off the origin: the Abbe terms of P (9), (10), (A3), (A6), (A9), from the angular errors only.
+    """Return the corrections of values measured off the origin: the Abbe terms of P (9), (10), (A3), (A6), (A9).
 
-    Derived from rule G in place of the printed sets, which lack the slope terms of squareness and have wrong signs in (A6), (A9) (math.md
-    2.1 and 3); agrees with math.md 2.1 for all ten types.
+    They depend on the angular errors only, and come from rule G. Errata of the printed sets: they lack the slope terms of squareness, and
+    have wrong signs in (A6), (A9).
 
     Parameters
     ----------
     kind, tables, setup, still_rad
-        As in `as_measured`; translations and squareness of ``tables`` play no part.
+        As in `as_measured`; translations and squareness of ``tables`` have no effect.
 
     Returns
     -------
     ParameterTables
-        ``d_mm`` (mm, Pahk's signs, same grid; straightness terms with their least-squares line removed) and ``squareness_rad`` (alpha,
-        beta1, beta2): the terms.
+        Corrections in ``d_mm`` (Pahk's signs, same grid; straightness without its least-squares line) and in ``squareness_rad``.
 
     Raises
     ------
     ValueError
-        An offset beyond the tables without ``still_rad``.
+        An offset lies outside the tables and ``still_rad`` is not given.
     """
     nothing = replace(tables, d_mm=_zeros(tables), squareness_rad=np.zeros(3))
     measured = as_measured(kind, nothing, setup, still_rad)
@@ -168,10 +167,10 @@ def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, st
 
 
 def refer_to_origin(kind: PahkType, measured: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
-    """Parameters referred to the origin from what was measured on offset lines: measured + `offset_terms` (P (9), (10), (A3), (A6), (A9)).
+    """Refer parameters measured on offset lines to the origin, by adding `offset_terms` (P (9), (10), (A3), (A6), (A9)).
 
-    Inverse of `as_measured` for functions in its normal form (positioning zero at the start, straightness without least-squares line).
-    Arguments, units, signs and errors as there; errata as in `offset_terms`.
+    It inverts `as_measured` for positioning that is zero at the start and straightness without a least-squares line. Arguments, units,
+    signs and errors are those of `as_measured`.
     """
     terms = offset_terms(kind, measured, setup, still_rad)
     d = [m + t for m, t in zip(measured.d_mm, terms.d_mm, strict=True)]

@@ -1,10 +1,10 @@
-"""Random error of the tool from the random errors of the 21 parameters (math.md 2.2; P (5), (8)).
+"""Random error of the tool from the random errors of the 21 parameters (P (5), (8)).
 
-A parameter may act through more than one lever: in MB1 Ey(X) enters dX with (Z + Zp). Its coefficients belong together before they are
-squared; the paper squares Z and Zp apart, which is too small or too large whenever both are non-zero (`printed_eq5_mm`).
+A parameter may act through more than one lever: in MB1, Ey(X) enters dX with (Z + Zp). Such coefficients must be added before they are
+squared. Erratum: the paper squares Z and Zp separately, which is wrong if both are non-zero (`printed_eq5_mm`).
 
-Coverage: an R may be one or two standard deviations. Quadrature keeps the factor, so results have the coverage of
-the inputs. Pahk's "repeatability" is 2 sigma, the largest over the positions: `in_coverage` converts.
+A random error R may be one or two standard deviations (its coverage); results have the coverage of the inputs. Pahk's "repeatability" is
+the largest 2 sigma over the positions; `RandomErrors.in_coverage` converts.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from abbe.models.machine import Machine
 from abbe.models.notation.pahk import PahkType, pahk_machine, parameter_signs, squareness_slopes
 
 PARAMETERS = (*(f"{f}{i}({j})" for f in "dE" for j in "XYZ" for i in "xyz"), "alpha", "beta1", "beta2")
-"""Order of the 21 parameters everywhere here: dx(X) dy(X) dz(X) dx(Y) ... Ez(Z), alpha, beta1, beta2."""
+"""Order of the 21 parameters: dx(X) dy(X) dz(X) dx(Y) ... Ez(Z), alpha, beta1, beta2."""
 
 REPEATABILITY_COVERAGE = 2.0
-"""Pahk's "repeatability" is twice the standard deviation (P, section 4; math.md 2.2)."""
+"""Pahk's "repeatability" is twice the standard deviation (P, section 4)."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class RandomErrors:
     squareness_rad : array, shape (3,)
         R of alpha, beta1, beta2.
     coverage : float
-        How many standard deviations these numbers are: 1 for sigma, 2 for Pahk's repeatability.
+        Number of standard deviations in each R: 1 for sigma, 2 for Pahk's repeatability.
 
     Raises
     ------
     ValueError
-        Wrong shapes, negative or not finite numbers, coverage not positive.
+        A shape is wrong, a number is negative or not finite, or the coverage is not positive.
     """
 
     d_mm: F2
@@ -51,11 +51,11 @@ class RandomErrors:
     coverage: float
 
     def __post_init__(self) -> None:
-        """Check and normalise once."""
+        """Check the numbers and turn them into arrays."""
         for name, shape in (("d_mm", (3, 3)), ("e_rad", (3, 3)), ("squareness_rad", (3,))):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != shape or not (np.isfinite(value) & (value >= 0.0)).all():
-                raise ValueError(f"random errors: {name} must be finite, not negative, of shape {shape}")
+                raise ValueError(f"random errors: {name} must hold finite numbers, not negative, in shape {shape}")
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.coverage) and self.coverage > 0.0):
             raise ValueError(f"random errors: coverage {self.coverage} must be positive")
@@ -66,13 +66,13 @@ class RandomErrors:
         return np.concatenate([self.d_mm.ravel(), self.e_rad.ravel(), self.squareness_rad])
 
     def in_coverage(self, coverage: float) -> RandomErrors:
-        """The same random errors as another multiple of sigma."""
+        """Return the same random errors as another multiple of sigma."""
         k = coverage / self.coverage
         return RandomErrors(self.d_mm * k, self.e_rad * k, self.squareness_rad * k, coverage)
 
 
 def parameter_jacobian(kind: PahkType, axes_mm: F2, probe_mm: F1 | None = None) -> F3:
-    """Derivative of the deviation (rule G) with respect to Pahk's 21 parameters, coefficients of the same parameter combined.
+    """Return the derivative of the deviation (rule G) with respect to Pahk's 21 parameters, one combined coefficient each.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def parameter_jacobian(kind: PahkType, axes_mm: F2, probe_mm: F1 | None = None) 
 
 
 def iso_parameter_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = None) -> F3:
-    """`parameter_jacobian` of any of the 24 chains in ISO names: EXX EYX EZX EXY ... ECZ (rotations after translations), C0Y, B0Z, A0Z.
+    """Return the `parameter_jacobian` of any chain in ISO names: translations EXX EYX EZX EXY ..., rotations EAX ... ECZ, C0Y, B0Z, A0Z.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def iso_parameter_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | Non
 
 
 def quadrature_mm(jacobian: F3, random: RandomErrors) -> F2:
-    """RX, RY, RZ of independent parameters: root of the sum of (coefficient x R) squared, in the coverage of ``random``.
+    """Return RX, RY, RZ for independent parameters, the root of the sum of (coefficient x R)^2, with the coverage of ``random``.
 
     Parameters
     ----------
@@ -121,29 +121,29 @@ def quadrature_mm(jacobian: F3, random: RandomErrors) -> F2:
 
 
 def propagate(jacobian: F3, covariance: F2) -> F3:
-    """Covariance of the deviation at each position for parameters that may be correlated: J C J^T.
+    """Return the covariance J C J^T of the deviation at each position, for parameters that may be correlated.
 
     Parameters
     ----------
     jacobian : array, shape (n, 3, 21)
     covariance : array, shape (21, 21)
-        Of the parameters in the order of the Jacobian, mm and rad.
+        Covariance of the parameters (mm, rad) in the order of the Jacobian.
 
     Returns
     -------
-    array, shape (n, 3, 3), mm^2. With a diagonal covariance the roots of its diagonal are `quadrature_mm`.
+    array, shape (n, 3, 3), mm^2. For a diagonal ``covariance`` the roots of the diagonal are `quadrature_mm`.
 
     Raises
     ------
     ValueError
-        It is not a covariance (`abbe.models.geometry.propagation.checked_covariance`).
+        ``covariance`` is not a covariance (`abbe.models.geometry.propagation.checked_covariance`).
     """
     c = checked_covariance(covariance, jacobian.shape[-1])
     return np.asarray(jacobian @ c @ np.swapaxes(jacobian, 1, 2))
 
 
 def printed_eq5_mm(axes_mm: F2, probe_mm: F1, random: RandomErrors) -> F2:
-    """RX, RY, RZ of MB1 as P (5) prints them: Z and Zp squared apart. For comparison: erratum, exact without probe offset only.
+    """Return RX, RY, RZ of MB1 as printed in P (5), with Z and Zp squared separately: WRONG with a probe offset, for comparison only.
 
     Parameters
     ----------

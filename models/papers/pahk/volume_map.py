@@ -1,4 +1,4 @@
-"""Parameter tables of a machine in Pahk's signs, and its deviation over the working volume as a deformed grid (math.md 2; P (4), (7), (A2),
+"""Parameter tables of a machine in Pahk's signs, and its deviation over the working volume as a deformed grid (P (4), (7), (A2),
 (A5), (A8)).
 """
 
@@ -18,19 +18,19 @@ from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine
 Triple = tuple[F2, F2, F2]
 """One table per axis X, Y, Z, each of shape (n_j, 3 directions): the numbers of positions may differ."""
 Form = Literal["first", "vector", "zyx", "small"]
-"""First order (rule G), or the exact chain with one of the rotations of `abbe.models.geometry.chain.exact_deviation_mm`."""
+"""``first``: first order (rule G); the others: exact chain with this rotation (`abbe.models.geometry.chain.exact_deviation_mm`)."""
 
 
 @dataclass(frozen=True)
 class ParameterTables:
-    """The 21 parameters of math.md 2: d_i(j) and E_i(j) at tabulated positions, and three squareness errors.
+    """Pahk's 21 parameters: d_i(j) and E_i(j) at tabulated positions, and three squareness errors.
 
     Parameters
     ----------
     positions_mm : three arrays, shape (n_j,)
         Increasing commanded positions of X, Y, Z; at least two of each.
     d_mm : three arrays, shape (n_j, 3)
-        d_x, d_y, d_z of the axis: positioning along it, straightness across, Pahk's signs (`abbe.models.notation.pahk.parameter_signs`).
+        d_x, d_y, d_z of the axis (positioning and straightness), Pahk's signs (`abbe.models.notation.pahk.parameter_signs`).
     e_rad : three arrays, shape (n_j, 3)
         E_x, E_y, E_z of the axis, Pahk's signs.
     squareness_rad : array, shape (3,)
@@ -39,7 +39,7 @@ class ParameterTables:
     Raises
     ------
     ValueError
-        Shapes do not agree, positions do not increase, or something is not finite.
+        Shapes do not agree, positions do not increase, or a number is not finite.
     """
 
     positions_mm: tuple[F1, F1, F1]
@@ -48,7 +48,7 @@ class ParameterTables:
     squareness_rad: F1 = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        """Check and normalise once."""
+        """Check the numbers and turn them into arrays."""
         for name in ("positions_mm", "d_mm", "e_rad"):
             object.__setattr__(self, name, tuple(np.asarray(v, dtype=np.float64) for v in getattr(self, name)))
         object.__setattr__(self, "squareness_rad", np.asarray(self.squareness_rad, dtype=np.float64))
@@ -58,10 +58,11 @@ class ParameterTables:
         for axis, x, d, e in zip("XYZ", self.positions_mm, self.d_mm, self.e_rad, strict=True):
             if x.ndim != 1 or x.size < 2 or d.shape != (x.size, 3) or e.shape != (x.size, 3):
                 raise ValueError(
-                    f"parameter tables of {axis}: positions {x.shape} need d and E of shape (n, 3), got {d.shape} and {e.shape}"
+                    f"parameter tables of {axis}: d and E must have one row of 3 numbers per position (2 or more positions); "
+                    f"got positions {x.shape}, d {d.shape}, E {e.shape}"
                 )
             if not (np.isfinite(x).all() and np.isfinite(d).all() and np.isfinite(e).all() and (np.diff(x) > 0.0).all()):
-                raise ValueError(f"parameter tables of {axis}: positions must increase and everything must be finite")
+                raise ValueError(f"parameter tables of {axis}: positions must increase, and all numbers must be finite")
         if not np.isfinite(self.squareness_rad).all():
             raise ValueError("parameter tables: squareness must be finite")
 
@@ -71,7 +72,7 @@ class ParameterTables:
         return np.array([[x[0], x[-1]] for x in self.positions_mm])
 
     def at(self, axes_mm: F2) -> tuple[F3, F3]:
-        """d and E at commanded positions, linear between the tabulated ones.
+        """Return d and E at commanded positions, interpolated linearly.
 
         Parameters
         ----------
@@ -84,7 +85,7 @@ class ParameterTables:
         Raises
         ------
         ValueError
-            A position lies outside its table: nothing is extrapolated.
+            A position lies outside its table.
         """
         axes = np.asarray(axes_mm, dtype=np.float64)
         lo, hi = self.stroke_mm.T
@@ -98,14 +99,14 @@ class ParameterTables:
         return out[0], out[1]
 
     def motions(self, kind: PahkType, axes_mm: F2) -> F3:
-        """ISO motions at commanded positions, shape (n, 3 axes, 6), squareness included (`abbe.models.notation.pahk.motions_from_pahk`)."""
+        """Return the ISO motions at commanded positions, squareness included, shape (n, 3 axes, 6)."""
         d, e = self.at(axes_mm)
         return motions_from_pahk(kind, np.asarray(axes_mm, dtype=np.float64), d, e, self.squareness_rad)
 
 
 @dataclass(frozen=True)
 class VolumetricMap:
-    """Nominal and deformed grid.
+    """Deviation on a grid over the volume.
 
     Parameters
     ----------
@@ -131,12 +132,12 @@ class VolumetricMap:
         return self.nominal_mm + self.deviation_mm
 
     def exaggerated_mm(self, factor: float) -> F3:
-        """The deformed grid with the deviation multiplied, for drawing."""
+        """Return the deformed grid with the deviation multiplied by a factor, for drawing."""
         return self.nominal_mm + factor * self.deviation_mm
 
 
 def chain_deviation_mm(machine: Machine, axes_mm: F2, motions: F3, form: Form = "first") -> F2:
-    """Deviation in one of the four forms; shapes and errors as in `abbe.models.geometry.chain.deviation_mm`."""
+    """Return the deviation in one of the four forms (`Form`); shapes and errors as in `abbe.models.geometry.chain.deviation_mm`."""
     if form == "first":
         return deviation_mm(machine, axes_mm, motions)
     return exact_deviation_mm(machine, axes_mm, motions, rotation=form)
@@ -145,12 +146,12 @@ def chain_deviation_mm(machine: Machine, axes_mm: F2, motions: F3, form: Form = 
 def volumetric_map(
     kind: PahkType, tables: ParameterTables, nodes: int, probe_mm: F1 | None = None, *, box_mm: F2 | None = None, form: Form = "first"
 ) -> VolumetricMap:
-    """Deviation on a product grid.
+    """Return the deviation on an equidistant grid.
 
     Parameters
     ----------
     nodes : int
-        Per axis, 2 or more.
+        Number of nodes per axis, 2 or more.
     probe_mm : array, shape (3,), optional
     box_mm : array, shape (3, 2), optional
         Part of the volume. Default: the whole range of the tables.
@@ -166,7 +167,7 @@ def volumetric_map(
         Fewer than two nodes, or the box reaches beyond the tables.
     """
     if nodes < 2:
-        raise ValueError(f"volumetric map: {nodes} nodes per axis, it takes at least 2")
+        raise ValueError(f"volumetric map: {nodes} nodes per axis given, at least 2 needed")
     machine = pahk_machine(kind, tables.stroke_mm, probe_mm)
     axes = volume_grid(machine.stroke_mm if box_mm is None else np.asarray(box_mm, dtype=np.float64), nodes)
     off = chain_deviation_mm(machine, axes, tables.motions(kind, axes), form)

@@ -1,1 +1,1 @@
-"""Touch probes: tilt and roll frame, master-sphere calibration, lobing map (math.md 7)."""
+"""Touch probes: tilt and roll frame, master-sphere calibration, lobing map."""

@@ -1,4 +1,4 @@
-"""Effective radius and lobing map of a probe from touches on a master sphere (math.md 7; P (13), section 3.2)."""
+"""Effective radius and lobing map of a probe from touches on a master sphere (P (13), section 3.2)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from abbe.models.papers.probe.model import LobingMap, direction, finite_vectors
 
 Indices = NDArray[np.intp]
 ROUNDING_RAD = 1e-9
-"""Touches that should have the same angle differ by this much or less when only rounding parted them."""
+"""Largest difference of equal angles by rounding."""
 ABSORBED = ("nx", "ny", "nz", "1")
-"""Functions of the touching direction that the fit takes for centre and radius: a map is known only without its share of them."""
+"""Functions of the touching direction that a sphere fit attributes to centre and radius; a calibrated map does not contain them."""
 ITERATIONS = 50
 STEP_MM = 1e-14
 SINGULAR = 1e-8
@@ -22,36 +22,38 @@ EDGE_RAD = 1e-6
 
 
 def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROUNDING_RAD) -> LobingMap:
-    """Map from values at the directions of a pattern: circles that share their longitudes, and one touch at the pole.
+    """Make a map from values at the directions of a pattern: circles with common longitudes, and one touch at the pole.
 
-    Touches are sorted into circles and longitudes; a node lies at the median of its touches. Each touch's value is moved to its node:
-    half a degree changes a lobing of 4 µm in three waves by up to 0.1 µm.
+    The circles and longitudes of the map are the medians of the touches. The value of a touch is assigned to its node without correction;
+    for a lobing of 4 µm with three lobes, an offset of half a degree changes it by up to 0.1 µm.
 
     Parameters
     ----------
     directions_rad : array, shape (n, 2)
-        Colatitude and longitude of each touch, longitudes of any turn.
+        Colatitude and longitude of each touch; longitudes may exceed one turn.
     values_mm : array, shape (n,)
     tolerance_rad : float
-        How far a touch may be from its place, as an angle of its direction. The default allows for rounding only; touches of a real
-        machine need e.g. ``np.deg2rad(0.5)``. Neighbouring circles and longitudes must be more than four tolerances apart.
+        Largest angle between a touch and its node. The default allows for rounding only; touches of a real machine need e.g.
+        ``np.deg2rad(0.5)``. Neighbouring circles and longitudes must be more than four tolerances apart.
 
     Raises
     ------
     ValueError
-        Shapes do not agree, a number is not finite, the tolerance is not positive, or the directions form no such pattern: no touch or
-        two at the pole, a place without touch or with two.
+        Shapes do not agree, a number is not finite, the tolerance is not positive, or the directions form no such pattern: a node or the
+        pole has no touch or more than one.
     """
     angles, values = np.asarray(directions_rad, dtype=np.float64), np.asarray(values_mm, dtype=np.float64)
     if angles.ndim != 2 or angles.shape[1] != 2 or values.shape != angles.shape[:1]:
-        raise ValueError(f"lobing map: directions {angles.shape} and values {values.shape} do not fit together")
+        raise ValueError(f"lobing map: directions {angles.shape} and values {values.shape} do not fit together, expected (n, 2) and (n,)")
     if not (np.isfinite(angles).all() and np.isfinite(values).all()) or not 0.0 < tolerance_rad < np.pi / 4:
         raise ValueError("lobing map: all numbers must be finite and the tolerance positive")
     pole = np.abs(angles[:, 0]) <= tolerance_rad
     if int(pole.sum()) != 1 or values.size < 2:
-        raise ValueError(f"lobing map: it takes circles and exactly one touch at the pole, got {int(pole.sum())} of {values.size} there")
+        raise ValueError(
+            f"lobing map: it takes circles and exactly one touch at the pole; {int(pole.sum())} of {values.size} touches are at the pole"
+        )
     circle, row = _levels("colatitude", angles[~pole, 0], tolerance_rad)
-    # The same way on the sphere is a longer one in longitude, most on the smallest circle.
+    # The same distance on the sphere is a larger difference in longitude, the most on the smallest circle.
     wide = tolerance_rad / max(float(np.sin(circle).min()), tolerance_rad)
     longitude, column = _around(angles[~pole, 1], wide)
     _check_complete(circle, longitude, row, column)
@@ -61,7 +63,7 @@ def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROU
 
 
 def _levels(name: str, angles_rad: F1, tolerance_rad: float) -> tuple[F1, Indices]:
-    """Different angles, increasing, and the index of each given angle among them."""
+    """Group nearly equal angles; return the median of each group, increasing, and the group index of each angle."""
     order = np.argsort(angles_rad, kind="stable")
     ranked = angles_rad[order]
     level = np.concatenate([[0], np.cumsum(np.diff(ranked) > 2.0 * tolerance_rad)])
@@ -69,14 +71,14 @@ def _levels(name: str, angles_rad: F1, tolerance_rad: float) -> tuple[F1, Indice
     wide = next((g for g in groups if g[-1] - g[0] > 2.0 * tolerance_rad * (1.0 + 1e-9)), None)
     if wide is not None:
         span = f"{np.rad2deg(wide[0]):.6g} to {np.rad2deg(wide[-1]):.6g} degrees"
-        raise ValueError(f"lobing map: touches at every {name} from {span} cannot be distinguished with this tolerance")
+        raise ValueError(f"lobing map: touches of {name} {span} are closer than the tolerance; give a smaller tolerance")
     index = np.empty(angles_rad.size, dtype=np.intp)
     index[order] = level
     return np.array([float(np.median(g)) for g in groups]), index
 
 
 def _around(longitudes_rad: F1, tolerance_rad: float) -> tuple[F1, Indices]:
-    """As `_levels` for periodic angles: the turn is cut at its largest gap, because a group may lie across zero."""
+    """Group longitudes as `_levels` does; the circle is cut at its largest gap, because a group may lie across zero."""
     slack, turn = 2.0 * tolerance_rad, np.mod(longitudes_rad, 2.0 * np.pi)
     ranked = np.sort(turn)
     gaps = np.diff(ranked, append=ranked[0] + 2.0 * np.pi)
@@ -101,16 +103,16 @@ def _check_complete(circle: F1, longitude: F1, row: Indices, column: Indices) ->
 
 
 def master_sphere_pattern(circles: int = 5, longitudes: int = 20, step_rad: float = np.pi / 10) -> F2:
-    """Touching directions on the upper half of a sphere, from the equator upwards, the pole last (P section 3.2: 5 x 20 + 1 = 101).
+    """Return touching directions on the upper half of a sphere, from the equator up, the pole last (P section 3.2: 5 x 20 + 1 = 101).
 
     Parameters
     ----------
     circles : int
         Circles of latitude 0, step, 2 step, ...; they must end below the pole.
     longitudes : int
-        Equidistant points of each circle.
+        Number of equidistant points on each circle.
     step_rad : float
-        Distance of the circles, 18 degrees.
+        Distance of the circles; default 18 degrees.
 
     Returns
     -------
@@ -120,10 +122,10 @@ def master_sphere_pattern(circles: int = 5, longitudes: int = 20, step_rad: floa
     Raises
     ------
     ValueError
-        No circle, fewer than three longitudes, or circles up to the pole and beyond.
+        There is no circle, there are fewer than three longitudes, or a circle reaches the pole.
     """
     if circles < 1 or longitudes < 3 or not 0.0 < step_rad * max(circles - 1, 1) < np.pi / 2 - EDGE_RAD:
-        raise ValueError("sphere pattern: it takes a circle or more below the pole, each of three points or more")
+        raise ValueError("sphere pattern: one or more circles below the pole are needed, each with three or more points")
     colatitude = np.pi / 2 - step_rad * np.arange(circles)
     longitude = 2.0 * np.pi * np.arange(longitudes) / longitudes
     grid = np.stack(np.meshgrid(colatitude, longitude, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -132,7 +134,7 @@ def master_sphere_pattern(circles: int = 5, longitudes: int = 20, step_rad: floa
 
 @dataclass(frozen=True)
 class SphereFit:
-    """Sphere through points by least squares of their distances.
+    """Sphere fitted to points by least squares of their radial distances.
 
     Parameters
     ----------
@@ -143,7 +145,7 @@ class SphereFit:
     cofactor : array, shape (4, 4)
         Covariance of centre x, y, z and radius for a standard deviation of 1 of every radial distance: multiply by the variance.
     leverage : array, shape (n,)
-        Share of each distance's own noise that the fit takes away; they sum to 4.
+        Share of the noise of each distance that the fit absorbs; the sum is 4.
     """
 
     centre_mm: F1
@@ -159,17 +161,17 @@ class SphereFit:
 
     @property
     def correlation(self) -> F2:
-        """Correlations of centre x, y, z and radius, shape (4, 4). On a hemisphere centre z and radius are -0.84: weakly separable."""
+        """Correlations of centre x, y, z and radius, shape (4, 4); on a hemisphere that of centre z and radius is -0.84."""
         return np.asarray(self.cofactor / np.outer(self.sigma, self.sigma))
 
     def noise_mm(self) -> float:
-        """Root mean square of the residuals with n - 4 degrees of freedom: noise and lobing together. NaN, unknown, of four points."""
+        """Return the rms of the residuals with n - 4 degrees of freedom (noise and lobing together); NaN for four points."""
         freedom = self.residual_mm.size - 4
         return float(np.sqrt(self.residual_mm @ self.residual_mm / freedom)) if freedom > 0 else float("nan")
 
 
 def fit_sphere(points_mm: F2) -> SphereFit:
-    """Sphere of least squared radial deviations (Gauss-Newton from the algebraic fit).
+    """Fit a sphere by least squares of the radial deviations (Gauss-Newton from the algebraic fit).
 
     Parameters
     ----------
@@ -183,7 +185,7 @@ def fit_sphere(points_mm: F2) -> SphereFit:
     """
     p = finite_vectors(points_mm)
     if p.ndim != 2 or p.shape[0] < 4:
-        raise ValueError(f"sphere fit: it takes four points or more, got shape {p.shape}")
+        raise ValueError(f"sphere fit: four or more points of shape (n, 3) are needed, got shape {p.shape}")
     middle = p.mean(axis=0)
     size = float(np.sqrt(((p - middle) ** 2).sum(axis=1).mean()))
     if size == 0.0:
@@ -192,7 +194,7 @@ def fit_sphere(points_mm: F2) -> SphereFit:
     design = np.column_stack([2.0 * q, np.ones(len(q))])
     singular = np.linalg.svd(design, compute_uv=False)
     if singular[-1] < SINGULAR * singular[0]:
-        raise ValueError("sphere fit: the points lie on one circle or plane; centre and radius are not determined")
+        raise ValueError("sphere fit: the points lie on one circle or plane and do not determine centre and radius")
     start = np.linalg.lstsq(design, (q * q).sum(axis=1), rcond=None)[0]
     centre = start[:3] * size
     shifted = p - middle
@@ -212,12 +214,12 @@ def fit_sphere(points_mm: F2) -> SphereFit:
 
 
 def _columns(normal: F2) -> F2:
-    """Derivative of the distances with respect to centre and radius: nx, ny, nz, 1."""
+    """Return the regressors of centre and radius: nx, ny, nz, 1."""
     return np.column_stack([normal, np.ones(normal.shape[0])])
 
 
 def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
-    """A lobing function without what a sphere fit over the same directions absorbs in centre and radius (least squares on nx, ny, nz, 1).
+    """Return a lobing without the part that a sphere fit over the same directions absorbs (`ABSORBED`, by least squares).
 
     Parameters
     ----------
@@ -227,7 +229,7 @@ def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
 
     Returns
     -------
-    array, shape (n,): the only part of ``values_mm`` that a calibration can find, to first order.
+    array, shape (n,): the part of ``values_mm`` that a calibration can find, to first order.
     """
     angles, v = np.asarray(directions_rad, dtype=np.float64), np.asarray(values_mm, dtype=np.float64)
     columns = _columns(direction(angles[:, 0], angles[:, 1]))
@@ -238,19 +240,19 @@ def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
 class ProbeCalibration:
     """Calibration of a probe on a master sphere.
 
-    ``probe_mm`` is the lobing at the touched directions, positive where the reading is too near the sphere's centre. It is known only
-    modulo the four functions `ABSORBED`: a true lobing with a share of nx, ny, nz moved the centre, one with a constant the radius.
+    ``probe_mm`` is the lobing at the touched directions, positive if the reading is too near the centre of the sphere. It does not contain
+    the four functions `ABSORBED`: parts of the true lobing in nx, ny, nz move the fitted centre, a constant part changes the radius.
 
     Parameters
     ----------
     fit : SphereFit
-        Of the ball centres; its radius is master plus effective ball radius.
+        Sphere through the ball centres; its radius is master radius plus effective ball radius.
     effective_radius_mm : float
-        Mean of Rm - Rs, P (13).
+        Reff, the mean of Rm - Rs, P (13); Rm: distance of a ball centre from the fitted centre, Rs: master radius.
     directions_rad : array, shape (n, 2)
-        Touched colatitudes and longitudes.
+        Colatitudes and longitudes of the touches.
     probe_mm : array, shape (n,)
-        Reff - (Rm - Rs).
+        Lobing, Reff - (Rm - Rs).
     """
 
     fit: SphereFit
@@ -259,10 +261,10 @@ class ProbeCalibration:
     probe_mm: F1
 
     def uncertainty_mm(self, noise_mm: float) -> tuple[F1, F1]:
-        """Standard uncertainties for a radial noise of one touch: of centre x, y, z and effective radius (4,), of each map value (n,).
+        """Return the standard uncertainties of centre x, y, z and effective radius (4,), and of each map value (n,).
 
-        A map value is a residual: its variance is the noise's times (1 - leverage). Unknown noise (NaN, as `SphereFit.noise_mm` says of
-        four points) gives NaN.
+        ``noise_mm`` is the standard deviation of the radial noise of one touch; NaN (unknown) gives NaN. A map value is a
+        residual, and its variance is that of the noise times (1 - leverage).
 
         Raises
         ------
@@ -274,30 +276,19 @@ class ProbeCalibration:
         return noise_mm * self.fit.sigma, np.asarray(noise_mm * np.sqrt(np.maximum(1.0 - self.fit.leverage, 0.0)))
 
     def lobing_map(self, tolerance_rad: float = ROUNDING_RAD) -> LobingMap:
-        """The map for look-ups, where the touches form circles with the same longitudes and one pole (`master_sphere_pattern`).
-
-        Parameters
-        ----------
-        tolerance_rad : float
-            How far a touch may be from its place in the pattern, see `map_of_pattern`.
-
-        Raises
-        ------
-        ValueError
-            They do not.
-        """
+        """Return the map, for touches in a pattern like `master_sphere_pattern`; parameter and errors as in `map_of_pattern`."""
         return map_of_pattern(self.directions_rad, self.probe_mm, tolerance_rad)
 
 
 def calibrate(ball_centres_mm: F2, directions_rad: F2, master_radius_mm: F1 | float) -> ProbeCalibration:
-    """Effective radius and lobing from ball centres at a master sphere (P (13)).
+    """Compute effective radius and lobing from ball centres measured at a master sphere (P (13)).
 
     Parameters
     ----------
     ball_centres_mm : array, shape (n, 3)
-        Readings.
+        Readings of the ball centres.
     directions_rad : array, shape (n, 2)
-        Colatitude and longitude of each touch in the probe frame; they only name the map's nodes.
+        Colatitude and longitude of each touch in the probe frame; the fit does not use them.
     master_radius_mm : float, or array of shape (n,)
         Radius of the master sphere, or its calibrated radius in each direction (Rs(phi, theta)).
 
@@ -311,7 +302,7 @@ def calibrate(ball_centres_mm: F2, directions_rad: F2, master_radius_mm: F1 | fl
     if p.ndim != 2 or angles.shape != (p.shape[0], 2) or radius.shape not in ((), (p.shape[0],)):
         raise ValueError(f"calibration: centres {p.shape}, directions {angles.shape} and radius {radius.shape} do not fit together")
     if not np.isfinite(angles).all() or not (np.isfinite(radius) & (radius > 0.0)).all():
-        raise ValueError("calibration: directions must be finite and the master's radius positive")
+        raise ValueError("calibration: directions must be finite, and the radius of the master sphere positive")
     fit = fit_sphere(p)
     over = fit.radius_mm + fit.residual_mm - radius
     effective = float(over.mean())

@@ -1,9 +1,9 @@
-"""A tilting touch probe: frame, angles, error map, and the corrected point of a touch (math.md 7; P (11)-(17)).
+"""A tilting touch probe: frame, angles, error map, and the corrected point of a touch (P (11)-(17)).
 
-The map holds values on a grid of directions, is read between its nodes and refused where nothing was measured.
+The error map interpolates between directions of a grid and refuses directions outside it.
 
-Errata of P (math.md 3): Tp has the probe's axes as columns, so (12) must read v = Tp v', v' = Tp^T v, as (14) has it; "cosB=0" in Tp is
-cosB; in (15), (16) phi is the colatitude from z' and theta the longitude (the text has them as longitude and latitude); (16) needs atan2.
+Errata of P: the columns of Tp are the probe's axes, so (12) must read v = Tp v', v' = Tp^T v, as in (14); "cosB=0" in Tp means cosB; in
+(15), (16) phi is the colatitude from z' and theta the longitude, which the text calls longitude and latitude; (16) needs atan2.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from abbe.models.arrays import F1, F2, F3
 
 PERIOD = 2.0 * np.pi
 EDGE_RAD = 1e-9
-"""How far below the last measured circle rounding of an angle may put a direction that is on it."""
+"""Tolerance, for rounding, of a direction on the outermost measured circle."""
 Reading17 = Literal["approach", "outward"]
-"""What M in P (17) may mean: the direction in which the probe approaches the part, or the part's outward normal."""
+"""Two meanings of M in P (17): the direction in which the probe approaches the part, or the part's outward normal."""
 UNIT = 1e-6
 
 
 def probe_frame(tilt_rad: F1, roll_rad: F1) -> F3:
-    """Tp: axes e'x, e'y, e'z of the probe in machine coordinates as columns, P (11) = Rz(B) Ry(-A).
+    """Return Tp, P (11) = Rz(B) Ry(-A): its columns are the axes e'x, e'y, e'z of the probe in machine coordinates.
 
-    At A = 0 the vector product in (11) that makes e'y vanishes; the limit Rz(B) is taken, so that B still turns the map.
+    At A = 0 the cross product for e'y in (11) vanishes; the limit Rz(B) is used, so that B still turns the map.
 
     Parameters
     ----------
     tilt_rad, roll_rad : arrays, shape (n,), or numbers
-        A and B.
+        Angles A and B.
 
     Returns
     -------
@@ -53,57 +53,51 @@ def probe_frame(tilt_rad: F1, roll_rad: F1) -> F3:
 
 
 def to_probe(frame: F3, machine: F2) -> F2:
-    """Components in the probe frame of vectors given in machine coordinates, v' = Tp^T v (P (14)); shapes (..., 3, 3) and (..., 3)."""
+    """Transform vectors from machine coordinates to the probe frame, v' = Tp^T v (P (14)); shapes (..., 3, 3) and (..., 3)."""
     out: F2 = np.einsum("...ji,...j->...i", np.asarray(frame, dtype=np.float64), finite_vectors(machine))
     return out
 
 
 def to_machine(frame: F3, probe: F2) -> F2:
-    """Components in machine coordinates of vectors given in the probe frame, v = Tp v'; shapes (..., 3, 3) and (..., 3).
+    """Transform vectors from the probe frame to machine coordinates, v = Tp v'; shapes (..., 3, 3) and (..., 3).
 
-    P (12) prints this product as leading into the probe frame; the columns of Tp are the probe's axes, so it leads out of it (math.md 3).
+    Erratum: P (12) prints this product as the transformation to the probe frame.
     """
     out: F2 = np.einsum("...ij,...j->...i", np.asarray(frame, dtype=np.float64), finite_vectors(probe))
     return out
 
 
 def direction_angles(probe: F2) -> tuple[F1, F1]:
-    """Colatitude from z' in [0, pi] and longitude in [0, 2 pi) of directions in the probe frame (P (15), (16) with their errata).
+    """Return colatitude from z' in [0, pi] and longitude in [0, 2 pi) of directions in the probe frame (P (15), (16), corrected).
 
     Parameters
     ----------
     probe : array, shape (..., 3)
-        Any length but zero. At the pole the longitude is that of atan2, and means nothing.
+        Any length but zero. At the pole the longitude has no meaning.
 
     Raises
     ------
     ValueError
-        A direction has no length or is not finite.
+        A direction has length zero or is not finite.
     """
     v = finite_vectors(probe)
     size = np.linalg.norm(v, axis=-1)
     if (size == 0.0).any():
         raise ValueError("probe direction: a vector of length zero has no direction")
-    # The same angle as acos(z'/|v|), without its loss of half the digits near the pole.
+    # acos(z'/|v|) would lose half the digits near the pole.
     colatitude = np.arctan2(np.hypot(v[..., 0], v[..., 1]), v[..., 2])
     longitude = np.mod(np.arctan2(v[..., 1], v[..., 0]), 2.0 * np.pi)
     return np.asarray(colatitude), np.asarray(np.where(longitude >= 2.0 * np.pi, 0.0, longitude))
 
 
 def direction(colatitude_rad: F1, longitude_rad: F1) -> F2:
-    """Unit vectors of colatitude and longitude in the probe frame, shape (..., 3); inverse of `direction_angles`."""
+    """Return the unit vectors of colatitudes and longitudes in the probe frame, shape (..., 3); inverse of `direction_angles`."""
     ph, th = np.broadcast_arrays(np.asarray(colatitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64))
     return np.stack([np.sin(ph) * np.cos(th), np.sin(ph) * np.sin(th), np.cos(ph)], axis=-1)
 
 
 def finite_vectors(value: F2) -> F2:
-    """Array of vectors, shape (..., 3).
-
-    Raises
-    ------
-    ValueError
-        Another shape, or something that is not finite.
-    """
+    """Return vectors as float64; ValueError if the shape is not (..., 3) or a number is not finite."""
     v = np.asarray(value, dtype=np.float64)
     if v.ndim == 0 or v.shape[-1] != 3 or not np.isfinite(v).all():
         raise ValueError(f"probe: expected finite vectors of shape (..., 3), got {v.shape}")
@@ -112,23 +106,23 @@ def finite_vectors(value: F2) -> F2:
 
 @dataclass(frozen=True)
 class LobingMap:
-    """Probe error by touching direction, on circles of colatitude times equidistant longitudes, with one value at the pole.
+    """Probe error as a function of the touching direction, on a grid of colatitudes and longitudes, with one value at the pole.
 
     Parameters
     ----------
     colatitude_rad : array, shape (m,)
-        Circles from the pole outwards, increasing, all above 0 and at most pi.
+        Circles, increasing, above 0 and at most pi.
     longitude_rad : array, shape (k,)
-        Increasing, within one turn; the map goes round.
+        Increasing, within one turn; the map is periodic.
     values_mm : array, shape (m, k)
-        Probe(phi, theta): positive where the reading is too near the sphere's centre (the probe triggers late).
+        Probe(phi, theta): positive if the reading is too near the centre of the sphere (the probe triggers late).
     pole_mm : float
-        The value at the pole, for every longitude.
+        Value at the pole.
 
     Raises
     ------
     ValueError
-        Wrong shapes, order or numbers.
+        A shape or an order is wrong, or a number is not finite.
     """
 
     colatitude_rad: F1
@@ -137,7 +131,7 @@ class LobingMap:
     pole_mm: float
 
     def __post_init__(self) -> None:
-        """Check and normalise once."""
+        """Check the numbers and turn them into arrays."""
         for name in ("colatitude_rad", "longitude_rad", "values_mm"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         ph, th, v = self.colatitude_rad, self.longitude_rad, self.values_mm
@@ -149,7 +143,7 @@ class LobingMap:
             raise ValueError("lobing map: circles must increase within (0, pi], longitudes within one turn")
 
     def at_angles(self, colatitude_rad: F1, longitude_rad: F1) -> F1:
-        """Probe error at colatitudes and longitudes, bilinear between the nodes, periodic in longitude.
+        """Return the probe error at colatitudes and longitudes, by bilinear interpolation, periodic in longitude.
 
         Parameters
         ----------
@@ -162,7 +156,7 @@ class LobingMap:
         Raises
         ------
         ValueError
-            An angle is not finite, or a direction lies beyond the outermost circle: there are no data, and none are invented.
+            An angle is not finite, or a direction lies beyond the outermost circle, where there are no data.
         """
         ph, th = np.broadcast_arrays(np.asarray(colatitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64))
         if not (np.isfinite(ph).all() and np.isfinite(th).all()):
@@ -181,49 +175,49 @@ class LobingMap:
         return np.asarray((1.0 - u) * inner + u * outer)
 
     def at(self, probe_direction: F2) -> F1:
-        """Probe error for OUTWARD directions in the probe frame, shape (..., 3); as `at_angles`."""
+        """Return the probe error for OUTWARD directions (part to ball centre) in the probe frame, shape (..., 3); raises as `at_angles`."""
         return self.at_angles(*direction_angles(probe_direction))
 
     def _closed(self) -> tuple[F1, F2]:
-        """Circles with the pole, values with the pole's row and the first longitude repeated at the end."""
+        """Return the circles with the pole in front, and the values with the pole's row and the first longitude repeated at the end."""
         rows = np.vstack([np.full(self.longitude_rad.size, self.pole_mm), self.values_mm])
         return np.concatenate([[0.0], self.colatitude_rad]), np.hstack([rows, rows[:, :1]])
 
 
 def _cell(nodes: F1, at: F1) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.intp]], F1]:
-    """Index of the node before each position, and the position's share of the way to the next one."""
+    """Return the index of the node before each position, and the position as a share of the interval to the next node."""
     k = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, nodes.size - 2)
     return k, np.asarray((at - nodes[k]) / (nodes[k + 1] - nodes[k]))
 
 
 def probe_error_mm(lobing: LobingMap, frame: F3, outward: F2) -> F1:
-    """Probe error of touches: the map is indexed by the OUTWARD unit normal (part to ball centre) in the probe frame, n' = Tp^T n.
+    """Return the probe error of touches from the map, at the OUTWARD unit normal (part to ball centre) in the probe frame, n' = Tp^T n.
 
     Parameters
     ----------
     frame : array, shape (3, 3) or (n, 3, 3)
-        Tp of `abbe.models.papers.probe.model.probe_frame`.
+        Tp from `probe_frame`.
     outward : array, shape (n, 3)
 
     Raises
     ------
     ValueError
-        A direction is not a unit vector, or points where the map has no data.
+        A direction is not a unit vector, or lies outside the map.
     """
     return lobing.at(to_probe(frame, unit_vectors(outward)))
 
 
 def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
-    """Actual minus reading of the ball centre: geometry plus probe, delta + Probe n.
+    """Return actual minus reading of the ball centre from geometry and probe, delta + Probe n.
 
-    A positive Probe means a reading too near the part, so it moves the corrected ball centre outward. One value per touched point.
+    A positive Probe means a reading too near the part, so it moves the corrected ball centre outward.
 
     Parameters
     ----------
     deviation_mm : array, shape (n, 3)
         Actual minus reading from the geometry alone.
     probe_mm : array, shape (n,)
-        `probe_error_mm`.
+        From `probe_error_mm`.
     outward : array, shape (n, 3)
         Unit normal from part to ball centre.
 
@@ -239,34 +233,35 @@ def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
 
 
 def printed_eq17_mm(deviation_mm: F2, probe_mm: F1, outward: F2, m: Reading17) -> F2:
-    """P (17), delta - Probe M, for both definitions of M; the map is indexed by the outward direction in both.
+    """Evaluate P (17), delta - Probe M, for either meaning of M; the paper does not say which it means.
 
-    ``"approach"`` (M = -n) is `combined_deviation_mm`. ``"outward"`` (M = n) moves the point the wrong way; it stands here because the
-    text does not say which is meant (math.md 3, CONV).
+    ``"approach"`` (M = -n) equals `combined_deviation_mm`. ``"outward"`` (M = n) moves the point the wrong way. The probe error is that of
+    the outward direction in both cases.
 
     Raises
     ------
     ValueError
-        As `combined_deviation_mm`, or ``m`` is neither.
+        As in `combined_deviation_mm`, or ``m`` has another value.
     """
     if m not in ("approach", "outward"):
-        raise ValueError(f"eq (17): M is 'approach' or 'outward', got {m!r}")
+        raise ValueError(f"eq (17): m must be 'approach' or 'outward', got {m!r}")
     direction = np.asarray(outward, dtype=np.float64) * (-1.0 if m == "approach" else 1.0)
     return combined_deviation_mm(deviation_mm, -np.asarray(probe_mm, dtype=np.float64), direction)
 
 
 def contact_point_mm(reading_mm: F2, combined_mm: F2, effective_radius_mm: float, outward: F2) -> F2:
-    """Touched point on the part: reading + combined deviation - effective radius along the outward normal.
+    """Return the touched point on the part: reading + combined deviation - effective radius along the outward normal.
 
     Parameters
     ----------
     reading_mm, combined_mm, outward : arrays, shape (n, 3)
+        Reading of the ball centre, `combined_deviation_mm`, and unit normals from part to ball centre.
     effective_radius_mm : float
 
     Raises
     ------
     ValueError
-        Not finite, or a direction is not a unit vector.
+        A number is not finite, or a direction is not a unit vector.
     """
     if not np.isfinite(effective_radius_mm):
         raise ValueError("contact point: the effective radius must be finite")
@@ -274,13 +269,7 @@ def contact_point_mm(reading_mm: F2, combined_mm: F2, effective_radius_mm: float
 
 
 def unit_vectors(value: F2) -> F2:
-    """Checked unit vectors.
-
-    Raises
-    ------
-    ValueError
-        One is not, or is not finite.
-    """
+    """Return vectors as float64; ValueError if one is not a unit vector or not finite."""
     v = finite_vectors(value)
     if (np.abs(np.linalg.norm(v, axis=-1) - 1.0) > UNIT).any():
         raise ValueError("touching direction: expected unit vectors")

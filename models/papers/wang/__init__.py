@@ -1,1 +1,1 @@
-"""Wang: the sequential step diagonal, what tilt, angles and scale errors do to it (math.md 5)."""
+"""Wang, cited as W (equation): the sequential step diagonal, and the effect of mirror tilt, angular and scale errors on it."""

@@ -1,4 +1,4 @@
-"""Step diagonals and single-axis laser lines on FXYZ as least-squares problems: the table and the demonstration of math.md 5.5."""
+"""Step diagonals and single-axis laser lines on Wang's machine FXYZ as least-squares problems, for ranks and a demonstration."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_
 from abbe.models.solvers.designs import Field, laser_rows, stacked
 
 Deviation = Callable[[F2], F2]
-"""Commanded positions (n, 3), mm, to the machine's deviation (n, 3), mm."""
+"""From commanded positions (n, 3), mm, to the machine's deviation (n, 3), mm."""
 
 
 @dataclass(frozen=True)
 class WangPlan:
-    """What is measured.
+    """A plan of laser measurements.
 
     Attributes
     ----------
     travel_mm : array, shape (3,)
-        Travels X, Y, Z, from 0.
+        Travels X, Y, Z; each starts at 0.
     steps : int
         Steps per axis of a diagonal.
     positions : int
@@ -34,9 +34,9 @@ class WangPlan:
     tilts : bool
         Whether the mirror of each diagonal is tilted by two unknown angles; otherwise it is ideal.
     axes : str
-        Axes measured by the laser alone.
+        Axes also measured by single-axis lines, e.g. ``"XY"``.
     edges : tuple of int
-        Edges along which those axes are measured: 0 with the other axes at 0, 1 with the other axes at their far end.
+        Positions of these lines: 0 with the other axes at 0, 1 with the other axes at their far end.
     """
 
     travel_mm: F1
@@ -68,7 +68,10 @@ class WangPlan:
 
 
 def problem(plan: WangPlan, degree: int) -> tuple[F2, F2]:
-    """Design of the error functions (18 degree - 3 columns) and of the mirror tilts, without each run's first reading (zero)."""
+    """Return the design matrices of the error functions (18 degree - 3 columns) and of the mirror tilts.
+
+    The first reading of each run is always zero and has no row.
+    """
     terms = monomials(degree)
 
     def field(points_mm: F2) -> F3:
@@ -92,14 +95,14 @@ def _design(plan: WangPlan, field: Field) -> tuple[F2, F2]:
 
 
 def readings(plan: WangPlan, deviation: Deviation, tilt_rad: dict[str, F1]) -> F1:
-    """Readings of the laser on a machine, in the order of the rows of `problem`, mm.
+    """Return the laser readings on a machine, in the order of the rows of `problem`, mm.
 
     Parameters
     ----------
     deviation : callable
         Commanded positions to deviation, mm.
     tilt_rad : dict of arrays (2,)
-        Mirror tilts of each diagonal; a missing one is ideal.
+        Mirror tilts of each diagonal, rad; a missing diagonal has an ideal mirror.
     """
     out = []
     for name, path in plan.diagonals:
@@ -113,14 +116,14 @@ def readings(plan: WangPlan, deviation: Deviation, tilt_rad: dict[str, F1]) -> F
 
 
 def distance_errors_mm(points_mm: F2, model_mm: F2, machine_mm: F2) -> F1:
-    """Distances between all pairs of points by a model minus those of the machine, shape (n (n - 1) / 2,), mm.
+    """Return the distances between all pairs of points by a model minus those of the machine, shape (n (n - 1) / 2,), mm.
 
-    Free of the choice of the frame (math.md 1): the only fair comparison of two volumetric maps without removing a rigid motion.
+    They do not depend on the frame, so volumetric maps can be compared without removing a rigid motion.
 
     Parameters
     ----------
     points_mm, model_mm, machine_mm : array, shape (n, 3)
-        Nominal points; deviation of the model and of the machine there.
+        Nominal points, and the deviations of model and machine there.
     """
     i, j = np.triu_indices(len(points_mm), 1)
     d, a, b = (v[i] - v[j] for v in (points_mm, model_mm, machine_mm))
@@ -129,9 +132,9 @@ def distance_errors_mm(points_mm: F2, model_mm: F2, machine_mm: F2) -> F1:
 
 
 def interpolated_mm(points_mm: F2, inc_mm: F1, e_mm: F3) -> F2:
-    """Deviation map of nine displacement curves, eq (10): the sum over the axes, linear between the steps.
+    """Return the deviation map of nine displacement curves, eq (10): the sum over the axes, linear between the steps.
 
-    Beyond the last step the last value holds. A map of sums has no lever arms: angular errors are not in it (math.md 5.2).
+    Beyond the last step the last value holds. Such a map has no lever arms and so no angular errors.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Squareness from the four body diagonals' end values, eq (12) and (13), and what angular errors do to eq (7) (math.md 5.2, 5.3).
+"""Squareness from the end values of the four body diagonals, (12) and (13), and the effect of angular errors on (7).
 
-X, Y, Z are total travels, R the diagonal. Signs of (12), (13) are acute positive: the negative of (9) and (11). The bias-free solution is
-`abbe.models.solvers.step_diagonal.squareness_contrast`.
+X, Y, Z are total travels, R is the diagonal. The squareness of (12), (13) is acute positive, that of (9) and (11) obtuse positive. The
+bias-free solution is `abbe.models.solvers.step_diagonal.squareness_contrast`.
 
-Angular errors of the machine FXYZ, step order X, Y, Z, make Abbe terms and spurious straightness, positioning and squareness. The closure
-test shows nothing of this beyond one step's size: a machine with pure yaw looks bent.
+Angular errors of the machine FXYZ, with step order X, Y, Z, cause Abbe terms and spurious straightness, positioning and squareness; a
+machine with pure yaw seems bent. The closure test shows of this no more than the size of one step.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from abbe.models.solvers.step_diagonal import ORDER, checked_increments
 
 @dataclass(frozen=True, slots=True)
 class AcuteSquareness:
-    """Acute-positive squareness of eq (12) and (13), rad."""
+    """Acute-positive squareness of (12) and (13), rad."""
 
     theta_yz: float
     theta_zx: float
@@ -28,14 +28,14 @@ class AcuteSquareness:
 
 
 def diagonal_totals_eq12(acute: AcuteSquareness, length_mm: F1, scale: F1 | None = None) -> dict[str, float]:
-    """Deviation at the end of each diagonal, eq (12), with the scale errors that the paper leaves out, mm.
+    """Return the deviation at the end of each diagonal, (12), with the scale errors that the paper neglects, mm.
 
     Parameters
     ----------
     length_mm : array, shape (3,)
         Total travels X, Y, Z.
     scale : array, shape (3,), optional
-        Relative length errors of the axes (default: none, as printed).
+        Relative length errors of the axes. Default: zero, as in the paper.
     """
     x, y, z = _length(length_mm)
     r = float(np.sqrt(x * x + y * y + z * z))
@@ -49,12 +49,12 @@ def diagonal_totals_eq12(acute: AcuteSquareness, length_mm: F1, scale: F1 | None
 
 
 def squareness_eq13_printed(totals_mm: dict[str, float], length_mm: F1) -> AcuteSquareness:
-    """Eq (13) as printed, acute positive: every value carries the bias of `bias_eq13` (erratum W (13)).
+    """Evaluate (13) as printed, acute positive. Erratum: every value has the bias `bias_eq13`.
 
     Parameters
     ----------
     totals_mm : dict of float
-        Deviation at the end of ppp, npp, pnp, ppn.
+        Deviation at the end of ppp, npp, pnp, ppn, mm.
     length_mm : array, shape (3,)
         Total travels X, Y, Z.
     """
@@ -67,7 +67,7 @@ def squareness_eq13_printed(totals_mm: dict[str, float], length_mm: F1) -> Acute
 
 
 def bias_eq13(scale: F1, length_mm: F1) -> AcuteSquareness:
-    """What scale errors add to the three values of eq (13): sum(X_i² e_i) over YZ, ZX, XY (erratum W (13), math.md 5.3).
+    """Return the bias of the three values of (13) by scale errors: sum(X_i² e_i) divided by YZ, ZX, XY.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def bias_eq13(scale: F1, length_mm: F1) -> AcuteSquareness:
     Returns
     -------
     AcuteSquareness
-        To be subtracted from `squareness_eq13_printed`, rad, acute positive.
+        Subtract it from `squareness_eq13_printed`; rad, acute positive.
 
     Raises
     ------
@@ -92,14 +92,14 @@ def bias_eq13(scale: F1, length_mm: F1) -> AcuteSquareness:
 
 
 def sum_test_mm(totals_mm: dict[str, float]) -> float:
-    """ppp + npp + pnp + ppn, mm: 0 by eq (12), 4 sum(X_i² e_i) / R with scale errors. Unless it is 0, (13) must not be used."""
+    """Return ppp + npp + pnp + ppn, mm: 0 by (12), 4 sum(X_i² e_i) / R with scale errors. Do not use (13) unless it is 0."""
     return float(sum(totals_mm[name] for name in ORDER))
 
 
 def common_scale(totals_mm: dict[str, float], length_mm: F1) -> float:
-    """The only scale figure that plain diagonals determine: sum(X_i² e_i) / R², relative length error of the mean diagonal (math.md 5.3).
+    """Return the only scale error that plain diagonals determine: sum(X_i² e_i) / R², the relative length error of the mean diagonal.
 
-    Not in the paper, whose (12) leaves the scale errors out.
+    It is not in the paper, whose (12) neglects scale errors.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def _length(length_mm: F1) -> tuple[float, float, float]:
 
 
 def abbe_and_spurious_eq7(n: int, inc_mm: F1, x_step_rad: F1, y_step_rad: F1) -> F3:
-    """Displacement per interval that eq (7) returns for constant angular rates alone, shape (3 directions i, 3 axes a, n), mm.
+    """Return the displacement per interval that (7) yields for constant angular rates alone, shape (3 directions i, 3 axes a, n), mm.
 
     Parameters
     ----------
@@ -138,20 +138,19 @@ def abbe_and_spurious_eq7(n: int, inc_mm: F1, x_step_rad: F1, y_step_rad: F1) ->
     inc_mm : array, shape (3,)
         Increments X, Y, Z.
     x_step_rad, y_step_rad : array, shape (3,)
-        Rotation about X, Y, Z that the X (Y) carriage gains in each of its intervals. Z's rotations and Y's yaw turn nothing that a mirror
-        at tool 0 would show.
+        Change of the rotation about X, Y, Z of the X (Y) carriage in each of its intervals. Rotations of Z and the yaw of Y have no effect
+        on a mirror at tool 0.
 
     Returns
     -------
     array
-        First order. Abbe terms at mid volume are what a diagonal may be expected to see; terms with (n + 2 - 2j), (n + 1 - 2j),
-        (2j - n - 1) or j are spurious: errors that the machine has nowhere. The effect of Y's rotations on the Z steps is not tabulated in
-        math.md; it is the same calculation with the lever (0, 0, Z).
+        First order. The Abbe terms at mid volume are real; terms with (n + 2 - 2j), (n + 1 - 2j), (2j - n - 1) or j, j being the number of
+        the interval, are spurious: the machine has these errors nowhere.
 
     Raises
     ------
     ValueError
-        n < 1, an array is not of shape (3,), or an increment not positive.
+        n < 1, an array has another shape than (3,), or an increment is not positive.
     """
     for name, v in (("inc_mm", inc_mm), ("x_step_rad", x_step_rad), ("y_step_rad", y_step_rad)):
         if np.shape(v) != (3,):
@@ -194,30 +193,30 @@ def _of_y(n: int, inc_mm: F1, step: F1) -> F3:
 
 
 def false_straightness_mm(length_mm: float, total_yaw_rad: float) -> float:
-    """Height of the parabola of false straightness EYX that a constant yaw rate makes, about L theta / 8, mm (math.md 5.2)."""
+    """Return the height of the false straightness EYX (a parabola) by a constant yaw rate, about L theta / 8, mm."""
     return length_mm * total_yaw_rad / 8.0
 
 
 def closure_of_angles_mm(inc_mm: F1, x_step_rad: F1) -> float:
-    """Closure of one X interval from X's rotations, X (Y az - Z ay) / R: one step's size, so the test does not find angular errors.
+    """Return the closure of one X interval by rotations of X, X (Y az - Z ay) / R; not in the paper.
 
-    Source: math.md 5.2 (not in the paper).
+    It has the size of one step only, so the closure test does not find angular errors.
 
     Parameters
     ----------
     inc_mm : array, shape (3,)
         Increments X, Y, Z, positive.
     x_step_rad : array, shape (3,)
-        Rotation about X, Y, Z that the X carriage gains in one interval, right-handed.
+        Change of the rotation about X, Y, Z of the X carriage in one interval, right-handed.
 
     Returns
     -------
-    float, mm: ppp - npp - pnp - ppn as `abbe.models.solvers.step_diagonal.closure_mm`, with its sign.
+    float, mm: ppp - npp - pnp - ppn, as in `abbe.models.solvers.step_diagonal.closure_mm`.
 
     Raises
     ------
     ValueError
-        Increments not positive, or rotations not of shape (3,).
+        An increment is not positive, or the rotations have another shape.
     """
     if np.shape(x_step_rad) != (3,):
         raise ValueError(f"angular errors: x_step_rad must have shape (3,), got {np.shape(x_step_rad)}")

@@ -1,1 +1,1 @@
-"""Yang and Kim: 21-error and six-parameter volumetric models and the ball-bar observation (math.md 4)."""
+"""Yang and Kim, cited as Y (equation): volumetric models with 21 errors and with six parameters, and the reading of a ball-bar."""

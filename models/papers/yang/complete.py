@@ -1,8 +1,7 @@
-"""Yang and Kim's complete volumetric error model with all 21 errors, eq (1), as printed, and the readings of a ball-bar, eq (4)-(8)
-(math.md 4.1, 4.2).
+"""Yang and Kim's complete volumetric model with all 21 errors, (1), as printed, and the readings of a ball-bar, (4)-(8).
 
-Eq (1) is rule G for the chain `abbe.models.notation.yang.CHAIN`; written out here term by term so that the paper can be read next to it.
-Readings are exact, or of first order, with a bound on the difference.
+(1) is rule G for the chain `abbe.models.notation.yang.CHAIN`, written out term by term for comparison with the paper. Ball-bar readings are
+exact or of first order, with a bound on the difference.
 """
 
 from __future__ import annotations
@@ -15,18 +14,18 @@ from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
 from abbe.models.notation.yang import YangErrors, iso_motions, machine, workpiece_mm
 
 ANGLE_MM = 500.0
-"""The reference vectors state angles and squareness times this length, so that all coefficients are lengths of like size."""
+"""The reference vectors multiply angles and squareness by this length, so that all coefficients are lengths of similar size."""
 
 
 def delta_eq1(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
-    """Volumetric error of the complete model, eq (1), in workpiece coordinates.
+    """Return the volumetric error of the complete model, (1), in workpiece coordinates.
 
     Parameters
     ----------
     errors : YangErrors
         The 21 errors at the n positions.
     slide_mm : array, shape (n, 3)
-        x, y, z of the machine's scales; z is the travel of the cross slide that carries the workpiece.
+        Scale readings x, y, z; z is the travel of the cross slide, which carries the workpiece.
     tool_mm : array, shape (3,)
         (Tx, Ty, Tz + L).
 
@@ -56,9 +55,9 @@ def delta_eq1(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
 
 
 def difference_eq3(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
-    """What the simplified model leaves out, eq (3): complete minus simplified model, shape (n, 3), mm.
+    """Return the complete minus the simplified model, (3), shape (n, 3), mm.
 
-    Eq (1) without the three positioning errors delta_jj and the three squareness errors. Parameters: as `delta_eq1`.
+    It is (1) without the three positioning errors delta_jj and the three squareness errors. Parameters are those of `delta_eq1`.
     """
     d = errors.d.copy()
     d[:, range(3), range(3)] = 0.0
@@ -66,22 +65,22 @@ def difference_eq3(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
 
 
 def delta_exact(errors: YangErrors, slide_mm: F2, tool_mm: F1, *, small_angles: bool = False) -> F2:
-    """`delta_eq1` without linearisation: full rotations Rz Ry Rx, or (``small_angles``) the paper's matrices multiplied out exactly.
+    """Return `delta_eq1` without linearisation: with full rotations Rz Ry Rx or, with ``small_angles``, with the paper's matrices.
 
-    Parameters, result: as `delta_eq1`.
+    Parameters and result are those of `delta_eq1`.
     """
     form = machine(np.array([[0.0, 1.0]] * 3), tool_mm)
     return exact_deviation_mm(form, workpiece_mm(slide_mm), iso_motions(errors, slide_mm), rotation="small" if small_angles else "zyx")
 
 
 def monomial_errors(terms: tuple[Monomial, ...], theta: F1, slide_mm: F2, travel_mm: F1) -> YangErrors:
-    """The 21 errors of a machine stated by coefficients of u = scale / travel, the form of the reference vectors (math.md 4.6).
+    """Evaluate the 21 errors of a machine given by coefficients of u = scale / travel, as in the reference vectors.
 
     Parameters
     ----------
     terms, theta : tuple of Monomial, array of shape (len(terms),)
-        Coefficients in mm: angles and squareness are stated times `ANGLE_MM`. Signs of the paper: Z's are the slide's own, squareness is
-        obtuse positive.
+        Coefficients in mm; those of angles and squareness are multiplied by `ANGLE_MM`. Signs of the paper: errors of Z are the slide's
+        own, squareness is obtuse positive.
     slide_mm : array, shape (n, 3)
         Scales x, y, z (z of the cross slide).
     travel_mm : array, shape (3,)
@@ -100,7 +99,7 @@ def monomial_errors(terms: tuple[Monomial, ...], theta: F1, slide_mm: F2, travel
 
 
 def monomial_field(terms: tuple[Monomial, ...], points_mm: F2, travel_mm: F1, tool_mm: F1) -> F3:
-    """Deviation per unit of each coefficient of `monomial_errors`, first order: eq (1) as a design (math.md 4.6).
+    """Return the first-order deviation, (1), per unit of each coefficient of `monomial_errors`.
 
     Parameters
     ----------
@@ -113,7 +112,7 @@ def monomial_field(terms: tuple[Monomial, ...], points_mm: F2, travel_mm: F1, to
     Returns
     -------
     array, shape (n, 3, len(terms))
-        mm per mm of coefficient (angles and squareness times `ANGLE_MM`), workpiece coordinates, actual minus nominal.
+        mm per mm of coefficient, workpiece coordinates, actual minus nominal.
     """
     slide = workpiece_mm(points_mm)
     form = machine(np.array([[0.0, 1.0]] * 3), tool_mm)
@@ -131,7 +130,7 @@ def _as_errors(a: ErrorArrays) -> YangErrors:
 
 
 def reading_eq6(d_mm: F2, error_mm: F2) -> F1:
-    """Change of the bar's length, eq (6) without linearisation: |d + error| - |d|.
+    """Return the change of the bar's length, (6) without linearisation: |d + error| - |d|.
 
     Parameters
     ----------
@@ -142,13 +141,13 @@ def reading_eq6(d_mm: F2, error_mm: F2) -> F1:
 
     Returns
     -------
-    array, shape (n,), mm, positive = longer. Computed without subtracting the two lengths, so that no digits are lost. Erratum: in the
-    printed (6) and (7) the fraction bar runs into the root (math.md 3).
+    array, shape (n,), mm, positive = longer; computed without the difference of two lengths. Erratum: in the printed (6) and (7) the root
+    sign is lost in the fraction bar.
 
     Raises
     ------
     ValueError
-        Shapes differ, or a point lies at the centre: no bar has length 0.
+        Shapes differ, or a point lies at the centre.
     """
     _bar_mm(d_mm, error_mm)
     change = np.einsum("ni,ni->n", error_mm, 2.0 * d_mm + error_mm)
@@ -156,16 +155,16 @@ def reading_eq6(d_mm: F2, error_mm: F2) -> F1:
 
 
 def reading_eq8(d_mm: F2, error_mm: F2) -> F1:
-    """`reading_eq6` to first order, eq (8): (w - w0) . (Delta - Delta0) / R, shape (n,), mm.
+    """Return `reading_eq6` to first order, (8): (w - w0) . (Delta - Delta0) / R, shape (n,), mm.
 
-    Parameters, errors: as `reading_eq6`; R is the length of each row of ``d_mm``. Erratum: the paper takes the slide's z for a workpiece
-    coordinate; WORKPIECE coordinates are wanted here (math.md 3 row Y (8), 4.2). What it leaves out: `second_order_bound_mm`.
+    Parameters and errors are those of `reading_eq6`; R is the length of each row of ``d_mm``. Erratum: the paper uses the z of the slide in
+    place of the workpiece coordinate. `second_order_bound_mm` bounds the neglected part.
     """
     return np.asarray(np.einsum("ni,ni->n", d_mm, error_mm) / _bar_mm(d_mm, error_mm))
 
 
 def second_order_bound_mm(error_mm: F2, radius_mm: float) -> F1:
-    """Largest possible difference of the two, |Delta - Delta0|² / (2 R), to second order, shape (n,), mm (math.md 4.2).
+    """Return the largest difference of `reading_eq6` and `reading_eq8` to second order, |Delta - Delta0|² / (2 R), shape (n,), mm.
 
     Raises
     ------
@@ -177,14 +176,14 @@ def second_order_bound_mm(error_mm: F2, radius_mm: float) -> F1:
 
 
 def measured_mm(tip_mm: F2, ball_mm: F1, radius_mm: float, bar_offset_mm: float = 0.0) -> F1:
-    """Bar reading from the actual positions of the two balls: |tip - ball| - R + offset, shape (n,).
+    """Return the bar reading from the actual positions of the two balls, |tip - ball| - R + offset, mm, shape (n,).
 
     Parameters
     ----------
     tip_mm, ball_mm : array, shape (n, 3) and (3,)
-        Actual tool tips and the fixed ball, workpiece coordinates (set-up error of the ball included).
+        Actual positions of tool tip and fixed ball (with its set-up error), workpiece coordinates.
     radius_mm, bar_offset_mm : float
-        Nominal length; how much longer the bar reads than it is.
+        Nominal length, and excess of the reading over the actual length.
 
     Raises
     ------
@@ -196,12 +195,12 @@ def measured_mm(tip_mm: F2, ball_mm: F1, radius_mm: float, bar_offset_mm: float 
 
 
 def _bar_mm(d_mm: F2, error_mm: F2) -> F1:
-    """Nominal lengths, shape (n,), none of them 0."""
+    """Return the nominal lengths, shape (n,); ValueError if one is 0."""
     if np.ndim(d_mm) != 2 or np.shape(d_mm)[1] != 3 or np.shape(error_mm) != np.shape(d_mm):
         raise ValueError(f"ball-bar: positions {np.shape(d_mm)} and errors {np.shape(error_mm)} must both have shape (n, 3)")
     length: F1 = np.linalg.norm(d_mm, axis=1)
     if not (length > 0).all():
-        raise ValueError(f"ball-bar: point {int(np.argmin(length > 0))} lies at the centre (or nowhere), a bar has a length")
+        raise ValueError(f"ball-bar: point {int(np.argmin(length > 0))} lies at the centre or is not finite; its bar would have no length")
     return length
 
 

@@ -1,8 +1,7 @@
-"""Yang and Kim's six-parameter model with its fit, eq (2) and (9), and how well one ball-bar test determines its parameters: condition,
-correlation, uncertainty per unit of noise (math.md 4.2, 4.4, 4.5).
+"""Yang and Kim's six-parameter model and its fit, (2) and (9), and how well one ball-bar test determines its parameters.
 
-Eq (2), (4), (8), (9) take the slide's z for a workpiece coordinate; by their own eq (1) the workpiece coordinate is -z. With readings of a
-real machine the printed matrix returns dzz, Sxz and Syz with the wrong sign. The default here is the physical reading.
+Erratum: (2), (4), (8), (9) use the z of the slide as a workpiece coordinate, but by (1) the workpiece coordinate is -z. With readings of a
+real machine the printed matrix gives dzz, Sxz and Syz the wrong sign. The default here (``z_convention="slide"``) is correct.
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.least_squares import RANK_TOLERANCE
 
 RADIUS_TOLERANCE = 0.01
-"""A larger share cannot be lost motion or polyline: radius or origin belong to other points, and all parameters scale with it."""
+"""Largest relative difference of radius and distance from the origin; if it is larger, radius or origin belong to other points."""
 ZConvention = Literal["slide", "workpiece"]
 PRINTED_WARNING = (
-    "z was taken for a workpiece coordinate, as eq (2), (4), (8) and (9) are printed: if it is the position of the Z slide, "
-    "dzz, Sxz and Syz come out with the wrong sign (math.md 4.2)"
+    "z was used as a workpiece coordinate, as in (2), (4), (8) and (9) of the paper: if it is the position of the Z slide, "
+    "dzz, Sxz and Syz come out with the wrong sign"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class SixParameters:
-    """dxx, dyy, dzz: linear positioning error per travel (mm/mm); sxy, sxz, syz: squareness (rad), signs of the paper."""
+    """The six parameters: dxx, dyy, dzz are scale errors (mm/mm); sxy, sxz, syz are squareness (rad), signs of the paper."""
 
     dxx: float
     dyy: float
@@ -44,7 +43,7 @@ class SixParameters:
 
 @dataclass(frozen=True, slots=True)
 class SixFit:
-    """Solution of eq (9), the covariance per unit variance of a reading (times your noise in mm²), and a note for the reader."""
+    """Solution of (9), its covariance per mm² of reading variance, residuals, and warnings."""
 
     parameters: SixParameters
     covariance_per_mm2: F2
@@ -53,77 +52,72 @@ class SixFit:
 
 
 def delta_eq2(p: SixParameters, slide_mm: F2) -> F2:
-    """Error of the six-parameter model, eq (2): shape (n, 3), mm; ``slide_mm``: scales x, y, z (z of the cross slide)."""
+    """Return the error of the six-parameter model, (2), shape (n, 3), mm; ``slide_mm``: scales x, y, z (z of the cross slide)."""
     x, y, z = np.asarray(slide_mm, dtype=np.float64).T
     return np.stack([p.dxx * x - y * p.sxy, p.dyy * y, -p.dzz * z - x * p.sxz - y * p.syz], axis=1)
 
 
 def matrix_eq9_printed(points_mm: F2, origin_mm: F1) -> F2:
-    """Matrix A of eq (9) as printed, shape (n, 6): z is read as a workpiece coordinate (erratum, math.md 3 and 4.2), mm²."""
+    """Return matrix A of (9) as printed, with z as a workpiece coordinate (erratum), shape (n, 6), mm²."""
     u, v, s = (np.asarray(points_mm, dtype=np.float64) - origin_mm).T
     return np.stack([u * u, v * v, -s * s, -u * v, -u * s, -v * s], axis=1)
 
 
 def matrix_eq9(points_mm: F2, origin_mm: F1) -> F2:
-    """Matrix A of eq (9) for scale readings, the workpiece coordinate being -z (math.md 4.2, physical reading), shape (n, 6), mm²."""
+    """Return matrix A of (9) for scale readings, with -z as the workpiece coordinate, shape (n, 6), mm²."""
     u, v, s = (np.asarray(points_mm, dtype=np.float64) - origin_mm).T
     return np.stack([u * u, v * v, s * s, -u * v, u * s, v * s], axis=1)
 
 
 def matrix_of(points_mm: F2, origin_mm: F1, z_convention: ZConvention) -> F2:
-    """`matrix_eq9` for ``"slide"``, `matrix_eq9_printed` for ``"workpiece"``.
-
-    Raises
-    ------
-    ValueError
-        ``z_convention`` is neither.
-    """
+    """Return `matrix_eq9` for ``"slide"``, `matrix_eq9_printed` for ``"workpiece"``; ValueError otherwise."""
     if z_convention not in ("slide", "workpiece"):
         raise ValueError(f"z_convention {z_convention!r}: must be 'slide' or 'workpiece'")
     return matrix_eq9(points_mm, origin_mm) if z_convention == "slide" else matrix_eq9_printed(points_mm, origin_mm)
 
 
 def fit_eq9(points_mm: F2, origin_mm: F1, delta_r_mm: F1, radius_mm: float, *, z_convention: ZConvention = "slide") -> SixFit:
-    """Six parameters from one ball-bar test by least squares, eq (9), perfect mounting assumed.
+    """Fit the six parameters to one ball-bar test by least squares, (9), assuming a perfect set-up.
 
-    A mounting error of 10 µm fakes about 100 µrad here (math.md 4.5): for measured data use `abbe.models.solvers.helix.fit_helix`, which
-    takes cup offset and bar length as unknowns.
+    A mounting error of 10 µm causes errors of about 100 µrad. For measured data use `abbe.models.solvers.helix.fit_helix`, which fits cup
+    offset and bar length too.
 
     Parameters
     ----------
     points_mm, origin_mm : array, shape (n, 3) and (3,)
-        Commanded positions and the centre, scales or workpiece coordinates as ``z_convention`` says.
+        Commanded positions and centre, as scales or workpiece coordinates according to ``z_convention``.
     delta_r_mm : array, shape (n,)
         Bar length minus radius.
     radius_mm : float
         Nominal bar length: the distance of the points from the origin, to 1 %.
     z_convention : "slide" | "workpiece"
-        ``slide``: z is the position of the Z slide (physical). ``workpiece``: as printed, with a warning in the result.
+        ``slide``: z is the position of the Z slide. ``workpiece``: as printed, with a warning in the result.
 
     Returns
     -------
     SixFit
-        Parameters (mm/mm and rad, the paper's signs: obtuse positive), covariance per mm² of reading variance, residual (mm), warnings.
-        Erratum: as printed dzz, Sxz and Syz of a real machine have the wrong sign (math.md 3 row Y (9), 4.2).
+        Parameters in mm/mm and rad (signs of the paper: obtuse positive), covariance per mm² of reading variance, residuals (mm), warnings.
 
     Raises
     ------
     ValueError
-        Unknown ``z_convention``, or fewer than six readings, or they do not determine the six parameters, or the radius is not positive or
-        more than 1 % off the points' distance from the origin.
+        ``z_convention`` is unknown, the readings are fewer than six or do not determine the six parameters, or the radius is not positive
+        or differs by more than 1 % from the distance of the points from the origin.
     """
     if not 0 < radius_mm < np.inf:
         raise ValueError(f"eq (9): radius {radius_mm} mm must be positive")
     a = matrix_of(points_mm, origin_mm, z_convention) / radius_mm
     if len(delta_r_mm) < 6 or a.shape[0] != len(delta_r_mm):
-        raise ValueError(f"eq (9): {len(delta_r_mm)} readings for {a.shape[0]} points, six parameters")
+        raise ValueError(
+            f"eq (9): {len(delta_r_mm)} readings for {a.shape[0]} points; one for each is needed, and six or more for the six parameters"
+        )
     away = np.linalg.norm(np.asarray(points_mm, dtype=np.float64) - origin_mm, axis=1)
     worst = float(away[int(np.argmax(np.abs(away - radius_mm)))])
     if not abs(worst - radius_mm) <= RADIUS_TOLERANCE * radius_mm:
-        raise ValueError(f"eq (9): a point lies {worst:g} mm from the origin, the radius is {radius_mm:g} mm")
+        raise ValueError(f"eq (9): a point lies {worst:g} mm from the origin, but the radius is {radius_mm:g} mm")
     scale = np.linalg.norm(a, axis=0)
     if not (scale > 0).all():
-        raise ValueError("eq (9): the points do not leave a plane or line through the centre, some parameters are not seen")
+        raise ValueError("eq (9): all points lie on a plane or line through the centre, so some parameters are not determined")
     q, r = scipy.linalg.qr(a / scale, mode="economic")
     if np.abs(np.diag(r)).min() < 1e-9:
         raise ValueError("eq (9): the points do not determine the six parameters")
@@ -135,14 +129,14 @@ def fit_eq9(points_mm: F2, origin_mm: F1, delta_r_mm: F1, radius_mm: float, *, z
 
 @dataclass(frozen=True)
 class Conditioning:
-    """Figures of one design.
+    """Conditioning of a design matrix.
 
     Attributes
     ----------
     singular_values : array, shape (p,)
-        Of the design with columns of unit length, largest first.
+        Singular values of the design with columns of unit length, largest first.
     rank : int
-        Singular values above 1e-9 of the largest.
+        Number of singular values above 1e-9 of the largest.
     condition : float
         Largest over the smallest singular value that counts in ``rank``.
     """
@@ -154,28 +148,28 @@ class Conditioning:
 
 @dataclass(frozen=True)
 class Spread:
-    """Uncertainty of the parameters per mm of reading noise, in their units per mm, and their correlations: shape (p,) and (p, p)."""
+    """Standard uncertainty of the parameters per mm of reading noise, shape (p,), and their correlations, shape (p, p)."""
 
     sigma_per_mm: F1
     correlation: F2
 
     @property
     def largest_correlation(self) -> float:
-        """Largest magnitude off the diagonal."""
+        """Largest absolute correlation of two parameters."""
         return float(np.abs(self.correlation - np.diag(np.diag(self.correlation))).max())
 
 
 def design_eq9(points_mm: F2, origin_mm: F1, *, setup: bool = True, z_convention: ZConvention = "slide") -> F2:
-    """Change of the bar length per unit of the six parameters, and with ``setup`` of cup offset (3) and bar length (1).
+    """Return the change of the bar length per unit of the six parameters and, with ``setup``, of cup offset (3) and bar length (1).
 
     Parameters
     ----------
     points_mm, origin_mm : array, shape (n, 3) and (3,)
-        Scales (or, with "workpiece", workpiece coordinates as printed).
+        Scales or, with ``z_convention`` "workpiece", workpiece coordinates.
 
     Returns
     -------
-    array, shape (n, 6) or (n, 10): mm per unit parameter, workpiece coordinates for the cup offset.
+    array, shape (n, 6) or (n, 10): mm per unit of the parameter; the cup offset is in workpiece coordinates.
     """
     d = np.asarray(points_mm, dtype=np.float64) - origin_mm
     radius = np.linalg.norm(d, axis=1, keepdims=True)
@@ -187,14 +181,14 @@ def design_eq9(points_mm: F2, origin_mm: F1, *, setup: bool = True, z_convention
 
 
 def two_radii_design(points_mm: tuple[F2, ...], origin_mm: F1, *, centre_separate: bool, radius_separate: bool) -> F2:
-    """Design of ball-bar tests with several bars about one origin: six parameters, then cup offsets, then bar lengths (math.md 4.5).
+    """Return the design of ball-bar tests with several bars about one origin: six parameters, then cup offsets, then bar lengths.
 
     Parameters
     ----------
     points_mm : tuple of (n_k, 3) arrays
-        One test per bar, scales.
+        Points of one test per bar, as scales.
     centre_separate, radius_separate : bool
-        Whether each test has its own cup offset (the cup was set anew) and its own bar length error, or all share one.
+        Whether each test has its own cup offset (the cup was set again), and its own bar length error.
     """
     rows = []
     for k, points in enumerate(points_mm):
@@ -208,7 +202,7 @@ def two_radii_design(points_mm: tuple[F2, ...], origin_mm: F1, *, centre_separat
 
 
 def conditioning(a: F2) -> Conditioning:
-    """Rank and condition of a design, columns of unit length first (math.md 4.4).
+    """Return rank and condition of a design after scaling its columns to unit length.
 
     Parameters
     ----------
@@ -218,22 +212,21 @@ def conditioning(a: F2) -> Conditioning:
     Returns
     -------
     Conditioning
-        Numbers without unit.
 
     Raises
     ------
     ValueError
-        ``a`` is not a matrix, not finite, or all zeros: nothing has been observed.
+        ``a`` is not a matrix, is not finite, or is all zeros.
     """
     if np.ndim(a) != 2 or not np.size(a) or not np.isfinite(a).all() or not np.any(a):
-        raise ValueError(f"conditioning: the design of shape {np.shape(a)} must be finite and show at least one parameter")
+        raise ValueError(f"conditioning: the design of shape {np.shape(a)} must be a finite matrix with a number other than 0")
     s = scipy.linalg.svd(unit_columns(a)[0], compute_uv=False)
     rank = int((s > RANK_TOLERANCE * s[0]).sum())
     return Conditioning(s, rank, float(s[0] / s[rank - 1]))
 
 
 def spread(a: F2) -> Spread:
-    """Uncertainty and correlation of least-squares estimates from a design of full rank, white noise assumed (math.md 4.4, 4.5).
+    """Return uncertainty and correlation of least-squares estimates from a design of full rank, for white noise.
 
     Parameters
     ----------
@@ -248,12 +241,12 @@ def spread(a: F2) -> Spread:
     Raises
     ------
     ValueError
-        The design has not full rank.
+        The design does not have full rank.
     """
     unit, factor = unit_columns(a)
     _, r = scipy.linalg.qr(unit, mode="economic")
     if np.abs(np.diag(r)).min() < RANK_TOLERANCE:
-        raise ValueError("the design has not full rank: some combination of its parameters has no finite uncertainty")
+        raise ValueError("spread: the design does not have full rank, so some combination of its parameters has no finite uncertainty")
     inverse = scipy.linalg.solve_triangular(r, np.eye(a.shape[1])) * factor[:, None]
     covariance = inverse @ inverse.T
     sigma: F1 = np.sqrt(np.diag(covariance))
@@ -261,9 +254,9 @@ def spread(a: F2) -> Spread:
 
 
 def common_scale_trace_mm(a: F2, radius_mm: float) -> float:
-    """Largest reading that a common scale of 1 with a bar shorter by its radius leaves: 0 up to rounding (math.md 4.5, the tenth unknown).
+    """Return the largest reading by a common scale error of 1 and a bar length error of minus the radius: 0 but for rounding.
 
-    ``a``: ten columns of `design_eq9`.
+    One ball-bar cannot separate the two. ``a``: the ten columns of `design_eq9`.
     """
     v = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -radius_mm])
     return float(np.abs(a @ v).max())

@@ -1,7 +1,7 @@
 """How far two volumetric models differ over the working volume, with the confidence interval of the mean (Yang and Kim 2.2, Table 1).
 
-The paper draws 100 random points, takes mean and standard deviation, and repeats that 100 times; its interval is x ± t s / sqrt(N), N =
-10 000. The text says Student's t, the printed figures are those of the normal law's 1.96 (math.md 8): both are here, by name. The mean of
+The paper draws 100 random points, takes mean and standard deviation, and repeats that 100 times; its interval is x ± t s / sqrt(N) with
+N = 10 000. Its text names Student's t, but its figures result from 1.96 of the normal distribution; both are available by name. The mean of
 standard deviations is too small (by 20 % for repeats of two points): "student" pools variances, "normal" averages as the paper does.
 """
 
@@ -17,7 +17,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.probability import t_quantile
 
 Model = Callable[[F2], F2]
-"""Positions (n, 3), mm, to errors (n, 3), mm."""
+"""From positions (n, 3), mm, to errors (n, 3), mm."""
 Law = Literal["student", "normal"]
 PRINTED_NORMAL = 1.96
 """Factor behind the printed intervals of Table 1."""
@@ -36,26 +36,26 @@ class RadiusDifference:
 def confidence_interval(
     mean: F1, sd: F1, n: int, *, law: Law = "student", level: float = 0.95, degrees_of_freedom: int | None = None
 ) -> F2:
-    """Two-sided interval of the mean of ``n`` samples, shape (..., 2), unit of ``mean``.
+    """Return the two-sided confidence interval of the mean of ``n`` samples, shape (..., 2), unit of ``mean``.
 
     Parameters
     ----------
     mean, sd : array, shape (...)
         Sample mean and standard deviation, 0 or more.
     n : int
-        Samples behind the mean.
+        Number of samples.
     law : "student" | "normal"
-        ``student``: t with n - 1 (or ``degrees_of_freedom``), as the paper says. ``normal``: the factor 1.96 of its figures.
+        ``student``: t with ``degrees_of_freedom``, as in the paper's text. ``normal``: the factor 1.96 of its figures.
     level : float
-        Confidence level; the printed 1.96 exists for 0.95 only.
+        Confidence level; with "normal" only 0.95.
     degrees_of_freedom : int, optional
-        Of ``sd``, where it was pooled over several means.
+        Degrees of freedom of ``sd``; default n - 1.
 
     Raises
     ------
     ValueError
-        n no number of 2 or more, level outside (0, 1), sd negative or not finite, no degree of freedom, unknown law, or "normal" with
-        another level than 0.95.
+        n is below 2 or infinite, the level is outside (0, 1), an sd is negative or not finite, there is no degree of freedom, the law is
+        unknown, or the level with "normal" is not 0.95.
     """
     if not 2 <= n < np.inf or not 0.0 < level < 1.0:
         raise ValueError(f"confidence interval: n = {n} must be 2 or more and the level {level} between 0 and 1")
@@ -63,7 +63,7 @@ def confidence_interval(
         raise ValueError("confidence interval: standard deviations must be finite and not negative")
     free = n - 1 if degrees_of_freedom is None else degrees_of_freedom
     if not free >= 1:
-        raise ValueError(f"confidence interval: {free} degrees of freedom, 1 or more are needed")
+        raise ValueError(f"confidence interval: {free} degrees of freedom given, 1 or more needed")
     if law == "normal":
         if level != 0.95:
             raise ValueError("confidence interval: the printed factor 1.96 holds for a level of 0.95 only")
@@ -79,12 +79,12 @@ def confidence_interval(
 def model_difference(
     complete: Model, simplified: Model, stroke_mm: F2, *, seed: int, points: int = 100, repeats: int = 100, law: Law = "student"
 ) -> RadiusDifference:
-    """Mean difference of two models over random points of the volume, by the paper's procedure 1) to 4).
+    """Return the mean difference of two models over random points of the volume, by the paper's procedure 1) to 4).
 
     Parameters
     ----------
     complete, simplified : callable
-        Positions (n, 3) to errors (n, 3); the difference is complete - simplified, eq (3).
+        The two models; the difference is complete - simplified, (3).
     stroke_mm : array, shape (3, 2)
         Volume in which the points are drawn, uniformly.
     seed : int
@@ -92,9 +92,8 @@ def model_difference(
     points, repeats : int
         Points per repeat; number of repeats.
     law : "student" | "normal"
-        ``student`` (default): standard deviation from the mean of the repeats' variances, t with repeats (points - 1) degrees of freedom.
-        ``normal``: the paper's own way, the mean of the repeats' standard deviations and 1.96; its intervals are too short, noticeably so
-        where a repeat has few points.
+        ``student``: standard deviation from the mean variance of the repeats, t with repeats (points - 1) degrees of freedom. ``normal``:
+        as in the paper, the mean standard deviation of the repeats and 1.96; the intervals are too short if a repeat has few points.
 
     Raises
     ------
@@ -102,7 +101,7 @@ def model_difference(
         Fewer than two points, no repeat, or as `confidence_interval`.
     """
     if points < 2 or repeats < 1:
-        raise ValueError(f"model difference: {points} points in {repeats} repeats are too few")
+        raise ValueError(f"model difference: {points} points in {repeats} repeats given, at least 2 points and 1 repeat needed")
     rng = np.random.default_rng(seed)
     low, high = np.asarray(stroke_mm, dtype=np.float64).T
     samples_mm = rng.uniform(low, high, size=(repeats * points, 3))

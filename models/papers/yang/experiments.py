@@ -1,8 +1,8 @@
-"""The experiments of math.md 4.6 on Yang's machine as least-squares problems: what each could tell about the 21 error functions.
+"""Experiments on Yang's machine as least-squares problems: what each could tell about the 21 error functions.
 
-Ball-bar helices about one or several cups, step diagonals with flat mirror, plain diagonals, and whole vector maps, with or without the
-set-up unknowns. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. Number and places of the paper's cups (Fig.
-6) are lost; centre plus four at (±200, ±75) mm is the plan of the reference vectors (math.md 4.3).
+There are ball-bar helices about one or several cups, step diagonals with a flat mirror, plain diagonals, and whole vector maps, with or
+without unknowns of the set-up. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. The number and positions of
+the paper's cups (Fig. 6) are lost; the reference vectors use the centre and four cups at (±200, ±75) mm.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diago
 from abbe.models.solvers.designs import DesignRows, Field, bar_rows, laser_rows, stacked, vector_rows
 
 Problem = tuple[F2, F2]
-"""Machine columns and set-up columns of one problem."""
+"""Columns of the machine and of the set-up of a design matrix."""
 BAR_POINTS = 63
 MAP_NODES = 7
-"""Nodes per axis of a whole vector map. Not stated in math.md: the rank does not depend on it, the effective rank hardly."""
+"""Nodes per axis of a whole vector map; the rank does not depend on it, the effective rank hardly."""
 LONG_TOOL_MM = np.array([0.0, 0.0, 250.0])
 LATERAL_TOOL_MM = np.array([100.0, 50.0, 150.0])
-"""Second tool of math.md 4.6; a laterally offset one (its length is not stated there either)."""
+"""Second and third tool of the vector maps: a longer one, and one with a lateral offset."""
 DEFAULT_OFFSETS_MM = ((-200.0, -75.0), (-200.0, 75.0), (200.0, -75.0), (200.0, 75.0))
-"""Offsets of the four outer origins in the two axes across the hemisphere's axis (X and Z of the paper's horizontal machine)."""
+"""Offsets of the four outer origins along the two axes across the hemisphere's axis (X and Z on the paper's horizontal machine)."""
 
 
 @dataclass(frozen=True)
 class YangPlan:
-    """A plan: volume, tool, cups, bars and steps of the experiments.
+    """Volume, tool, cups, bars and steps of the experiments.
 
     Attributes
     ----------
     travel_mm, tool_mm : array, shape (3,)
-        Travels from 0 of the scales; (Tx, Ty, Tz + L).
+        Travels of the scales, from 0; (Tx, Ty, Tz + L).
     origins_mm : array, shape (k, 3)
-        Cup positions, scales; the first is the one of the single helix.
+        Cup positions as scales; a single helix uses the first.
     radii_mm : tuple of float
-        Bars, the first is the one of the single helix.
+        Bar lengths; a single helix uses the first.
     turns : float
-        Turns of a helix (63 points).
+        Turns of a helix of 63 points.
     steps : int
         Steps per axis of a diagonal.
     degree : int
@@ -62,14 +62,14 @@ class YangPlan:
     degree: int
 
     def __post_init__(self) -> None:
-        """Refuse a plan without origins, bars or travels."""
+        """Refuse a plan without origins or bars."""
         if np.ndim(self.origins_mm) != 2 or np.shape(self.origins_mm)[1] != 3 or not len(self.origins_mm):
             raise ValueError(f"plan: origins must have shape (k, 3) with k of 1 or more, got {np.shape(self.origins_mm)}")
         if not self.radii_mm:
             raise ValueError("plan: at least one bar is needed")
 
     def field(self, tool_mm: F1 | None = None) -> Field:
-        """Deviation at workpiece coordinates per unit of each coefficient, for the plan's tool or another."""
+        """Return the deviation per unit of each coefficient as a function of workpiece coordinates, for the plan's tool or another."""
         terms, tool = monomials(self.degree), self.tool_mm if tool_mm is None else tool_mm
 
         def at(points_mm: F2) -> F3:
@@ -79,32 +79,35 @@ class YangPlan:
 
 
 def helix_rows(plan: YangPlan, origin_mm: F1, radius_mm: float) -> DesignRows:
-    """Ball-bar rows of one helix with pole in +Y, eq (8) of Yang (math.md 4.2, 4.3).
+    """Return the design rows of one ball-bar helix with pole in +Y, (8).
 
     Parameters
     ----------
     plan : YangPlan
     origin_mm : array, shape (3,)
-        Cup, scales x, y, z (z of the cross slide); so lies the path.
+        Cup as scales x, y, z (z of the cross slide).
     radius_mm : float
 
     Returns
     -------
-    Rows
+    DesignRows
         Change of the bar's length, mm, per unit of each coefficient (`monomial_errors`), shape (63, p), and of cup offset (WORKPIECE
         coordinates) and bar length, shape (63, 4).
 
     Raises
     ------
     ValueError
-        As `helix_points`.
+        As in `helix_points`.
     """
     points = helix_points(origin_mm, radius_mm, turns=plan.turns, n=BAR_POINTS)
     return bar_rows(plan.field(), workpiece_mm(points), workpiece_mm(origin_mm))
 
 
 def diagonal_rows(plan: YangPlan, *, sequential: bool = True) -> list[DesignRows]:
-    """Laser rows of the four diagonals ppp, npp, pnp, ppn OF THE SCALES (not of the workpiece: z runs the other way), order X, Y, Z."""
+    """Return the design rows of the four laser diagonals ppp, npp, pnp, ppn, step order X, Y, Z.
+
+    The names refer to the scales, whose z runs against the workpiece coordinate.
+    """
     box = np.stack([np.zeros(3), plan.travel_mm], axis=1)
     out = []
     for name in DIAGONALS:
@@ -117,7 +120,7 @@ def diagonal_rows(plan: YangPlan, *, sequential: bool = True) -> list[DesignRows
 
 
 def across(beam: F1) -> F2:
-    """Any two unit vectors across a beam, shape (2, 3)."""
+    """Return two unit vectors across a beam, shape (2, 3)."""
     helper = np.eye(3)[int(np.argmin(np.abs(beam)))]
     first = np.cross(beam, helper)
     first /= np.linalg.norm(first)
@@ -125,18 +128,16 @@ def across(beam: F1) -> F2:
 
 
 def one_helix(plan: YangPlan, *, setup: bool) -> Problem:
-    """(a) one helix with the first bar about the first origin, set-up perfect or cup offset and bar length unknown."""
+    """Experiment (a): one helix with the first bar about the first origin; with ``setup``, cup offset and bar length are unknown."""
     rows = helix_rows(plan, plan.origins_mm[0], plan.radii_mm[0])
     return rows.machine, rows.setup if setup else rows.setup[:, :0]
 
 
 def all_helices(plan: YangPlan, *, centres: bool, lengths: Literal["none", "common", "each"] = "none") -> Problem:
-    """(b) every origin with every bar; a cup offset per origin; bar lengths ``"none"`` known, ``"common"`` or ``"each"`` unknown.
+    """Experiment (b): helices with every bar about every origin.
 
-    Raises
-    ------
-    ValueError
-        Another word for ``lengths``.
+    ``centres``: whether the cup offset of each origin is unknown. ``lengths``: bar lengths are known (``"none"``), have one unknown error
+    (``"common"``) or one each (``"each"``); ValueError otherwise.
     """
     unknown_lengths = {"none": 0, "common": 1, "each": len(plan.radii_mm)}
     if lengths not in unknown_lengths:
@@ -154,20 +155,20 @@ def all_helices(plan: YangPlan, *, centres: bool, lengths: Literal["none", "comm
 
 
 def step_diagonals(plan: YangPlan, *, tilts: bool, sequential: bool = True) -> Problem:
-    """(d) four diagonals, mirrors ideal or two tilts unknown per diagonal."""
+    """Experiment (d): four diagonals; with ``tilts``, two mirror tilts per diagonal are unknown."""
     rows = diagonal_rows(plan, sequential=sequential)
     per = 2 if tilts else 0
     return stacked([r.machine for r in rows], [(r.setup[:, :per], tuple(range(per * k, per * k + per))) for k, r in enumerate(rows)])
 
 
 def together(first: Problem, second: Problem) -> Problem:
-    """Two experiments with set-up unknowns of their own."""
+    """Combine two experiments; each keeps its own set-up unknowns."""
     k, m = first[1].shape[1], second[1].shape[1]
     return stacked([first[0], second[0]], [(first[1], tuple(range(k))), (second[1], tuple(range(k, k + m)))])
 
 
 def vector_map(plan: YangPlan, tools_mm: tuple[F1, ...]) -> Problem:
-    """Upper bound: the whole deviation vector on a grid over the volume, with each of the tools (math.md 4.6).
+    """Experiment (e), an upper bound: the whole deviation vector on a grid over the volume, with each of the tools.
 
     Parameters
     ----------
@@ -178,12 +179,12 @@ def vector_map(plan: YangPlan, tools_mm: tuple[F1, ...]) -> Problem:
     Returns
     -------
     machine, setup : array, shape (3 x 343 x tools, p) and (same, 0)
-        mm per unit of each coefficient (`monomial_errors`), workpiece coordinates; nothing is unknown about the set-up.
+        mm per unit of each coefficient (`monomial_errors`), workpiece coordinates; there are no set-up unknowns.
 
     Raises
     ------
     ValueError
-        No tool.
+        There is no tool.
     """
     if not tools_mm:
         raise ValueError("vector map: at least one tool is needed")
@@ -211,38 +212,38 @@ EXPERIMENTS: dict[str, Experiment] = {
     "d2": lambda p: step_diagonals(p, tilts=True),
     "d3": lambda p: step_diagonals(p, tilts=False, sequential=False),
 }
-"""Experiments of math.md 4.6 by the letters of the reference vectors."""
+"""Experiments by their codes in the reference vectors."""
 
 
 @dataclass(frozen=True, slots=True)
 class OriginFit:
-    """Whether a hemisphere fits: how far it leaves the travel at each end of each axis (0 inside), mm, shape (3, 2)."""
+    """Result of `hemisphere_fits`: how far the hemisphere leaves the travel at each end of each axis (0 inside), mm, shape (3, 2)."""
 
     over_mm: F2
 
     @property
     def ok(self) -> bool:
-        """Nothing leaves the travel."""
+        """Whether the hemisphere stays in the travel."""
         return bool((self.over_mm <= 0.0).all())
 
 
 def origin_plan(stroke_mm: F2, offsets_mm: tuple[tuple[float, float], ...] = DEFAULT_OFFSETS_MM, *, axis: int = 1) -> F2:
-    """Origins: the centre of the bed and points about it, shape (1 + len(offsets), 3), mm, in the coordinates of ``stroke_mm``.
+    """Return origins: the centre of the bed and points about it, shape (1 + len(offsets), 3), mm, in the coordinates of ``stroke_mm``.
 
     Parameters
     ----------
     stroke_mm : array, shape (3, 2)
         Travel of X, Y, Z.
     offsets_mm : tuple of pairs
-        Offsets from the centre along the two axes across ``axis``, in alphabetic order.
+        Offsets from the centre along the two axes across ``axis``, in alphabetical order.
     axis : int
-        Axis of the hemispheres, 1 = Y: there the origin stands at the small end of the travel.
+        Axis of the hemispheres (1: Y), on which the origins stand at the lower end of the travel.
 
     Raises
     ------
     ValueError
-        ``stroke_mm`` is not a finite (3, 2) array of rising pairs, ``axis`` is not 0, 1 or 2, or an origin would lie outside the travel (or
-        nowhere). Whether a hemisphere fits about it, `hemisphere_fits` tells.
+        ``stroke_mm`` is not a finite (3, 2) array of rising pairs, ``axis`` is not 0, 1 or 2, or an origin lies outside the travel.
+        `hemisphere_fits` checks the hemisphere about it.
     """
     stroke = _stroke(stroke_mm, axis)
     centre = stroke.mean(axis=1)
@@ -261,7 +262,7 @@ def origin_plan(stroke_mm: F2, offsets_mm: tuple[tuple[float, float], ...] = DEF
 
 
 def hemisphere_fits(origin_mm: F1, radius_mm: float, stroke_mm: F2, *, axis: int = 1) -> OriginFit:
-    """Whether a hemisphere about ``origin_mm`` with its pole in +``axis`` stays in the travel.
+    """Check whether a hemisphere about ``origin_mm`` with its pole in +``axis`` stays in the travel.
 
     Parameters
     ----------
@@ -272,7 +273,7 @@ def hemisphere_fits(origin_mm: F1, radius_mm: float, stroke_mm: F2, *, axis: int
     Raises
     ------
     ValueError
-        Radius not positive, origin not three finite numbers, strokes or axis as `origin_plan`.
+        The radius is not positive, the origin is not three finite numbers, or strokes or axis are wrong as in `origin_plan`.
     """
     stroke = _stroke(stroke_mm, axis)
     if not 0 < radius_mm < np.inf:
@@ -288,5 +289,7 @@ def hemisphere_fits(origin_mm: F1, radius_mm: float, stroke_mm: F2, *, axis: int
 def _stroke(stroke_mm: F2, axis: int) -> F2:
     stroke = np.asarray(stroke_mm, dtype=np.float64)
     if stroke.shape != (3, 2) or not np.isfinite(stroke).all() or not (stroke[:, 1] > stroke[:, 0]).all() or axis not in (0, 1, 2):
-        raise ValueError(f"origins: strokes of shape {stroke.shape} must be (3, 2) and growing, axis {axis} one of 0, 1, 2")
+        raise ValueError(
+            f"origins: strokes must be finite rising pairs of shape (3, 2), got shape {stroke.shape}; axis {axis} must be 0, 1 or 2"
+        )
     return stroke

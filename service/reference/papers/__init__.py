@@ -1,1 +1,1 @@
-"""Printed numbers of the four papers, how each is computed, and their pictures."""
+"""Printed numbers of the four papers, their computation, and the papers' pictures."""

@@ -1,4 +1,4 @@
-"""Kwon (math.md 6 and 8): kinematics, text, and consistency of the printed coefficients and sums of Tables 1 and 2."""
+"""Kwon: comparisons for kinematics, text, and the printed coefficients and sums of Tables 1 and 2."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from abbe.service.reference.printed import Computed, Given, Printed, agrees, com
 from abbe.service.reference.text import minus
 
 IK_BOUND_MM = 1e-7
-"""Largest deviation of the inverse from the commands of math.md's example."""
+"""Largest deviation of the inverse from the commands of the example in math.md."""
 
 ALPHA = 0.01
 GRID = "9 × 9 points, steps of 0.25 mm as printed, ± 1 mm assumed from the stroke of 2 mm and the 82 points of the text"
@@ -39,13 +39,13 @@ DAMAGED_ROW = (paper.COMPONENTS.index(paper.DAMAGED[0]), paper.DAMAGED[1])
 
 
 def comparisons() -> list[Comparison]:
-    """Every number of the paper, in printed order, and the round trip of the kinematics."""
+    """Return the comparisons of every number of the paper, in printed order, and the round trip of the kinematics."""
     tables = (_plane, _coefficients, _in_plane, _sums, _largest, _variance, _degrees_of_freedom)
     return [*_kinematics(), *_text(), *(c for table in tables for c in table()), *_round_trip()]
 
 
 def assumed_geometry() -> Geometry:
-    """The dimensions that math.md 6 assumes for its example."""
+    """Return the geometry that math.md 6 assumes for its example."""
     g = paper.GEOMETRY_MM
     legs = {"R_mm": np.array(g["R"]), "r_mm": np.array(g["r"]), "l_mm": np.array(g["l"])}
     return Geometry(**legs, l_up_mm=g["l_up"], l_dw_mm=g["l_dw"], theta_rad=float(np.deg2rad(paper.GEOMETRY_DEG)), le_mm=g["le"])
@@ -62,13 +62,13 @@ def _kinematics() -> list[Comparison]:
     how = "forward_as_printed: eq (4) without the factor 1/2"
     out += _point("ball centre by (4) as printed", paper.EXAMPLE_WITHOUT_HALF, wrong[0], how)
     lengths = np.linalg.norm(links(geometry, np.array([paper.EXAMPLES[1][0]]), wrong)[0], axis=1)
-    how = f"links at that point: {paper.GEOMETRY_MM['l']} mm came out unequal, (4) as printed breaks its own constraint"
+    how = f"links at that point: their lengths differ from {paper.GEOMETRY_MM['l']} mm, so (4) as printed breaks its own constraint"
     out += [
         stated("6", f"link {k} at that point", "mm", number, float(value), how)
         for k, (number, value) in enumerate(zip(paper.LINKS_WITHOUT_HALF, lengths, strict=True), 1)
     ]
     ends = square_commands(geometry, 1.0, float(forward(geometry, np.array([paper.EXAMPLES[0][0]]))[0, 2]))
-    how = "square_commands with the assumed geometry: more than the stated stroke of 2 mm; the real one cannot be checked"
+    how = "square_commands with the assumed geometry: more than the stated stroke of 2 mm; the actual geometry is not printed"
     return out + [
         stated("6", f"{name} λ for a square of ± 1 mm", "mm", number, value, how)
         for name, number, value in zip(("smallest", "largest"), paper.SQUARE_COMMANDS_MM, ends, strict=True)
@@ -109,7 +109,7 @@ def _text() -> list[Comparison]:
     raw = "the coordinates measured on the CMM (Figs. 9, 10) are not printed"
     repeated = "the repeated readings (Fig. 14) are not printed"
     sd = ", ".join(f"{1e3 * np.sqrt(row[1].value):.1f}" for row in paper.TABLE2_MEAN_SQUARES.values())
-    residual = f"the residuals (Fig. 13) are not printed. Consistency only: Table 2's mean squares mean standard deviations of {sd} µm"
+    residual = f"the residuals (Fig. 13) are not printed. The mean squares of Table 2 correspond to standard deviations of {sd} µm"
     return [
         Comparison("4.2", "turn about Z before referencing", "°", paper.TURN_BEFORE_DEG, why=raw),
         Comparison("4.2", "turn about Z afterwards", "°", paper.TURN_AFTER_DEG, why=raw),
@@ -123,12 +123,12 @@ def _text() -> list[Comparison]:
 
 @cache
 def plane() -> ImpliedPlane:
-    """Plane on which the coefficients of Table 1 were fitted, from all quotients without the damaged coefficient."""
+    """Return the plane on which the coefficients of Table 1 were fitted, from all quotients without the damaged coefficient."""
     return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS]), leave_out=(DAMAGED_ROW,))
 
 
 def restored(component: str) -> tuple[Printed, ...]:
-    """Coefficients of a component with the damaged exponent restored."""
+    """Return the coefficients of a component with the damaged exponent restored."""
     numbers = paper.TABLE1[component]
     if component != paper.DAMAGED[0]:
         return numbers
@@ -137,7 +137,7 @@ def restored(component: str) -> tuple[Printed, ...]:
 
 
 def in_plane(component: str, z_mm: float) -> F1:
-    """Coefficients of a component as a cubic of x and y on a plane, in the order of IN_PLANE."""
+    """Return the coefficients of a component as a cubic of x and y on a plane, in the order of IN_PLANE."""
     return in_plane_coefficients(np.array(values(restored(component))), z_mm)
 
 
@@ -179,7 +179,7 @@ def _coefficients() -> list[Comparison]:
 
 
 def _all_pairs() -> tuple[tuple[tuple[int, int, int], float], ...]:
-    """All quotients, including damaged ones."""
+    """Return all quotients, including damaged ones."""
     return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS])).ratios_mm
 
 
@@ -196,7 +196,7 @@ def _in_plane() -> list[Comparison]:
 
 
 def _on_grid(component: str, z_mm: float, figure: Callable[[GridSums], float]) -> Computed:
-    """A figure of a component's surface on the 9 x 9 grid, with the allowance from the rounding of its coefficients."""
+    """Return a figure of a component's surface on the 9 x 9 grid, with the allowance for the rounding of its coefficients."""
 
     def of(*beta: float) -> float:
         return figure(grid_sums(in_plane_coefficients(np.array(beta), z_mm)))
@@ -234,9 +234,9 @@ def _largest() -> list[Comparison]:
         found = _on_grid(c, used, lambda s: 1e3 * s.largest)
         near = abs(found.value - number.value) <= paper.RESIDUAL_UM.value
         why = (
-            f"within the residuals of ± {paper.RESIDUAL_UM.text} µm that the paper states, if its figure is of the readings"
+            f"within the stated residuals of ± {paper.RESIDUAL_UM.text} µm, if the paper's figure is that of the readings"
             if near
-            else f"not even within the residuals of ± {paper.RESIDUAL_UM.text} µm: Table 1 does not give the figure of the text"
+            else f"beyond the stated residuals of ± {paper.RESIDUAL_UM.text} µm: Table 1 does not give the figure of the text"
         )
         out.append(Comparison("4.2", f"largest |{c}|", "µm", number, found, how, why))
         out.append(stated("6", f"largest |{c}|", "µm", paper.MATH_LARGEST_UM[c], found.value, how))
@@ -261,7 +261,7 @@ def _variance() -> list[Comparison]:
 
 
 def _over_61(c: str) -> bool:
-    """Whether the residual's mean square of a component results from a division by 61 and not by the printed 60."""
+    """Tell whether the residual mean square of a component results from a division by 61 and not by the printed 60."""
     residual, printed = paper.TABLE2_SUMS[c][1], paper.TABLE2_MEAN_SQUARES[c][1]
     n = int(paper.DOF_RESIDUAL.value)
     by_60, by_61 = computed_from(lambda s: s / n, residual), computed_from(lambda s: s / (n + 1), residual)
@@ -296,7 +296,7 @@ def _f(c: str, regression: Printed, residual: Printed) -> Comparison:
             erratum = Erratum(f"residual divided by {n + 1} instead of the printed {n}, as in its mean square", by_61)
         else:
             why = f"unexplained. Nearest is the ratio of the printed mean squares, {_interval(ratio)}"
-            erratum = Erratum("ratio of the printed mean squares in place of that of the sums", ratio)
+            erratum = Erratum("the paper divides the printed mean squares, not those computed from the sums", ratio)
     return Comparison("Table 2", f"F of {c}", "", number, found, how, why, erratum)
 
 
@@ -310,7 +310,7 @@ def _interval(found: Computed) -> str:
 
 
 def degrees_of_freedom() -> tuple[int, int]:
-    """Degrees of freedom of regression and residual on the grid of the paper: rank - 1 and points - rank."""
+    """Return the degrees of freedom of regression and residual on the paper's grid: rank - 1 and points - rank."""
     found = layout(square_grid(step_mm=paper.STEP_MM.value, z_mm=plane().z_mm))
     return found.rank - 1, found.n - found.rank
 

@@ -1,4 +1,4 @@
-"""Kwon: the numbers of section 4 with Tables 1 and 2 as printed. Lengths mm in the tables, um in the text."""
+"""Kwon: the numbers of section 4 and of Tables 1 and 2 as printed; lengths in mm in the tables, in um in the text."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ TABLE1: dict[str, tuple[Printed, ...]] = {
         *("-3.728e-5", "-1.315e-2", "2.359e-4", "4.163e-3", "-1.435e-6", "-4.682e-5", "-1.127e-6", "2.064e-3", "2.120e-2", "3.715e-8"),
     ),
 }
-"""beta_0 .. beta_19 as printed; beta_10 of e_x has the wrong power of ten (math.md 3)."""
+"""beta_0 .. beta_19 as printed; beta_10 of e_x has the wrong power of ten."""
 
 DAMAGED = ("e_x", 10)
 RESTORED = Printed("-1.752e-5")
-"""beta_10 of e_x with the exponent that the ratios of Table 1 demand."""
+"""beta_10 of e_x with the exponent that follows from the quotients of Table 1."""
 
-PADDED = "the last 0 is padding: all six sums of regression and total in Table 2 end in 0, so three digits may be all there are"
+PADDED = "the last 0 is padding: all six sums of regression and total in Table 2 end in 0, so they may have three digits only"
 
 
 def _padded(text: str) -> Printed:
@@ -49,8 +49,8 @@ TABLE2_SUMS: dict[str, tuple[Printed, ...]] = {
     "e_y": (_padded("4.520e-2"), Printed("3.155e-4"), _padded("4.550e-2")),
     "e_z": (_padded("1.230e-2"), Printed("1.020e-4"), _padded("1.240e-2")),
 }
-"""Sums of squares: regression, residual, total. A padded fourth digit of regression and total is an assumption, so it can make a row
-consistent, not reproduced."""
+"""Sums of squares: regression, residual, total. That the fourth digit of regression and total is padding is an assumption; it can make a
+row consistent but not reproduced."""
 
 TABLE2_MEAN_SQUARES: dict[str, tuple[Printed, ...]] = {
     "e_x": printed("2.099e-3", "2.160e-6"),
@@ -92,7 +92,7 @@ MATH_CRITICAL_F = Printed("2.668")
 
 GEOMETRY_MM = {"R": 100.0, "r": 30.0, "l": 101.26, "l_up": 8.0, "l_dw": 8.0, "le": 20.0}
 GEOMETRY_DEG = 35.0
-"""Assumed by math.md 6: the paper prints no dimensions."""
+"""Dimensions that math.md 6 assumes; the paper prints none."""
 
 EXAMPLES: tuple[tuple[tuple[float, ...], tuple[Printed, ...]], ...] = (
     ((1.0, 1.0, 1.0), (Printed("0", last="0.00001"), Printed("0", last="0.00001"), Printed("113.61357"))),
@@ -103,4 +103,4 @@ EXAMPLES: tuple[tuple[tuple[float, ...], tuple[Printed, ...]], ...] = (
 EXAMPLE_WITHOUT_HALF = printed("1.330", "0.697", "114.090")
 LINKS_WITHOUT_HALF = printed("101.26", "101.65", "101.97")
 SQUARE_COMMANDS_MM = printed("-0.37", "2.37")
-"""Commands that a square of +-1 mm needs."""
+"""Smallest and largest command for a square of +-1 mm."""

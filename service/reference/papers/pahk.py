@@ -1,6 +1,6 @@
-"""Pahk, sections 3.2 and 4 (math.md 8): the numbers of two machines and a probe, and why most cannot be computed.
+"""Pahk, sections 3.2 and 4: the numbers of two machines and a probe.
 
-The figures with the curves and maps are not in the text.
+Most cannot be computed, because the figures with the curves and maps are lost.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ EXAMPLE = "5 µm · sin²φ cos 3θ + 2.5 µm · cos 2φ, less what centre and r
 
 
 def comparisons() -> list[Comparison]:
-    """Every number of the paper, in printed order, with the numbers that math.md adds."""
+    """Return the comparisons of every number of the paper, in printed order, and of the numbers that math.md adds."""
     return [*_probe(), *[r for cmm in CMMS for r in _machine(cmm)]]
 
 
@@ -129,7 +129,7 @@ def _pattern() -> list[Comparison]:
 
 
 def machine_inputs(cmm: Cmm) -> tuple[F1, F1]:
-    """Volume in mm and squareness XY, XZ, YZ in rad of a machine."""
+    """Return the volume in mm and the squareness XY, XZ, YZ in rad of a machine."""
     return np.array(values(cmm.volume_mm)), np.array([cmm.squareness_urad[k].value for k in ("XY", "XZ", "YZ")]) * URAD
 
 
@@ -148,7 +148,7 @@ def _machine(cmm: Cmm) -> list[Comparison]:
         Comparison(location, f"space diagonal {k}, deviation", "µm", number, why=why, series=f"diagonals of {cmm.name}")
         for k, number in enumerate(cmm.diagonals_um, 1)
     ]
-    random = "the random errors of the single parameters are printed for three of ten only, and their curves are lost"
+    random = "the random errors of the single parameters are printed for three of ten only, and the curves are lost"
     out += [
         Comparison(location, f"space diagonal {k}, random error", "µm", number, why=random, series=f"random errors of {cmm.name}")
         for k, number in enumerate(cmm.random_um, 1)
@@ -157,7 +157,7 @@ def _machine(cmm: Cmm) -> list[Comparison]:
 
 
 def _known(cmm: Cmm) -> list[Comparison]:
-    """Numbers of math.md about the machine: the evidence for "not reproducible"."""
+    """Return the comparisons of the numbers of math.md about the machine, the evidence for "not reproducible"."""
     location = f"8, {cmm.name}"
     diagonals_mm, misfit_rad, mean_um = _diagonals(cmm)
     length = float(np.linalg.norm(values(cmm.volume_mm)))
@@ -175,14 +175,14 @@ def _known(cmm: Cmm) -> list[Comparison]:
 
 
 def _diagonals(cmm: Cmm) -> tuple[dict[str, float], float, float]:
-    """Diagonals of squareness only (mm), misfit of the best order of the printed ones (rad), and the mean of the printed ones (um)."""
+    """Return diagonals by squareness only (mm), misfit of the best order of the printed ones (rad), and mean of the printed ones (um)."""
     volume, squareness = machine_inputs(cmm)
     misfit, _ = best_assignment(cmm.type_name, volume, squareness, [d.value * 1e-3 for d in cmm.diagonals_um])
     return squareness_diagonals_mm(cmm.type_name, volume, squareness), misfit, float(np.mean(values(cmm.diagonals_um)))
 
 
 def diagonal_evidence(cmm: Cmm) -> str:
-    """Reason why the printed diagonals cannot be reproduced, with the numbers that show it."""
+    """Return the reason why the printed diagonals cannot be reproduced, with the numbers that show it."""
     diagonals_mm, misfit_rad, mean_um = _diagonals(cmm)
     sizes = ", ".join(f"{name} {minus(f'{1e3 * value:.1f}')}" for name, value in diagonals_mm.items())
     return (
@@ -194,25 +194,25 @@ def diagonal_evidence(cmm: Cmm) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Example:
-    """The calibrated example, and the largest deviation of its map from the assumed lobing, mm."""
+    """Calibration of the example, and the largest deviation of its map from the assumed lobing, mm."""
 
     calibration: ProbeCalibration
     largest_mm: float
 
     def values_um(self, colatitude_rad: F1, longitude_rad: F1) -> F2:
-        """The map on a grid, shape (colatitudes, longitudes), um."""
+        """Return the map on a grid, um, shape (colatitudes, longitudes)."""
         grid = np.meshgrid(colatitude_rad, longitude_rad, indexing="ij")
         return np.asarray(1e3 * self.calibration.lobing_map().at_angles(*grid))
 
 
 def pattern() -> F2:
-    """Directions of the printed pattern: circles and points every 18 degrees, and the pole; shape (101, 2)."""
+    """Return the directions of the printed pattern, circles and points every 18 degrees and the pole, shape (101, 2)."""
     step = PATTERN_STEP_DEG.value
     return master_sphere_pattern(round(90.0 / step), round(360.0 / step), float(np.deg2rad(step)))
 
 
 def example_lobing_mm(directions_rad: F2) -> F1:
-    """The assumed lobing: the three lobes of a kinematic touch-trigger probe, and a difference between pole and equator."""
+    """Return the assumed lobing: the three lobes of a kinematic touch-trigger probe, and a difference between pole and equator."""
     phi, theta = directions_rad.T
     return without_absorbed(directions_rad, THREE_LOBES_MM * np.sin(phi) ** 2 * np.cos(3.0 * theta) + POLE_MM * np.cos(2.0 * phi))
 

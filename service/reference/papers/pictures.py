@@ -24,11 +24,11 @@ from abbe.service.rendering.plots.volume import deformed_grid
 
 NODES = 5
 SURFACE_NODES = 41
-"""Nodes per side of Kwon's square in both pictures of a surface: the paper's nine, and four between neighbours."""
+"""Nodes per side of Kwon's square in the pictures of a surface: the paper's nine, and four between neighbours."""
 
 
 def figures(paper: Paper) -> list[Picture]:
-    """Pictures of one paper, in printed order."""
+    """Return the pictures of one paper, in printed order."""
     if paper == "pahk":
         return [_probe(), _machines()]
     if paper == "yang":
@@ -64,7 +64,7 @@ def _surface(component: str, z_mm: float) -> Surface:
 
 
 def _hemisphere(step_deg: float) -> tuple[F1, F1]:
-    """Colatitudes and longitudes of the upper half of a sphere, rad, including equator and full turn."""
+    """Return colatitudes and longitudes of the upper half of a sphere, rad, including equator and full turn."""
     low, around = (np.deg2rad(np.arange(0.0, end + step_deg / 2, step_deg)) for end in (90.0, 360.0))
     return low, around
 
@@ -83,8 +83,8 @@ def _probe() -> Picture:
     caption = (
         "Pahk, Figs. 3(a) and 3(b), EXAMPLE: the paper's map is not printed. Master sphere, effective ball radius and the 101 directions"
         f" (dots) are the printed ones (Rs {pahk.SPHERE_MM.text} mm, Reff {pahk.EFFECTIVE_MM.text} mm, every"
-        f" {pahk.PATTERN_STEP_DEG.text}°); the lobing is declared: {EXAMPLE}. Drawn is the map that the calibration recovers"
-        f" (Reff {found.calibration.effective_radius_mm:.4f} mm, map within {short(1e3 * found.largest_mm)} µm of the declared one),"
+        f" {pahk.PATTERN_STEP_DEG.text}°); the lobing is assumed: {EXAMPLE}. The picture shows the map that the calibration recovers"
+        f" (Reff {found.calibration.effective_radius_mm:.4f} mm, map within {short(1e3 * found.largest_mm)} µm of the assumed one),"
         " bilinear between the touches. Positive: the probe triggers late. Dashed: equator of the ball without error."
     )
     return Picture(caption, pictures)
@@ -93,7 +93,7 @@ def _probe() -> Picture:
 def _machines() -> Picture:
     caption = (
         "Pahk, Figs. 5 and 7(a): volumetric error of CMM A and CMM B, 5 × 5 × 5 nodes, tool relative to workpiece, Y line as datum"
-        " as in the paper. Only the three printed squareness errors are in it: the positional, straightness and angular curves of Figs. 4"
+        " as in the paper. It contains only the three printed squareness errors: the positional, straightness and angular curves of Figs. 4"
         " and 6 are lost, so these are not the paper's maps. Dashed: as commanded; solid: with the errors magnified as each picture states."
     )
     return Picture(caption, tuple(_machine(cmm) for cmm in pahk.CMMS))

@@ -1,4 +1,4 @@
-"""Wang, section IV (math.md 8): the numbers of the error discussion. Part I holds no measured data."""
+"""Wang, section IV: the numbers of the error discussion. Part I of the paper has no measured data."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ CUBE = np.ones(3)
 
 
 def comparisons() -> list[Comparison]:
-    """Every number of the paper, in printed order."""
+    """Return the comparisons of every number of the paper, in printed order."""
     share = float(projection_factors(CUBE)[0])
-    # The text writes the factor as "one over root three squared": read literally a third.
+    # Literally, the text's "one over root three squared" is a third.
     literal = Erratum("the text writes 1/√3²; 1/√3 is meant", Computed(share))
     of_cube = "projection_factors of a cube"
     return [
@@ -56,7 +56,7 @@ def _mirror() -> Comparison:
     computed = Computed(1e3 * abs(float(reading_mm(step, mirror_normal(beam, tilt), beam)[0])))
     how = "reading_mm of a 50 mm step across the beam to a mirror_normal tilted by 0.5 mrad"
     why = (
-        "the paper gives an upper bound. It calls the error constant and removable by calculation: that takes 12 slopes away with it and"
-        " leaves only 3 squarenesses and one weighted scale (math.md 5.4)"
+        "the paper gives an upper bound. It calls the error constant and removable by calculation; but that also removes 12 slopes and"
+        " leaves only 3 squareness errors and one weighted scale error"
     )
     return Comparison("IV.C", "mirror askew by 0.5 mrad, step of 50 mm", "µm", MIRROR_UM, computed, how, why)

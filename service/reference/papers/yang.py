@@ -1,4 +1,4 @@
-"""Yang and Kim (math.md 8): Tables 1 to 6 and the text of 3.3, and a round trip of the method."""
+"""Yang and Kim: comparisons for Tables 1 to 6 and the text of 3.3, and a round trip of the method."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOT_PRINTED = {
 }
 
 TURNS = 5.0
-"""Not in the paper (math.md 4.3)."""
+"""Assumed; the paper does not print it."""
 
 CENTRE_MM = np.array([406.4, 0.0, -254.0])
 """Middle of the XZ bed, workpiece coordinates; the height is not printed."""
@@ -33,16 +33,16 @@ CENTRE_MM = np.array([406.4, 0.0, -254.0])
 TOOL_MM = np.array([0.0, 0.0, 150.0])
 URAD = 1e6
 BOUND_URAD = 0.02
-"""math.md 8: least squares must return the laser column to less than this."""
+"""math.md 8: the fit must return the laser column within this."""
 
 
 def comparisons() -> list[Comparison]:
-    """Every number of the paper, in printed order, and the round trips."""
+    """Return the comparisons of every number of the paper, in printed order, and the round trips."""
     return [*_table1(), *_table2(), *_table3(), *_table4(), *_table5(), *_table6(), *_round_trips()]
 
 
 def _table1() -> list[Comparison]:
-    lost = "the laser's polynomials, the range and the random points are not printed; only the interval's arithmetic can be redone"
+    lost = "the polynomials of the laser, the range and the random points are not printed; only the interval can be recomputed"
     out = []
     for name, (mean, sd, _, _) in paper.TABLE1.items():
         out.append(Comparison("Table 1", f"mean of {name}", "µm", mean, why=lost, series="means"))
@@ -94,7 +94,7 @@ def _table4() -> list[Comparison]:
     for name, (largest, position, mean) in paper.TABLE4.items():
         bar = paper.TABLE2[name][1].value * position.value * 1e3
         why = (
-            f"the laser readings are not printed. Consistency only: the bar line stands at {bar:.1f} µm there, so the laser should read"
+            f"the laser readings are not printed. The line of the bar is at {bar:.1f} µm there, so the laser should read"
             f" {bar + largest.value:.1f} µm"
         )
         out.append(Comparison("Table 4", f"{name}, largest laser − bar, at {position.text} mm", "µm", largest, why=why))
@@ -145,20 +145,20 @@ def _products(location: str, name: str, inputs: tuple[Printed, Printed, Printed]
 
 
 def restored_x_mm() -> list[float]:
-    """Positions of Table 3 with the damaged one replaced by the mean of its neighbours, which are equally spaced."""
+    """Return the positions of Table 3 with the damaged one replaced by the mean of its neighbours."""
     x = values(paper.TABLE3_X)
     x[paper.DAMAGED] = 0.5 * (x[paper.DAMAGED - 1] + x[paper.DAMAGED + 1])
     return x
 
 
 def bar_line_um() -> list[float]:
-    """The ball bar's line at the positions of the laser's readings, um."""
+    """Return the line of the ball bar at the positions of the laser readings, um."""
     slope = paper.TABLE2["dxx"][1].value
     return [slope * x * 1e3 for x in restored_x_mm()]
 
 
 def _laser_slopes(printed: Printed) -> list[Comparison]:
-    """The laser's slope of Table 2 from the readings of Table 3: only a line through the origin reproduces it."""
+    """Compare the laser slope of Table 2 with lines through Table 3; only a line through the origin reproduces it."""
     x = np.array(restored_x_mm())
     rounding = "readings rounded to 0.1 µm"
     by_origin = computed_from(lambda *y: slope_through_origin(x, np.array(y)) * 1e-3, *paper.TABLE3_LASER, because=rounding)
@@ -176,7 +176,7 @@ def _laser_slopes(printed: Printed) -> list[Comparison]:
 
 
 def _table3() -> list[Comparison]:
-    """Positions, the three columns, and the numbers that the text derives from them."""
+    """Compare the positions, the three columns, and the numbers that the text derives from them."""
     return [_position(), *_laser_column(), *_bar_column(), *_difference_column(), *_derived()]
 
 
@@ -210,7 +210,7 @@ def _difference_column() -> list[Comparison]:
 
 
 def _in_column(name: str, x_mm: float, number: Printed, value_um: float, how: str) -> Comparison:
-    """Row of a column; the number at the origin is always zero, so it is not evidence."""
+    """Compare a number of a column; at the origin it is always zero and so counts as an input."""
     quantity, series = f"{name} at {x_mm:g} mm", f"{name} column"
     if x_mm == 0.0:
         why = "zero by construction: readings and lines start at the origin"
@@ -235,7 +235,7 @@ def _derived() -> list[Comparison]:
 
 @dataclass(frozen=True, slots=True)
 class RecoveredErrors:
-    """The six fitted parameters for the helix of one radius, and the effect of the neglected second order on each."""
+    """The six parameters fitted to the helix of one radius, and the largest effect of the neglected second order on each."""
 
     radius_mm: float
     values: dict[str, float]
@@ -243,7 +243,7 @@ class RecoveredErrors:
 
 
 def recover(radius_mm: float) -> RecoveredErrors:
-    """Simulate exact bar lengths of a machine with the laser column's errors and fit the six parameters (paper: 175 and 100 mm)."""
+    """Simulate exact bar lengths of a machine with the errors of the laser column and fit the six parameters."""
     truth = {name: row[0].value for name, row in paper.TABLE2.items()}
     points = helix_points(CENTRE_MM, radius_mm, turns=TURNS, n=paper.POINTS)
     moved = _deviation_mm(truth, points) - _deviation_mm(truth, CENTRE_MM[None])
@@ -267,19 +267,19 @@ def _deviation_mm(truth: dict[str, float], points_mm: F2) -> F2:
 
 
 def _round_trips() -> list[Comparison]:
-    """Laser column against the parameters fitted to simulated readings, urad (a slope of 1e-6 counts as 1 urad).
+    """Compare the laser column with the parameters fitted to simulated readings, urad (a slope of 1e-6 counts as 1 urad).
 
-    The ball-bar column cannot be recomputed: 15 more error functions, origins and tool are not printed. The method can be checked: a
-    machine with the six errors of the laser column, exact bar lengths on the hemispherical helix, and the paper's linear fit.
+    The ball-bar column cannot be recomputed, because 15 more error functions, origins and tool are not printed. This checks the method
+    instead: the paper's linear fit to exact bar lengths on the helix, for a machine with the six errors of the laser column.
     """
     out = []
     how = "delta_exact of a machine with the laser column of Table 2, helix_points (63, 5 turns), reading_eq6, fit_helix with six unknowns"
     for radius in paper.BAR_RADII:
         found = recover(radius.value)
         why = (
-            f"math.md 8 demands less than {BOUND_URAD} µrad. The readings are simulated from the paper's numbers: this tries"
+            f"math.md 8 demands less than {BOUND_URAD} µrad. The readings are simulated from the paper's numbers: this tests"
             f" the fit, not the paper. Turns, height of the cup and tool are assumed (not printed); the second order that"
-            f" the fit neglects may move one of them by {max(found.second_order.values()) * URAD:.3f} µrad"
+            f" the fit neglects may change a parameter by {max(found.second_order.values()) * URAD:.3f} µrad"
         )
         series = f"laser column by helix R {radius.text} mm"
         for name, (laser, _, _) in paper.TABLE2.items():

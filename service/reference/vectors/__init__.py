@@ -1,1 +1,1 @@
-"""Readers of independent vector files: what each stored number is compared with."""
+"""Readers of the independent vector files; each compares the stored numbers with computed ones."""

@@ -1,4 +1,4 @@
-"""`kwon_kinematics.json` and `kwon_rsm.json`: the 3-PUU machine and the response surfaces of its errors (math.md 6)."""
+"""`kwon_kinematics.json` and `kwon_rsm.json`: the 3-PUU machine and the response surfaces of its errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from abbe.service.reference.vector_file import LAYOUT, VectorCase
 
 HALF_MM = 1.0
 MIDDLE_MM = 1.0
-"""The workspace is the square of +-1 mm at the height that all three drives at 1 mm give (math.md 6, "Stroke")."""
+"""The workspace is the square of +-1 mm at the height of the ball centre when all drives are at 1 mm."""
 
 ROOTS = "roots of 1e4 mm2"
 DIGITS = 4
@@ -41,13 +41,13 @@ DIGITS = 4
 PRINTED_DIGITS = 7
 """Largest number of significant digits in Table 2."""
 SUM_DIGITS = 3
-"""Valid digits of the sums of squares of Table 2 and of their total (math.md 6: 4.240e-2, 4.250e-2)."""
+"""Valid digits of the sums of squares of Table 2 and of their total; a printed fourth digit 0 (4.240e-2) may be padding."""
 COMPONENTS = ("ex", "ey", "ez")
 PLANES = ("rank plane 9x9, Z=const", "rank 2 planes", "rank 3 planes", "rank 4 planes")
 NEAR_F = 1e-3
-"""Relative agreement of the printed F with a quotient of the other printed numbers, limited by their rounding."""
+"""Accepted relative difference of the printed F from a quotient of other printed numbers, because of their rounding."""
 REGRESSION_DOF, RESIDUAL_DOF = 20, 60
-"""Degrees of freedom of the paper, used for the file's mean squares."""
+"""Degrees of freedom of the paper, for the mean squares in the file."""
 POINTS = 81
 RANK = 10
 UM = 1e3
@@ -110,13 +110,13 @@ def _frame(part: VectorCase, checks: Checks) -> None:
 
 
 def _truth(part: VectorCase, checks: Checks) -> None:
-    """Check that the placement of the measured points is a rotation; its position depends on unknown machine errors."""
+    """Check that the placement of the measured points contains a rotation; its shift depends on unknown machine errors."""
     rotation = part.array(shape=(4, 4))[:3, :3]
     for i, row in enumerate(nearest_rotation(rotation)):
         for k, value in enumerate(row):
             checks.check_form("placement is a rotation", value, part.at(i, k), floor=5e-16)
         checks.leave_out(
-            "shift of the placement", part.at(i, 3), "the points carry the machine's own errors, which no input separates from it"
+            "shift of the placement", part.at(i, 3), "the points contain errors of the machine, which no input separates from the shift"
         )
     checks.check_form("last row of the placement", np.array([0.0, 0.0, 0.0, 1.0]), part.at(3))
 
@@ -129,7 +129,7 @@ def read_rsm(case: VectorCase, checks: Checks) -> None:
         _planes(case, component, checks)
         _table2(case.at(f"table2 {component}"), checks)
     _ranks(case, checks)
-    checks.assume("coefficients of Table 1 were printed with four digits: so rounded they are recovered from their values on two planes")
+    checks.assume("the coefficients of Table 1 have four digits, which makes it possible to recover them from their values on two planes")
     for key, part in case.at("F_crit").items():
         df_reg, df_res, alpha = _three_numbers(key, part)
         checks.compare("critical F", critical_f(int(df_reg), int(df_res), alpha), part, unit="1", floor=1e-14)
@@ -137,7 +137,7 @@ def read_rsm(case: VectorCase, checks: Checks) -> None:
 
 
 def _three_numbers(key: str, part: VectorCase) -> tuple[float, float, float]:
-    """Both degrees of freedom and the level of a key such as ``F(9,71,.01)``."""
+    """Return both degrees of freedom and the level from a key such as ``F(9,71,.01)``."""
     match = re.fullmatch(r"F\((\d+),(\d+),(0?\.\d+)\)", key)
     if match is None:
         raise FileFormatError(f"{part.label}: expected a key such as F(9,71,.01)", LAYOUT)
@@ -145,7 +145,7 @@ def _three_numbers(key: str, part: VectorCase) -> tuple[float, float, float]:
 
 
 def _planes(case: VectorCase, component: str, checks: Checks) -> None:
-    """Coefficients and sums of one component on the implied and on the printed plane."""
+    """Compare coefficients and sums of one component on the implied and on the printed plane."""
     implied, printed = (_find(case, component, word) for word in ("implied", "printed"))
     z_implied = case.number("implied_plane_Z")
     z_printed = float(printed.path[-1].split("Z=")[1].split()[0])  # type: ignore[union-attr]
@@ -213,7 +213,7 @@ def _table2(part: VectorCase, checks: Checks) -> None:
         checks.compare(f"Table 2, {key}", value, part.at(key), unit="1", floor=1e-19)
     quotients = [computed[key] for key in ("MSR/MSE_printed", "F(20,60)", "F(20,61 for MSE)")]
     nearest = min(quotients, key=lambda f: abs(f - part.number("F_printed")))
-    rounding = "the nearest quotient of the printed numbers: no rule of math.md gives all three F"
+    rounding = "compared with the nearest quotient of the printed numbers, as no single rule gives all three F"
     checks.compare("Table 2, F_printed", nearest, part.at("F_printed"), unit="1", floor=0.0, relative=NEAR_F, rounding=rounding)
 
 
@@ -240,5 +240,5 @@ def _printed(value: float) -> float:
 
 
 def _half_unit(value: float) -> float:
-    """Half a unit of the last valid digit of a sum of squares."""
+    """Return half a unit of the last valid digit of a sum of squares."""
     return float(0.5 * 10.0 ** (np.floor(np.log10(max(abs(value), 1e-300))) + 1 - SUM_DIGITS))

@@ -1,4 +1,4 @@
-"""`pahk_*.json`: ten machines measured on offset lines, deviation in the volume, random errors, space diagonals (math.md 2, 8)."""
+"""`pahk_*.json`: ten machines measured on offset lines, deviation in the volume, random errors, space diagonals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from abbe.service.reference.vector_file import LAYOUT, VectorCase
 
 AXES = "XYZ"
 SUBTRACTED = "coordinates of up to 900 mm were subtracted"
-LINE = "a line was fitted to the values and taken off"
+LINE = "a fitted line was subtracted from the values"
 LAST = "last digit of a cubic polynomial"
 FLOORS = {"positioning": (1.2e-13, SUBTRACTED, LAST), "straightness": (1e-16, LINE, LINE)}
 """Rounding of the stored number in mm, its reason, and the reason of the rounding of the parameters."""
@@ -31,24 +31,24 @@ FORMS: dict[str, tuple[Form, float, str]] = {
 }
 """Key of the file, form of the chain, rounding of the stored number in mm and its reason."""
 FLOAT64 = 4e-15
-"""Tolerance of a root of a sum of 21 squares: nothing cancels, so it is a few units in the last place."""
+"""Tolerance of the root of a sum of 21 squares: without cancellation, a few units in the last place."""
 PRINTED_TYPE = "MB1"
-"""Machine with a printed P (5), which its cases must hold."""
+"""Machine for which P (5) is printed; its cases must contain these numbers."""
 LENGTHS = "two lengths of 1142 mm were subtracted"
 
 
 def pair(part: VectorCase, key: str) -> F2:
-    """Nine numbers of ``d`` or ``E`` as an array, shape (3 axes, 3 directions)."""
+    """Return nine numbers of ``d`` or ``E`` as an array, shape (3 axes, 3 directions)."""
     return np.array([[part.number(key, direction + axis) for direction in AXES] for axis in AXES])
 
 
 def squareness(part: VectorCase) -> F1:
-    """alpha, beta1, beta2, shape (3,)."""
+    """Return alpha, beta1, beta2, shape (3,)."""
     return np.array([part.number(name) for name in ("alpha", "beta1", "beta2")])
 
 
 def read_abbe(case: VectorCase, checks: Checks) -> None:
-    """Compare the file's "measured" and "true" values in both directions."""
+    """Compute "measured" from "true" values of the file, and "true" from "measured" ones, and compare them."""
     length = case.array("L", shape=(3,))
     for name, part in case.at("types").items():
         count = len(part.at("true_translational", "XX").parts())
@@ -91,18 +91,18 @@ def _three(of_axis: Callable[[int], F2]) -> Triple:
 
 
 def _coefficients(part: VectorCase, key: str, axis: int) -> F2:
-    """c1, c2, c3 of the three directions of an axis, shape (3 directions, 3)."""
+    """Return c1, c2, c3 of the three directions of an axis, shape (3 directions, 3)."""
     return np.stack([part.array("coef", key, direction + AXES[axis], shape=(3,)) for direction in AXES])
 
 
 def _cubic(u: F1, coefficients: F2) -> F2:
-    """c1 u + c2 u^2 + c3 u^3, shape (n, 3 directions)."""
+    """Return c1 u + c2 u^2 + c3 u^3, shape (n, 3 directions)."""
     powers: F2 = np.stack([u, u * u, u * u * u], axis=1)
     return np.asarray(powers @ coefficients.T)
 
 
 def _translations(x: F1, length: float, coefficients: F2, axis: int) -> F2:
-    """Positioning unchanged, straightness minus its least-squares line with intercept, as the file's text states."""
+    """Return positioning unchanged and straightness without its least-squares line with intercept, as the file's text states."""
     d = _cubic(x / length, coefficients)
     for i in set(range(3)) - {axis}:
         slope, start = straight_line(x, d[:, i])
@@ -120,7 +120,7 @@ def read_volumetric(case: VectorCase, checks: Checks) -> None:
         kind = pahk_type(name)
         ours, theirs = kind.chain.replace("-", "").removeprefix("w").removesuffix("t").replace("b", "F"), part.text("chain")
         if ours != theirs:
-            raise FileFormatError(f"{part.label}/chain: {name} is {ours}, the file says {theirs}", "compare with math.md 2")
+            raise FileFormatError(f"{part.label}/chain: the chain of {name} is {ours}, but the file says {theirs}", "correct the file")
         checks.compare("sign of alpha", kind.alpha_sign, part.at("alpha_sign"), unit="1")
         for point in part.at("cases").parts():
             _point(kind, point, checks)
@@ -137,7 +137,7 @@ def _point(kind: PahkType, point: VectorCase, checks: Checks) -> None:
 
 
 def read_random(case: VectorCase, checks: Checks) -> None:
-    """Compare RX, RY, RZ of every case, with the coverage factor of the inputs."""
+    """Compare RX, RY, RZ of every case, in the coverage of the inputs."""
     for name, part in case.at("types").items():
         for point in part.parts():
             axes, probe, given = point.array("X", shape=(3,))[None], point.array("probe", shape=(3,)), point.at("R")
@@ -150,7 +150,7 @@ def read_random(case: VectorCase, checks: Checks) -> None:
 
 
 def read_diagonals(case: VectorCase, checks: Checks) -> None:
-    """Compare both forms of every diagonal; every function is zero at the start of its axis and as given at the full travel."""
+    """Compare both forms of every diagonal; each function is zero at the start of its axis and has the given value at full travel."""
     volume = case.array("volume", shape=(3,))
     for name, part in case.at("types").items():
         given = part.at("value_at_full_travel")
@@ -165,5 +165,5 @@ def read_diagonals(case: VectorCase, checks: Checks) -> None:
 
 
 def _ramps(ends: F2) -> Triple:
-    """Tables of two values: zero, and the row of each axis."""
+    """Return tables of two rows for each axis: zeros, and the given values."""
     return np.stack([0.0 * ends[0], ends[0]]), np.stack([0.0 * ends[1], ends[1]]), np.stack([0.0 * ends[2], ends[2]])

@@ -1,6 +1,6 @@
-"""`paper_tables.json`: tables of the papers, and results derived from them (math.md 8).
+"""`paper_tables.json`: tables of the papers, and results derived from them.
 
-Lengths that the file gives in um stay in um: their floors are in um, and the unit column says "1".
+Lengths that the file gives in um stay in um, with floors in um and the unit "1".
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ DIGITS = 5
 """Significant digits of Yang's Table 2."""
 
 REVERSED = ("Syz",)
-"""Rows of Table 2 whose difference is printed with the sign reversed (math.md 3)."""
+"""Rows of Table 2 whose difference is printed with the sign reversed."""
 
 ROWS = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
 """Rows of Table 2: laser, bar, difference."""
 
 TYPES = {"pahk_A": "MB1", "pahk_B": "MH2"}
-"""Pahk's machines (section 4); for squareness alone, all types with X on the tool side have the same diagonals."""
+"""Types of Pahk's machines (section 4). For squareness alone, all types with X on the tool side have the same diagonals."""
 
 
 def read(case: VectorCase, checks: Checks) -> None:
@@ -73,11 +73,11 @@ def _pahk(part: VectorCase, type_name: str, checks: Checks) -> None:
 
 
 def _unit(values: F1) -> F1:
-    """One unit of the fifth significant digit."""
+    """Return one unit of the fifth significant digit."""
     size: F1 = 10.0 ** (np.floor(np.log10(np.maximum(np.abs(values), 1e-300))) - DIGITS + 1)
     return size
 
 
 def _as_printed(values: F1) -> F1:
-    """Numbers rounded to the digits of Table 2."""
+    """Round numbers to the digits of Table 2."""
     return np.array([float(f"{v:.{DIGITS - 1}e}") for v in values])

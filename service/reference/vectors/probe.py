@@ -1,4 +1,4 @@
-"""`probe.json`: frame and angles of a tilting probe, calibration on a master sphere, geometry and probe combined (math.md 7)."""
+"""`probe.json`: frame and angles of a tilting probe, calibration on a master sphere, geometry and probe combined."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from abbe.service.reference.vector_file import VectorCase
 Lobe = Callable[[F1, F1], F1]
 NUMBER = r"([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)"
 LOBE = re.compile(rf"lobe\(ph,th\)={NUMBER} sin\(ph\)\^2 cos\(3th\+{NUMBER}\)\+{NUMBER}\(cos\(ph\)\^2-1/3\)\+{NUMBER} sin\(2ph\)cos\(th\)")
-"""Text of the lobing in the file, with its four numbers as groups."""
+"""Formula of the lobing in the text of the file, with its four numbers as groups."""
 COORDINATES = "coordinates of up to 150 mm were subtracted"
 
 
@@ -31,7 +31,7 @@ def read(case: VectorCase, checks: Checks) -> None:
 
 
 def stated_lobe(note: str) -> Lobe | None:
-    """Lobing function of the file's text, mm over colatitude and longitude; None for another kind."""
+    """Return the lobing function from the text of the file, mm over colatitude and longitude; None if the formula is unknown."""
     found = LOBE.search(note)
     if found is None:
         return None
@@ -63,11 +63,11 @@ def _sphere(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
         along = middle + away[:, None] * normal
         checks.check_form("ball centres along their directions", along, stored, unit="mm", floor=5e-14, rounding=COORDINATES)
     else:
-        # A touch ends at the contact of sphere and ball, minus the probe's error there.
+        # The distance of a touch is sphere radius plus ball radius minus the probe error.
         error = lobe(angles[:, 0], angles[:, 1])
         radius = float(np.median(away + error))
         tip = radius - part.number("Rs")
-        checks.assume(f"the ball of the stylus has a radius of {tip:.6g} mm: the one that all ball centres agree with")
+        checks.assume(f"the ball of the stylus has a radius of {tip:.6g} mm, which agrees with all ball centres")
         at = middle + (radius - error)[:, None] * normal
         checks.compare("ball centres", at, stored, unit="mm", floor=2e-13, rounding=COORDINATES)
     found = calibrate(centres, angles, part.number("Rs"))
@@ -85,7 +85,7 @@ def _combined(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
     frame = probe_frame(part.array("A"), part.array("B"))
     if lobe is None:
         # Touches may lie below the equator, outside the calibration of the file.
-        checks.leave_out("probe error of a touch", part.at("probe"), "the file's text states no lobing function that is known here")
+        checks.leave_out("probe error of a touch", part.at("probe"), "the text of the file states no known lobing function")
         probe = part.array("probe")
     else:
         probe = lobe(*direction_angles(to_probe(frame, n)))

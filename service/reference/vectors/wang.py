@@ -1,4 +1,4 @@
-"""wang_step_diagonal.json: simulated step diagonals with and without tilt, squareness, ranks and the demonstration of math.md 5.5."""
+"""`wang_step_diagonal.json`: simulated step diagonals with and without tilt, squareness, ranks, and a demonstration of compensation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from abbe.service.reference.vector_file import LAYOUT, VectorCase
 
 RANK_STEPS = 20
 RANK_POSITIONS = 20
-"""math.md 4.6 has 20 steps; the effective ranks of the file result only with 20 positions per line."""
+"""Found by trial: the effective ranks of the file result only with these."""
 ORDERS2 = ("XYZ", "ZYX")
 RANK_PLANS: dict[str, Callable[[F1], WangPlan]] = {
     "ideal mirror": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, tilts=False),
@@ -43,7 +43,7 @@ RANK_PLANS: dict[str, Callable[[F1], WangPlan]] = {
 NODES = 5
 DEGREE = 3
 ANGLE_SCALE = 1.0 / 500.0
-"""Relative weight of angles, squareness and tilts against millimetres in the file's minimum-norm solution (as in yang_ballbar_complete)."""
+"""Weight of angles, squareness and tilts against mm in the minimum-norm solution of the file."""
 IDEAL, TILTED = "with_angles|none", "with_angles|tilt_0.5mrad"
 NOISY = "same with 0.1um noise"
 DEMO_PLANS: dict[str, Callable[[F1, int], WangPlan] | None] = {
@@ -62,18 +62,18 @@ CURVES = tuple(i + a for a in "XYZ" for i in "XYZ")
 
 
 def read(case: VectorCase, checks: Checks) -> None:
-    """Every case, then squareness, ranks and the demonstration."""
+    """Compare every case, then squareness, ranks and the demonstration."""
     n = case.whole("n")
     inc = case.array("inc", shape=(3,))
     for _ in case.at("compensation_demo").named("metric", *DEMO_PLANS):
-        pass  # all must exist; they are computed last
+        pass  # check that all exist; they are compared last
     for _, part in case.at("cases").items():
         _readings(part, checks, n, inc)
         _curves(part, checks, n, inc)
     _squareness(case.at("squareness"), checks)
     checks.assume(
-        f"the ranks are of {RANK_STEPS} steps per diagonal and {RANK_POSITIONS} positions per straight line: only with these all effective "
-        "ranks come out"
+        f"the ranks hold for {RANK_STEPS} steps per diagonal and {RANK_POSITIONS} positions per straight line, the only numbers that give "
+        "all effective ranks"
     )
     for key, part in case.at("ranks").named(*RANK_PLANS):
         plan = RANK_PLANS[key](n * inc)
@@ -85,7 +85,7 @@ def read(case: VectorCase, checks: Checks) -> None:
 
 
 def errors_of(part: VectorCase, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
-    """The machine of a case: ``d_coef["YX"]`` powers 1, 2, .. of x / travel in delta_y(X) (mm), ``a_coef`` likewise (rad)."""
+    """Return the errors of a case: ``d_coef["YX"]`` holds the coefficients of (x / travel)^1, ^2, .. in delta_y(X), mm; ``a_coef``, rad."""
     u = np.asarray(axes_mm) / travel_mm
     d, e = np.zeros((len(u), 3, 3)), np.zeros((len(u), 3, 3))
     for out, key in ((d, "d_coef"), (e, "a_coef")):
@@ -98,7 +98,7 @@ def errors_of(part: VectorCase, axes_mm: F2, travel_mm: F1) -> ErrorArrays:
 
 
 def tilts_of(part: VectorCase) -> dict[str, F1]:
-    """Mirror tilts of a case, two angles per diagonal; empty: ideal mirrors."""
+    """Return the mirror tilts of a case, two angles per diagonal; empty for ideal mirrors."""
     if not part.at("tilt").value:
         return {}
     return {name: angles.array(shape=(2,)) for name, angles in part.at("tilt").named(*DIAGONALS)}
@@ -157,7 +157,7 @@ def _squareness(part: VectorCase, checks: Checks) -> None:
 
 
 def _demonstration(case: VectorCase, checks: Checks, n: int, inc: F1) -> None:
-    """Worst error of all distances in a grid before and after each compensation, of the machine ``with_angles`` (found by trial)."""
+    """Compare the largest error of all distances in a grid before and after each compensation."""
     travel, demo, machine = n * inc, case.at("compensation_demo"), case.at("cases", TILTED)
     grid = volume_grid(np.stack([np.zeros(3), travel], axis=1), NODES)
 
@@ -174,21 +174,21 @@ def _demonstration(case: VectorCase, checks: Checks, n: int, inc: F1) -> None:
     maps = {"no_compensation": np.zeros_like(grid), "wang_eq7_ideal_mirror": curves(IDEAL), "wang_eq7_tilt_0.5mrad": curves(TILTED)}
     tilts = {name: angles.array() for name, angles in machine.at("tilt").items()}
     checks.assume(
-        f"compensation_demo is of the machine {TILTED!r}: all distances in a grid of {NODES} nodes per axis; rigid-body solutions of "
-        f"degree {DEGREE} weight angles {ANGLE_SCALE:g} against mm"
+        f"compensation_demo holds for the machine {TILTED!r} and all distances in a grid of {NODES} nodes per axis; rigid-body solutions "
+        f"of degree {DEGREE} weight angles {ANGLE_SCALE:g} against mm"
     )
     for key, plan in DEMO_PLANS.items():
         if plan is not None:
             maps[key] = _rigid(plan(travel, n), grid, deviation, tilts)
         if key in maps:
-            why = "distances of 1000 mm subtracted, and readings good to 3e-13 mm; in µm"
+            why = "difference of distances of 1000 mm, and readings accurate to 3e-13 mm; in µm"
             worst = worst_um(maps[key])
             checks.compare("worst distance after compensation", worst, demo.at(key), unit="1", floor=1e-9, rounding=why, relative=1e-9)
-    checks.leave_out("worst distance after compensation, with noise", demo.at(NOISY), "the draws of the noise are not in the file")
+    checks.leave_out("worst distance after compensation, with noise", demo.at(NOISY), "the file does not contain the noise")
 
 
 def _rigid(plan: WangPlan, grid_mm: F2, deviation: Callable[[F2], F2], tilts: dict[str, F1]) -> F2:
-    """Map of the cubic rigid-body model by least squares with mirror tilts as unknowns."""
+    """Return the map of the cubic rigid-body model fitted by least squares with the mirror tilts as unknowns."""
     a, setup = problem(plan, DEGREE)
     terms = monomials(DEGREE)
     scale = np.array([1.0 if t.kind == "d" else ANGLE_SCALE for t in terms] + [ANGLE_SCALE] * setup.shape[1])

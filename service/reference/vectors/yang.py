@@ -1,4 +1,4 @@
-"""`yang_*.json`: complete model, helix, conditioning, ranks, and all 21 errors by ball bar (math.md 4)."""
+"""`yang_*.json`: complete model, helix, conditioning, ranks, and all 21 errors by ball bar."""
 
 from __future__ import annotations
 
@@ -50,28 +50,28 @@ LAWS: dict[str, Law] = {"angle": "angle", "area": "area"}
 RADII_MM = (175.0, 100.0)
 POINTS = 63
 TURNS = 5
-"""Layout of the file: 63 points, 175 mm, with two bars also 100 mm; 5 turns unless its key differs."""
+"""The file has 63 points and a bar of 175 mm, with two bars also 100 mm, and 5 turns unless a key says otherwise."""
 KINDS = ("six_angle_", "six_area_", "ten_", "corr9_", "two_radii")
 TWO_BARS = tuple(f"centre_{c}_radius_{r}" for c in ("common", "separate") for r in ("common", "separate"))
 ORIGIN = np.zeros(3)
 PER_UM = 1e-3
 """mm of reading noise in one µm."""
-INVERTED = "the vector inverted normal equations of condition up to 1900 squared"
+INVERTED = "the file's numbers come from inverted normal equations with a condition number of up to 1900 squared"
 DETERMINED = "last digits of a least-squares solution"
 DECIMALS = 4
-"""Decimals of the combinations in the file; the computed ones are rounded to them and must then be equal."""
+"""Decimals of the combinations in the file; the computed ones, rounded to them, must be equal."""
 NO_TRACE = 1e-9
 INNER = (0.1, 0.9)
 NODES = 4
-"""Nodes per axis over the inner 80 % of the travels for the file's figures of the map (found by trial)."""
+"""Nodes per axis, over the inner 80 % of the travels, for the numbers about the map in the file (found by trial)."""
 STEPS = 20
 DEGREES = 4
-"""Degrees of the noise gains: d1 to d4 in the file's key."""
+"""Number of degrees of the noise gains: d1 to d4 in the key of the file."""
 UM = 1e3
 
 
 def read_volumetric(case: VectorCase, checks: Checks) -> None:
-    """Every case of the file through the model's three forms."""
+    """Compare every case of the file with the three forms of the model."""
     for part in case.at("cases").parts():
         errors = errors_of(part)
         slide, tool = part.array("xyz_slide", shape=(3,))[None], part.array("T_plus_L", shape=(3,))
@@ -87,14 +87,14 @@ def read_volumetric(case: VectorCase, checks: Checks) -> None:
 
 
 def errors_of(part: VectorCase) -> YangErrors:
-    """The 21 errors of one case: d["xy"] = delta_xy, e["zx"] = eps_zx, Sxy, Sxz, Syz."""
+    """Return the 21 errors of one case: d["xy"] = delta_xy, e["zx"] = eps_zx, Sxy, Sxz, Syz."""
     d = np.array([[[part.number("d", i + j) for j in "xyz"] for i in "xyz"]])
     e = np.array([[[part.number("e", i + j) for j in "xyz"] for i in "xyz"]])
     return YangErrors(d, e, part.number("Sxy"), part.number("Sxz"), part.number("Syz"))
 
 
 def read_helix(case: VectorCase, checks: Checks) -> None:
-    """Every set: points, exact and linear reading, both fits."""
+    """Compare points, exact and linear readings, and both fits of every set."""
     truth = SixParameters(*(case.number("truth", k) for k in NAMES))
     origin, turns = case.array("origin", shape=(3,)), case.number("turns")
     spacing = case.text("spacing")
@@ -111,7 +111,7 @@ def read_helix(case: VectorCase, checks: Checks) -> None:
 
 
 def _helix_readings(part: VectorCase, checks: Checks, truth: SixParameters, points: F2, origin: F1) -> None:
-    """Both readings of one set and what eq (9) makes of the exact one."""
+    """Compare both readings of one set, and the fits of eq (9) to the exact one."""
     reading, radius = READINGS[part.text("z_reading")], part.number("R")
     d = points - origin
     nominal = d if reading == "workpiece" else workpiece_mm(d)
@@ -127,11 +127,11 @@ def _helix_readings(part: VectorCase, checks: Checks, truth: SixParameters, poin
 
 
 def read_conditioning(case: VectorCase, checks: Checks) -> None:
-    """Every key, at least one of each kind: ``six_<law>_<turns>``, ``ten_<turns>``, ``corr9_<turns>turns`` and ``two_radii``."""
+    """Compare every key; each kind must occur: ``six_<law>_<turns>``, ``ten_<turns>``, ``corr9_<turns>turns``, ``two_radii``."""
     for kind in KINDS:
         if not any(key.startswith(kind) for key, _ in case.items()):
             raise FileFormatError(f"{case.label}: there is no key {kind}...", LAYOUT)
-    checks.assume(f"bars of {RADII_MM[0]:g} and (two bars) {RADII_MM[1]:g} mm, {TURNS} turns with two bars")
+    checks.assume(f"a single bar has {RADII_MM[0]:g} mm; two bars have {RADII_MM[0]:g} and {RADII_MM[1]:g} mm and {TURNS} turns")
     for key, part in case.items():
         if six := re.fullmatch(r"six_(angle|area)_(\d+)", key):
             _six(part, checks, _points("angle" if six[1] == "angle" else "area", int(six[2])))
@@ -185,7 +185,7 @@ def _two(case: VectorCase, checks: Checks) -> None:
 
 
 def read_ranks(case: VectorCase, checks: Checks) -> None:
-    """The plan of the assumptions, ranks of every experiment and degree, and the listed null vectors."""
+    """Compare the plan in ``assumed``, the ranks of every experiment and degree, and the listed null vectors."""
     assumed = case.at("assumed")
     plans = [plan_of(assumed, d + 1) for d in range(len(case.at("N").parts()))]
     stroke = np.stack([np.zeros(3), plans[0].travel_mm], axis=1)
@@ -206,14 +206,14 @@ def read_ranks(case: VectorCase, checks: Checks) -> None:
 
 
 def plan_of(case: VectorCase, degree: int) -> YangPlan:
-    """The file's assumptions as a plan."""
+    """Return the file's assumptions as a plan."""
     radii = tuple(float(r) for r in case.array("radii"))
     origins, turns, steps = case.array("origins", shape=(None, 3)), case.number("turns"), case.whole("steps")
     return YangPlan(case.array("L", shape=(3,)), case.array("tool", shape=(3,)), origins, radii, turns, steps, degree)
 
 
 def experiment(case: VectorCase, key: str) -> Experiment:
-    """Experiment of a key such as ``c1 helix(1)+step diagonals, ideal mirror``, named by its first word."""
+    """Return the experiment of a key such as ``c1 helix(1)+step diagonals, ideal mirror`` by its first word."""
     code = key.split()[0]
     if code not in EXPERIMENTS:
         raise FileFormatError(f"{case.label}: experiment {code!r} is unknown", f"known: {', '.join(EXPERIMENTS)}")
@@ -221,28 +221,28 @@ def experiment(case: VectorCase, key: str) -> Experiment:
 
 
 def _null_vector(case: VectorCase, checks: Checks, problem: Problem) -> None:
-    """Compare the ratios of the named parameters, up to the common sign, and check that their combination is unobservable."""
+    """Compare the ratios of the named parameters up to a common sign, and check that their combination is unobservable."""
     names = [t.name for t in monomials(1)]
     stored = dict(case.items())
     if not set(stored) <= set(names):
         raise FileFormatError(f"{case.label}: parameters {', '.join(stored)} are not all known", f"known: {', '.join(names)}")
     parts = list(stored.values())
     weights, trace = hidden_combination(*problem, [names.index(k) for k in stored])
-    # A null vector and its negative are one direction: the file's sign is taken for all components together.
+    # The sign of a null vector is arbitrary; take that of the file.
     sign = -1.0 if sum(w * part.number() for w, part in zip(weights, parts, strict=True)) < 0 else 1.0
     for w, part in zip(weights, parts, strict=True):
         value = np.round(sign * w, DECIMALS) if trace < NO_TRACE else np.nan
-        checks.compare("null vectors, degree 1", value, part, unit="1", rounding="stated with four decimals, ours rounded alike")
+        checks.compare("null vectors, degree 1", value, part, unit="1", rounding="both rounded to four decimals")
 
 
 def read_ballbar(case: VectorCase, checks: Checks) -> None:
-    """Readings, the two small fits, and the complete fit with the noise gains."""
+    """Compare readings, the two small fits, and the complete fit with the noise gains."""
     checks.assume(
-        f"the figures of the fit are of two bars of {RADII_MM[0]:g} and {RADII_MM[1]:g} mm at every origin; runs are listed of one"
+        f"the complete fit uses bars of {RADII_MM[0]:g} and {RADII_MM[1]:g} mm at every origin, although the file lists runs of one bar"
     )
     checks.assume(
-        f"figures of the map are taken at {NODES} nodes per axis from {INNER[0]:.0%} to {INNER[1]:.0%} of the travels; "
-        f"steps per diagonal: {STEPS}"
+        f"numbers about the map hold for {NODES} nodes per axis from {INNER[0]:.0%} to {INNER[1]:.0%} of the travels, and for {STEPS} "
+        "steps per diagonal"
     )
     terms = tuple(_monomial(p) for p in case.at("monomials").parts())
     plan = _plan(case)
@@ -250,7 +250,7 @@ def read_ballbar(case: VectorCase, checks: Checks) -> None:
     _small_fits(case, checks)
     _complete_fit(case, checks, terms, plan)
     _gains(case.at("result", "map_noise_gain_d1_to_d4"), checks, plan)
-    why = "the draws of the noise are not in the file"
+    why = "the file does not contain the noise"
     checks.leave_out("worst error of the map with noise", case.at("result", "recovered_map_max_error_um_with_0.5um_noise"), why)
 
 
@@ -258,7 +258,7 @@ def _monomial(case: VectorCase) -> Monomial:
     kinds: dict[str, Kind] = {"d": "d", "e": "e", "S": "S"}
     kind, letters, power = case.text(0), case.text(1), case.number(2)
     if kind not in kinds or len(letters) != 2 or not set(letters) <= set("xyz") or power != int(power):
-        raise FileFormatError(f"{case.label}: expected kind d, e or S, two of x y z, and a power", "")
+        raise FileFormatError(f"{case.label}: expected kind d, e or S, two of x y z, and a power", LAYOUT)
     return Monomial(kinds[kind], "xyz".index(letters[0]), "xyz".index(letters[1]), int(power))
 
 
@@ -269,7 +269,7 @@ def _plan(case: VectorCase) -> YangPlan:
 
 
 def _cups(case: VectorCase) -> list[VectorCase]:
-    """One run of every origin, in the order of the file."""
+    """Return the first run of every origin, in the order of the file."""
     found: dict[tuple[float, ...], VectorCase] = {}
     for run in case.at("runs").parts():
         found.setdefault(tuple(run.array("origin")), run)
@@ -277,7 +277,7 @@ def _cups(case: VectorCase) -> list[VectorCase]:
 
 
 def _nodes(plan: YangPlan) -> F2:
-    """Scale readings of the nodes for the file's figures of the map."""
+    """Return the scale readings of the nodes for the numbers about the map."""
     return volume_grid(np.outer(plan.travel_mm, INNER), NODES)
 
 
@@ -286,7 +286,7 @@ def _errors(case: VectorCase, terms: tuple[Monomial, ...], slide_mm: F2) -> Yang
 
 
 def _tip(case: VectorCase, terms: tuple[Monomial, ...], slide_mm: F2) -> F2:
-    """Actual position of the tool tip relative to the workpiece for scale readings."""
+    """Return the actual position of the tool tip relative to the workpiece for scale readings."""
     tool = case.array("tool")
     return np.asarray(workpiece_mm(slide_mm) + tool + delta_exact(_errors(case, terms, slide_mm), slide_mm, tool))
 
@@ -323,14 +323,14 @@ def _small_fits(case: VectorCase, checks: Checks) -> None:
 
 
 def _complete_fit(case: VectorCase, checks: Checks, terms: tuple[Monomial, ...], plan: YangPlan) -> None:
-    """All coefficients, five cups and the bar's length in one linear step from the exact readings of both bars."""
+    """Compare the linear fit of all coefficients, five cup offsets and the bar length to the exact readings of both bars."""
     a, setup = all_helices(plan, centres=True, lengths="common")
     y = np.concatenate([_bar(case, terms, run, r) for run in _cups(case) for r in plan.radii_mm])
     x = np.concatenate([a, setup], axis=1)
     found = shortest_solution(x, y, 1.0 / np.maximum(np.linalg.norm(x, axis=0), 1e-30))
     result = case.at("result")
     rms = float(np.sqrt(np.mean((y - x @ found) ** 2)))
-    noise = "readings of the vector are good to 1e-13 mm"
+    noise = "the readings in the file are accurate to 1e-13 mm"
     checks.compare("residual of the complete fit", rms * UM, result.at("residual_rms_um"), unit="1", floor=4e-12, rounding=noise)
     length = found[a.shape[1]]
     checks.compare("bar length of the complete fit", length, result.at("radius_offset_est"), unit="mm", floor=1e-11, rounding=noise)

@@ -182,7 +182,7 @@ def test_a_small_square_carries_less_and_says_so() -> None:
     assert set(small.on_prior) > set(large.on_prior)
     assert "l1" in small.on_prior
     assert "l1" not in large.on_prior
-    assert f"carry {small.carried}" in small.statement
+    assert f"and {small.carried} of them better than the prior" in small.statement
     assert "l1" in small.statement
     assert not set(FRAME_NAMES) & set(small.on_prior)
 
@@ -283,7 +283,7 @@ def test_an_iteration_that_does_not_settle_is_refused(monkeypatch: pytest.Monkey
     lam = cube(20.0)
     measured = from_frame(FRAME, forward(machine(0.5 * default_prior()), lam))
     monkeypatch.setattr(calibration, "ITERATIONS", 1)
-    with pytest.raises(NotSettled, match="not settled after 1 steps"):
+    with pytest.raises(NotSettled, match="no convergence after 1 steps"):
         calibrate(NOMINAL, PlaneReadings(lam, measured, U))
 
 

@@ -134,12 +134,12 @@ def test_uncertainties_on_a_hemisphere_agree_with_draws():
 def test_calibration_refuses_what_it_cannot_use():
     good = 26.0 * NORMAL
     for centres, angles, radius, words in (
-        (good[:3], PATTERN[:3], 25.0, "four points"),
+        (good[:3], PATTERN[:3], 25.0, "four or more points"),
         (good[:100], PATTERN, 25.0, "fit together"),
         (good, PATTERN, -1.0, "positive"),
         (good * np.nan, PATTERN, 25.0, "finite"),
         (good, PATTERN + np.inf, 25.0, "finite"),
-        (good[:20], PATTERN[:20], 25.0, "not determined"),
+        (good[:20], PATTERN[:20], 25.0, "do not determine"),
         (np.ones((5, 3)), PATTERN[:5], 25.0, "coincide"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -242,9 +242,9 @@ def test_directions_that_form_no_pattern_are_said():
         (PATTERN[:, :1], values, 1e-9, "do not fit together"),
         (PATTERN, values * np.nan, 1e-9, "finite"),
         (PATTERN, values, 0.0, "tolerance positive"),
-        (many, values, 0.02, "touches at every colatitude from 17.8763 to 85.9437 degrees cannot be distinguished"),
-        (PATTERN, values, np.deg2rad(10), "touches at every colatitude"),
-        (PATTERN[100:], values[100:], 1e-9, "exactly one touch at the pole, got 1 of 1 there"),
+        (many, values, 0.02, "touches of colatitude 17.8763 to 85.9437 degrees are closer than the tolerance"),
+        (PATTERN, values, np.deg2rad(10), "touches of colatitude"),
+        (PATTERN[100:], values[100:], 1e-9, "exactly one touch at the pole; 1 of 1 touches are at the pole"),
     ):
         with pytest.raises(ValueError, match=words):
             map_of_pattern(angles, v, tolerance)

@@ -230,7 +230,7 @@ def test_lateral_step_across_a_tilted_mirror_reads_at_first_order_and_the_diagon
     mirror = mirror_normal(beam, np.array([0.5e-3, 0.0]))
     assert reading_mm(50.0 * first[None], mirror, beam)[0] == pytest.approx(25e-3, rel=1e-6)  # the paper's 25 µm
     assert reading_mm(1000.0 * beam[None], mirror, beam)[0] == pytest.approx(1000.0, abs=1e-9)
-    with pytest.raises(ValueError, match="along the beam"):
+    with pytest.raises(ValueError, match="parallel to the beam"):
         reading_mm(np.zeros((1, 3)), first, beam)
     with pytest.raises(ValueError, match="vertical"):
         tilt_axes(np.array([0.0, 0.0, 1.0]))

@@ -85,9 +85,9 @@ def test_all_four_diagonals_are_needed():
 def test_a_mirror_along_the_beam_has_no_reading():
     beam = diagonal_beam(INC, "ppp")
     along = np.cross(beam, [0.0, 0.0, 1.0])
-    with pytest.raises(ValueError, match="along the beam"):
+    with pytest.raises(ValueError, match="parallel to the beam"):
         step_readings_mm(np.zeros((4, 3)), np.zeros((4, 3)), beam, along)
-    with pytest.raises(ValueError, match="along the beam"):
+    with pytest.raises(ValueError, match="parallel to the beam"):
         step_readings_mm(np.zeros((4, 3)), np.zeros((4, 3)), beam, ZERO)
 
 

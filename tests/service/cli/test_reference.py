@@ -173,7 +173,7 @@ def test_captions_say_what_is_missing_and_how_errors_are_magnified(page):
     assert "EXAMPLE: the paper's map is not printed" in text
     assert "25.006 mm" in text
     assert text.count("squareness only") >= 2
-    assert "Only the three printed squareness errors are in it" in text
+    assert "It contains only the three printed squareness errors" in text
     assert len(re.findall(r"errors drawn \d+ ×", text)) >= 2
     assert "Z = 97.616 mm" in text
     assert "The square of ± 1 mm is an assumption from the text" in text
