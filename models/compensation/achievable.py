@@ -9,7 +9,7 @@ The caller names the motions to write:
 
 - `individually_observable` (default): only motions that the data separate from all others. The tables hold for every tool, but the other
   motions stay uncorrected.
-- `enough_for_the_field`: the fewest motions that reproduce the whole deviation; they also carry the effect of the others. The tables hold
+- `enough_for_the_field`: as few motions as reproduce the whole deviation; they also carry the effect of the others. The tables hold
   at this tool length only, and are labelled so.
 """
 
@@ -180,7 +180,7 @@ def individually_observable(solution: JointSolution, *, weak: bool = False) -> f
 
 
 def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
-    """Return a smallest set of motions that reproduces the deviation with the machine's own tool; angles are dropped first."""
+    """Return a minimal set of motions that reproduces the deviation with the machine's own tool; angles are dropped first."""
     field = _field(solution)
     triangle = scipy.linalg.qr(field / np.maximum(np.linalg.norm(field, axis=0), 1e-300), mode="r")[0][: field.shape[1]]
     names = [*[t.motion for t in solution.terms], *["rigid"] * 6]
