@@ -24,10 +24,10 @@ from tests.faults.contract import Observed, Record, assert_fault_contract, told_
 Script = Callable[[], Awaitable[None]]
 
 
-def be_patient(monkeypatch: pytest.MonkeyPatch, *, answer_s: float = 10.0) -> None:
+def be_patient(monkeypatch: pytest.MonkeyPatch, *, answer_s: float = 10.0, sample_s: float = 3.0) -> None:
     """A busy computer is not a mute box: three times the usual silence, and as long for an answer as the case can bear."""
     monkeypatch.setattr(module, "_ANSWER_S", answer_s)
-    monkeypatch.setattr(module, "_SAMPLE_TIMEOUT_S", 3.0)
+    monkeypatch.setattr(module, "_SAMPLE_TIMEOUT_S", sample_s)
 
 
 class Tap:

@@ -14,7 +14,7 @@ from tests.experiments.campaigns.late_replies import campaign
 from tests.faults.patient import patience
 
 LONG = bool(os.environ.get("ABBE_TEST_LONG"))
-TRIALS, TIMEOUT_S, LINES = (100_000, 0.05, 64) if LONG else (108, 0.2, 36)  # in CI a busy computer must not look like a slow device
+TRIALS, TIMEOUT_S, LINES = (100_000, 0.05, 64) if LONG else (108, 0.1, 36)  # in CI a busy computer must not look like a slow device
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,15 +13,22 @@ from abbe.drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, Re
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import parse_url
 from tests.faults.contract import Record
+from tests.faults.patient import patience
 from tests.faults.rows_serial import S10, S11
 from tests.faults.serial_rig import Stage, be_patient, stage, together
 
 NO_FAULT = "shorter than the watchdog: the samples come, only later, so there is nothing to detect"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _patient() -> Iterator[None]:
+    with patience():
+        yield
+
+
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    be_patient(monkeypatch, answer_s=2.0)
+    be_patient(monkeypatch, answer_s=1.0, sample_s=1.5)
 
 
 # --- S10 -----------------------------------------------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ from abbe.service.errors import (
 from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.journal import StoreJournal
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, RecordPath
+from abbe.service.storage import engine
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import AtStep, Bench, InTest, bench, number, small
 from tests.faults.test_going_on import SUSPENDING, broken_off, going_on, statuses, step_of
@@ -236,7 +237,8 @@ def test_a_campaign_whose_journal_names_no_recipe_is_one_line(tmp_path):
             begun_source(store, "c")
 
 
-async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path):
+async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(engine, "BUSY_TIMEOUT_MS", 500)
     path = tmp_path / "abbe.sqlite3"
     with Store.open(f"sqlite:///{path}") as store:
         campaign = store.campaigns.add(store.machines.add("m", {}), "c", {})
@@ -253,7 +255,7 @@ async def test_a_locked_database_delays_the_journal_and_nothing_else(tmp_path):
         thread = threading.Thread(target=lock)
         thread.start()
         locked.wait(within(10))
-        asyncio.get_running_loop().call_later(5.5, free.set)  # longer than the database itself waits
+        asyncio.get_running_loop().call_later(1.0, free.set)  # longer than the database itself waits
         await StoreJournal(store, campaign).add("point", n=1)
         thread.join()
         assert [c.doc for c in store.checkpoints.of_campaign(campaign)] == [{"n": 1}]

@@ -50,7 +50,7 @@ wait(lambda: all(status.homed[:3]))
 component = hal.component(f"probe{os.getpid()}")
 component.ready()
 go("G21 G90 G64 P0.001 G94")
-places = [(3.3 + 24.37 * k, -298.1 + 14.63 * k) for k in range(20)]
+places = [(3.3 + 48.74 * k, -298.1 + 29.26 * k) for k in range(10)]
 rows = []
 for way, first, order in ((1, "X0 Z-300", places), (-1, "X490 Z-1", places[::-1])):
     go(f"G0 {first}")

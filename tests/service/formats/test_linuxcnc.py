@@ -74,7 +74,7 @@ def test_linuxcnc_adds_what_the_tables_say(control: Path) -> None:
     at = np.array([[r["at"][0], 0.0, r["at"][1]] for r in rows])
     way = np.array([[r["way"], 1.0, r["way"]] for r in rows])
     seen = np.array([r["added"] for r in rows])
-    assert len(rows) == 40
+    assert len(rows) == 20
     assert np.abs(seen).max() > 0.02
     for comps, limit_mm in ((read, HUNDREDTHS_OF_NM), (parts, 0.5e-6 + HUNDREDTHS_OF_NM)):
         both = Compensation(comps[0].tables + comps[1].tables)
