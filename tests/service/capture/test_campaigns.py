@@ -24,7 +24,7 @@ def campaign(*words: str) -> dict:
 @pytest.mark.parametrize("speed", [10, 20] if LONG else [20])
 def test_under_load_no_sample_is_unaccounted(speed: int) -> None:
     """1 kHz at this many times real time, a core-eater for each core, a locked database, a consumer who stalls the event loop."""
-    device_s, lock_s = (600, 30) if LONG else (30, 1)
+    device_s, lock_s = (600, 30) if LONG else (15, 1)
     found = campaign("load", "--speed", str(speed), "--device-s", str(device_s), "--lock-s", str(lock_s))
     assert found["sent"] + found["corrupted"] + found["suppressed"] >= 1000 * device_s
     assert found["corrupted"] > 0
@@ -41,7 +41,7 @@ def test_under_load_no_sample_is_unaccounted(speed: int) -> None:
 
 @pytest.mark.timeout(900)
 def test_a_killed_recording_loses_nothing_that_was_durable() -> None:
-    kills = 200 if LONG else 10
+    kills = 200 if LONG else 6
     found = campaign("kills", "--kills", str(kills))
     assert found["violations"] == []
     assert found["kills"] == kills

@@ -22,7 +22,7 @@ SECTOR = 512
 RATE_HZ = 1000
 PERIOD_US = 1_000_000 // RATE_HZ
 GROUP_US = round(GROUP_S * 1e6)
-STATES = 2000 if os.environ.get("ABBE_TEST_LONG") else 500
+STATES = 2000 if os.environ.get("ABBE_TEST_LONG") else 250
 LABEL = "r"
 LONGEST_SYNC_US = 50_000
 """The slowest sync of the model, and it may come twice in a row: 2.5 times the slowest that was measured (19.7 ms). The promise of 100 ms
