@@ -39,7 +39,7 @@ def _celsius(window: tuple[float, float]) -> tuple[float, float]:
 def _certificate(day: date | None) -> date | None:
     first, last = CERTIFICATES
     if day is not None and not first <= day <= last:
-        raise ValueError(f"expected the last day of a certificate, from {first} to {last}, got {day}")
+        raise ValueError(f"expected the last day of a certificate, a date between {first} and {last}, got {day}")
     return day
 
 
@@ -221,7 +221,7 @@ class Mqtt(Section):
     @model_validator(mode="after")
     def _encrypted(self) -> Self:
         if bool(self.certificate) != bool(self.key):
-            raise ValueError("certificate and key belong together, expected both or none")
+            raise ValueError("certificate and key belong together, expected both or neither")
         if (self.ca or self.certificate) and not (self.url or "").startswith("mqtts:"):
             raise ValueError("ca and certificate are for an encrypted connection, expected url = mqtts://host:8883")
         return self
@@ -255,7 +255,7 @@ class Web(Section):
     @model_validator(mode="after")
     def _both(self) -> Self:
         if bool(self.certificate) != bool(self.key):
-            raise ValueError("certificate and key belong together, expected both or none")
+            raise ValueError("certificate and key belong together, expected both or neither")
         if self.behind_tls and not self.names:
             raise ValueError("behind_tls: add to names the host name of the proxy that browsers use")
         return self
@@ -283,7 +283,7 @@ class OpcUa(Section):
     @model_validator(mode="after")
     def _both(self) -> Self:
         if bool(self.certificate) != bool(self.key):
-            raise ValueError("certificate and key belong together, expected both or none")
+            raise ValueError("certificate and key belong together, expected both or neither")
         return self
 
     @property

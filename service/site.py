@@ -21,7 +21,7 @@ from abbe.service.sequences.nc.write import NcSettings
 class Site:
     """What a workflow needs to know about a machine. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
-    ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without certificate is absent.
+    ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``control``: identity of the control
     (`control_of`); empty without a control.
     """

@@ -11,7 +11,7 @@ from network import Network
 
 
 class Result(IntEnum):
-    """COMP_RESULT."""
+    """Result of a compensation command, as in the register COMP_RESULT."""
 
     OK = 0
     BAD_ARGUMENT = 1
@@ -25,7 +25,7 @@ class Result(IntEnum):
 
 
 class State(IntEnum):
-    """BANK_STATE."""
+    """State of a bank, as in the register BANK_STATE."""
 
     EMPTY = 0
     WRITING = 1

@@ -31,7 +31,7 @@ class Result(IntEnum):
 
 
 class Hold(IntEnum):
-    """HOLD_REQUEST."""
+    """Run, hold or abort, as in the register HOLD_REQUEST."""
 
     RUN = 0
     HOLD = 1

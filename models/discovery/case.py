@@ -27,7 +27,7 @@ class CaseRun:
     length_calibrated: bool | None = None
 
     def data(self) -> RunData:
-        """The run as solver input, with invalid readings too; sealed and invalid readings are zero."""
+        """The run as solver input with all its readings; those of a sealed run, and invalid ones, are zero."""
         p = self.path
         reading = np.zeros(p.n) if self.deviation_mm is None else np.where(self.valid, self.deviation_mm, 0.0)
         bar = p.kind == "bar"

@@ -28,9 +28,10 @@ class Colour:
     memory: float = MEMORY
 
     def filter(self) -> tuple[float, float, float]:
-        """ARMA(1, 1) with the same autocovariance: (m, c, ratio of an innovation's variance to that of a reading).
+        """Return (m, c, v) of the ARMA(1, 1) process with the autocovariance of this noise: (1 - m B) noise = (1 + c B) innovation.
 
-        Autocovariance 1, s m, s m^2, ... with share s and memory m; (1 - m B) noise = (1 + c B) innovation, B the shift by one reading.
+        B shifts by one reading. v is the variance of an innovation if that of a reading is 1; the autocovariance is then 1, s m, s m^2, ...
+        with share s and memory m.
         """
         s, m = self.share, self.memory
         g0 = 1.0 + m * m - 2.0 * m * (s * m)

@@ -252,7 +252,7 @@ def _new_folder(target: Path) -> Path:
     try:
         part.mkdir(mode=0o700)
     except OSError as err:
-        raise BackupRefused(f"{target} cannot be made: {err.strerror}", "give a folder that exists and may be written") from None
+        raise BackupRefused(f"{target} cannot be made: {err.strerror}", "give a folder that exists and is writable") from None
     return part
 
 

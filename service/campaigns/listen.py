@@ -135,7 +135,10 @@ async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: R
 
 
 async def _hear(session: Session, quiet_s: float) -> Heard:
-    """Read the laser from before the program moves until it has ended."""
+    """Read the laser from before the program moves the machine until the program has ended.
+
+    Without a "program running" status, it has ended after ``quiet_s`` seconds without motion.
+    """
     heard, laser = Heard(), session.need_laser()
     last, ran, moved_us, level = None, False, 0, None
     while True:

@@ -104,9 +104,9 @@ def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[
         return tools, ()
     messages = []
     if tools.laser and not has_laser:
-        messages.append("planned without laser: the machine file names none under [devices]")
+        messages.append("planned without a laser: the machine file names none under [devices]")
     if tools.bar_lengths_mm and not has_bar:
-        messages.append("planned without ball-bar: the machine file names none under [devices]")
+        messages.append("planned without a ball-bar: the machine file names none under [devices]")
     try:
         return replace(tools, laser=tools.laser and has_laser, bar_lengths_mm=tools.bar_lengths_mm if has_bar else ()), tuple(messages)
     except ValueError:

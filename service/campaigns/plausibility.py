@@ -192,7 +192,7 @@ def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
 def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> list[str]:
     """Return messages about expired certificates of these instruments."""
     return [
-        f"the certificate of the {INSTRUMENTS[role]} has ended on {day}: what is measured now goes into no table ([calibration] {role})"
+        f"the certificate of the {INSTRUMENTS[role]} ended on {day}: what is measured now goes into no table ([calibration] {role})"
         for role, day in ended_certificates(site, today, roles).items()
     ]
 

@@ -277,7 +277,7 @@ def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False)
     except OSError as error:
         if aside is not None:
             shutil.rmtree(aside, ignore_errors=True)
-        raise FileFormatError(f"{out}: cannot be written: {error.strerror}", "give a folder that may be written") from None
+        raise FileFormatError(f"{out}: cannot be written: {error.strerror}", "give a writable folder") from None
     return [out / f.name for f in files]
 
 

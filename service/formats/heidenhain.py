@@ -33,7 +33,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        The table is of another kind, is a direction-dependent cross table (only the own axis has BACKLASH), exceeds a limit, or has
+        The table is of another kind, is a direction-dependent cross table (only own-axis tables have BACKLASH), exceeds a limit, or has
         positions finer than 0.1 µm.
     """
     check_kinds(comp, LIMITS, WHAT)
@@ -45,7 +45,10 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         for table in mine:
             check_table(table, LIMITS, WHAT, settings.reference_mm, settings.step_mm)
             if table.directional and not table.own:
-                raise FormatRefused(f"{WHAT}, table {table.name}: only the own axis has a BACKLASH column", f"give the mean; {NOTHING}")
+                raise FormatRefused(
+                    f"{WHAT}, table {table.name}: the two directions of motion differ, and only own-axis tables have a BACKLASH column",
+                    f"give the mean of both; {NOTHING}",
+                )
             if not np.array_equal(table.position_mm, mine[0].position_mm):
                 raise FormatRefused(
                     f"{WHAT}: the tables over {axis} have different points, but share one column of positions",

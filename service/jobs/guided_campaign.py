@@ -33,7 +33,9 @@ def is_full(recipe: str, names: tuple[str, ...]) -> bool:
 
 
 async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str) -> JobOutcome:
-    """Measure the plan as a campaign of its name, solve it and propose tables. ``context.control.prompts`` asks a person to mount.
+    """Measure the plan as a campaign with the plan's name, solve it and propose tables.
+
+    A person mounts the instruments, as ``context.control.prompts`` asks.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     except OSError as err:
-        raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a folder that may be written") from None
+        raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a writable folder") from None
     try:
         aside.chmod(0o755)  # mkdtemp creates private folders; other users may read an export
         _write_folder(store, record, runs, aside)

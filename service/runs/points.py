@@ -36,7 +36,7 @@ class PointsFile:
     axes_mm : array, shape (n, 3)
         Commanded positions.
     direction : array, shape (n, 3), or None
-        Sign of each axis' last move; 0 for an axis without column; None without any such column.
+        Sign of each axis' last move; 0 for an axis without a column; None without any such column.
     directed : tuple of int
         Axes that have a direction column.
     tool_mm : array, shape (n, 3), or None

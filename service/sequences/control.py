@@ -116,7 +116,7 @@ def person_may_be_inside(status: ControllerStatus) -> bool:
 
 
 def beam_trouble(reading: LaserReading) -> BeamLost | None:
-    """Return why the laser's count is not valid: beam lost, too weak or without reflector; None: it is valid."""
+    """Return why the laser's count is not valid (the beam was lost, has no reflector, or is too weak); None: it is valid."""
     if beam_is_good(reading.status):
         return None
     what = "lost" if beam_is_gone(reading.status) else f"too weak ({reading.signal_permille} permille)"

@@ -46,7 +46,7 @@ async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, he
     Raises
     ------
     BarOutOfRange, MeasurementFault
-        The box flags a sample as out of range or without bar; samples are lost.
+        The box flags a sample as out of range or taken without a bar; samples are lost.
     """
     samples: list[BarSample] = []
     host_s = status.host_s

@@ -32,7 +32,7 @@ def new_key(path: Path) -> str:
     except FileExistsError:
         raise KeyRefused(f"{path} exists already, and a key is never overwritten", "give another name") from None
     except OSError as error:
-        raise KeyRefused(f"{path}: cannot be written: {error.strerror}", "give a folder that may be written") from None
+        raise KeyRefused(f"{path}: cannot be written: {error.strerror}", "give a writable folder") from None
     return public_of(key)
 
 

@@ -170,7 +170,7 @@ def _remedy(text: str) -> str:
     if "full" in text:
         return "free disk space"
     if "readonly" in text or "unable to open" in text:
-        return "check that the folder exists and may be written"
+        return "check that the folder exists and is writable"
     if "password" in text or "authentication" in text:
         return "check user and password in the URL"
     if "connection" in text:
@@ -209,7 +209,7 @@ def _make_private(path: Path) -> None:
     except FileExistsError:
         return  # another process was first
     except OSError as err:
-        raise StoreError(f"database {path} cannot be created: {err.strerror}", "check that the folder may be written") from None
+        raise StoreError(f"database {path} cannot be created: {err.strerror}", "check that the folder is writable") from None
 
 
 def _set_pragmas(connection: sqlite3.Connection, _record: object) -> None:

@@ -244,7 +244,7 @@ class JournalView:
             raise TableRefused("no push of this machine was kept: there is nothing to roll back", NOTHING)
         if self.origin(kept[-1]).kind == KIND:
             raise TableRefused(
-                f"the last kept push ({kept[-1][-1].push}) was a rollback itself",
+                f"the last kept push ({kept[-1][-1].push}) was itself a rollback",
                 f"name the push with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
             )
         return kept[-1]

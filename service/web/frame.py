@@ -106,7 +106,7 @@ class Frame:
         return units.unit_in(unit, self.units)
 
     def with_u(self, value: float | None, u: float | None, unit: str = "µm") -> tuple[str, str]:
-        """A value and U (k = 2) of its standard uncertainty, rounded together in the reader's unit."""
+        """A value and U = 2 u, rounded together in the reader's unit."""
         return units.rounded(value, u, unit, self.units)
 
     def drawn(self, unit: str = "µm") -> Unit:

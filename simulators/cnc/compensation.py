@@ -6,7 +6,7 @@ from abbe.simulators.cnc import bank
 
 
 class CompResult(IntEnum):
-    """COMP_RESULT."""
+    """Result of a compensation command, as in the register COMP_RESULT."""
 
     OK = 0
     BAD_ARGUMENT = 1

@@ -175,7 +175,7 @@ class Result(IntEnum):
 
 
 class Hold(IntEnum):
-    """HOLD_REQUEST."""
+    """Run, hold or abort, as in the register HOLD_REQUEST."""
 
     RUN = 0
     HOLD = 1
@@ -274,7 +274,7 @@ class Controller:
     # ---- time ----------------------------------------------------------------------------------------------------
 
     def advance(self, to_s: float) -> None:
-        """Advance to ``to_s``; a motion that arrives before ends exactly at its own instant."""
+        """Advance to ``to_s``. A motion that arrives earlier ends at the instant of its arrival, not at ``to_s``."""
         motion = self._motion
         if motion is not None:
             end_s = motion.end_s()

@@ -18,7 +18,7 @@ Locate = Callable[[F, F], F]
 
 
 class LaserResult(IntEnum):
-    """CMD_RESULT."""
+    """Result of a command, as in the register CMD_RESULT."""
 
     OK = 0
     BAD_ARGUMENT = 1

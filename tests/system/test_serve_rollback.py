@@ -91,7 +91,7 @@ def test_an_approver_orders_the_table_back_and_an_operator_does_not(tmp_path: Pa
             assert asyncio.run(table_in_force(sims.ready["cnc"]))[1] == old
             again = order("ann")
             assert (again.status_code, again.headers["Location"], again.headers[REPLAYED]) == (202, sent.headers["Location"], "true")
-            assert "was a rollback itself" in order("ann", old, 2, "k2").json()["detail"]
+            assert "was itself a rollback" in order("ann", old, 2, "k2").json()["detail"]
             assert running.terminate()[0] == 0
     with Store.open(url) as store:
         entries = store.pushes.entries("sim")

@@ -393,8 +393,9 @@ def error_left(nominal: Geometry, calibrated: Geometry, lambda_mm: F2, measured_
     Parameters
     ----------
     nominal, calibrated : Geometry
+        Each is placed by its own best fit to the measured points.
     lambda_mm, measured_mm : arrays, shape (n, 3)
-        Commands and CMM points. Each geometry is placed by its own best fit.
+        Commands and CMM points.
     """
     before = best_fit_errors(forward(nominal, lambda_mm), measured_mm)
     after = best_fit_errors(forward(calibrated, lambda_mm), measured_mm)

@@ -1,4 +1,4 @@
-"""Yang and Kim: the numbers of Tables 1 to 6 as printed, in the paper's units (um or mm; slopes without unit)."""
+"""Yang and Kim: the numbers of Tables 1 to 6 as printed, in the paper's units (um or mm; slopes without a unit)."""
 
 from __future__ import annotations
 

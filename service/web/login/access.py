@@ -16,7 +16,7 @@ MUTATING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 class Open(Enum):
-    """Marks routes without permission: login, pictures and style, and the two health checks."""
+    """Marks routes that need no permission: login, pictures and style, and the two health checks."""
 
     PUBLIC = "public"
 

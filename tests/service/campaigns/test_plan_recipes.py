@@ -174,7 +174,7 @@ def test_a_slow_machine_gets_a_plan_that_it_may_run():
 
 
 @pytest.mark.parametrize(
-    ("named", "kinds", "says"), [("ballbar", {Helix}, "without laser"), ("laser", {Diagonal, Linear}, "without ball-bar")]
+    ("named", "kinds", "says"), [("ballbar", {Helix}, "without a laser"), ("laser", {Diagonal, Linear}, "without a ball-bar")]
 )
 def test_only_what_the_machine_file_names_is_planned(named, kinds, says):
     found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=7.0, tools=ONE_BAR)

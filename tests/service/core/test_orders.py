@@ -126,7 +126,7 @@ async def test_it_is_a_job_with_who_and_why_in_the_audit(bench: Bench) -> None:
     assert (told.now.crc, told.now.how, told.now.push) == (crc32(OLD), "ordered", 2)
     assert (told.pushes[0].why, told.pushes[1].proposal) == ("worse", 4)
     assert (told.pushes[1].word, told.pushes[1].text) == ("kept", "better")  # and not that it is in force: it is not any more
-    assert (await bench.ask(push=2, image=OLD)).text.startswith("the last kept push (2) was a rollback itself")
+    assert (await bench.ask(push=2, image=OLD)).text.startswith("the last kept push (2) was itself a rollback")
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,7 @@ async def test_after_the_last_day_of_a_certificate_nothing_is_measured(monkeypat
     line = Linear("l", "L1", "identify", 0, positions=5, at_share=(0.15, 0.15)).plan(MACHINE)
     bench.plan = CampaignPlan("full 1", (line,))
     led = await work.run_guided_campaign(bench, {}, "bob")
-    assert (led.word, "certificate of the laser has ended on 2020-05-31" in led.text, "ball-bar" in led.text) == ("ended", True, False)
+    assert (led.word, "certificate of the laser ended on 2020-05-31" in led.text, "ball-bar" in led.text) == ("ended", True, False)
 
 
 async def test_without_certificates_nothing_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,7 +93,7 @@ def test_the_machine_file_says_what_the_control_holds(folder):
     assert found.exit_code == 0, found.output
     assert "TOOL CALL 12 Z" in (folder / "p.h").read_text()
     assert "warning: " in found.output
-    assert "more than the 1 KiB" in " ".join(found.output.split())
+    assert "is assumed to hold 1 KiB" in " ".join(found.output.split())
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_an_expired_certificate_and_a_timetable_that_cannot_be_kept_are_told_bef
     machine.write_text(MACHINE_TOML + DEVICES + timetable)
     found = measure(folder, "--dry-run")
     assert found.exit_code == 0, found.output
-    assert "warning: the certificate of the laser has ended on 2020-05-31" in found.stderr
+    assert "warning: the certificate of the laser ended on 2020-05-31" in found.stderr
     assert "warning: schedule 'w': there is no recipe 'quick-chekc'" in found.stderr
 
 
