@@ -64,9 +64,9 @@ class Pick:
 
 
 def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
-    """Prior standard deviation of a coefficient: it gives `GENEROUS` times the top of the usual strength, for any power law of the latter.
+    """Return the prior sd of a coefficient: the value with a strength of `GENEROUS` times the top of its usual range.
 
-    ``width``: number of columns of the effect along one run.
+    The strength may be any power of the coefficient. ``width``: number of columns of the effect along one run.
     """
     top = GENEROUS * effect.typical[1]
     if effect.name.startswith(UNNAMED):
@@ -102,7 +102,7 @@ class Bank:
     Attributes
     ----------
     picks : tuple of Pick, one per group.
-    known : group index of every requested start; -1 where no run sees it.
+    known : group index of every requested start; -1 if it changes no reading.
     first : array of int, first column of each group; size : number of columns of each.
     parts : arrays, shape (columns, n): whitened columns as rows, no group split between parts. Single precision suffices, because the bank
         only chooses where a refinement starts; the parts are half of the memory of a search.
@@ -169,7 +169,7 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
-    """Build the bank of all candidates that some run sees; groups of the problem's other live banks are reused."""
+    """Build the bank of all candidates that change a reading; columns are taken over from other banks of the problem still in memory."""
     asked = [p.start for p in picks]
     banks = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in banks if list(b.known) == asked), None)
@@ -201,7 +201,7 @@ def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
 
 
 def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
-    """Start and group of each pick that some run sees."""
+    """Identifier (`Pick.start`) and group of each pick that changes a reading."""
     blocks = [(p, raw) for p, raw in ((p, p.raw(problem)) for p in picks) if raw.any()]
     if not blocks:
         return

@@ -119,7 +119,7 @@ def _one(asked: AskedChange, gram: F2, rhs: F1) -> ChangeEvidence:
 
 @dataclass(frozen=True)
 class TakenChange:
-    """A chosen candidate: size and gain (after its price) beside the other chosen ones, and rivals as (name, missing gain)."""
+    """A chosen candidate: size and gain (after its price) given the other chosen ones, and rivals as (name, missing gain)."""
 
     asked: AskedChange
     size: float
@@ -202,7 +202,7 @@ class ChangeContext:
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
     def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
-        """Candidates that explain nearly as much in place of a chosen one, beside all other chosen ones."""
+        """Candidates that explain nearly as much in place of a chosen one, given all other chosen ones."""
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
         others = self._changed([t for t in chosen.taken if t is not taken])
@@ -231,7 +231,7 @@ class ChangeContext:
         return TakenChange(left[k], found[k].size, gain, ())
 
     def _needed(self, chosen: Chosen) -> Chosen:
-        """Update gain and size of every chosen change beside the others, and drop the weakest until all gain enough."""
+        """Update gain and size of every chosen change given the others, and drop the weakest until all gain enough."""
         taken = list(chosen.taken)
         while taken:
             for k, one in enumerate(taken):
@@ -380,7 +380,7 @@ class Change:
         Change and standard uncertainty, estimated together with all scales and squareness errors: of a scale (m/m) or squareness (rad); of
         a shape its rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.
     evidence : float
-        Gain in log evidence after its price, beside all other named changes.
+        Gain in log evidence after its price, given all other named changes.
     rivals : tuple of (name, missing evidence)
         Candidates that explain nearly as much in its place: these runs cannot distinguish them.
     halves : int

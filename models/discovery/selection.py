@@ -91,7 +91,7 @@ def _neighbours(parameter: Parameter, value: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Selection:
-    """A pick with its gain (reduction of chi-square beside all other picks) and its score (gain minus price)."""
+    """A pick with its gain (reduction of chi-square given all other picks) and its score (gain minus price)."""
 
     pick: Pick
     gain: float
@@ -226,7 +226,7 @@ def others(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
 
 
 def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Refine every pick again beside the others, and replace it by another name that explains more."""
+    """Refine every pick again given the others, and replace it by another name if that explains more."""
     if len(picks) < 2:
         return picks
     for i in range(len(picks)):
@@ -258,7 +258,7 @@ def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Drop picks whose score beside the others is not positive, the worst first."""
+    """Drop the pick with the lowest score given the others, until every score is positive."""
     while picks:
         found = weighed(contest, picks)
         worst = min(found, key=lambda f: f.score)
@@ -269,7 +269,7 @@ def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
-    """Gain and score of each pick beside all others, in the order of the picks."""
+    """Gain and score of each pick given all others, in the order of the picks."""
     out = []
     for i, pick in enumerate(picks):
         gain = gain_of(contest.problem, pick, others(contest.problem, picks, i))

@@ -135,7 +135,7 @@ def _width(signal: Signal, problem: WhitenedProblem, pick: Pick) -> int:
 
 
 def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
-    """Coefficients for columns over all runs; zero for columns that no identify run sees."""
+    """Coefficients for columns over all runs; zero for columns that change no reading of an identify run."""
     if columns[0].shape[1] == c.size:
         return c
     observed = np.any([np.abs(col).max(axis=0) > 0.0 for col, known in zip(columns, identified, strict=True) if known], axis=0)

@@ -137,8 +137,8 @@ class WhitenedProblem:
     tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
     projection : whitened gap, and the operator that projects the simulation's unknowns out of it.
     also : array, shape (n, k): further columns to project out that are not part of the simulation (waves of a vibration), mm per mm.
-    column_cache : whitened columns of picks and their projection. banks : live banks of candidates of this problem. widths : number of
-        columns of an effect along one run, by label. All three are caches.
+    column_cache : whitened columns of picks and their projection. banks : banks of candidates of this problem that are still in
+        memory. widths : number of columns of an effect along one run, by label. All three are caches.
     """
 
     case: Case

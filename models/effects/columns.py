@@ -257,9 +257,10 @@ def smooth(position_mm: F1, stroke_mm: F1, first: int, last: int) -> F2:
 
 
 def shifts(direction: Callable[[str], int], first: int, last: int) -> Signal:
-    """Make the signal of a translation as a smooth function of the key's axis: orders ``first`` to ``last``, 1 um rms over the stroke each.
+    """Make the signal of a translation that varies smoothly along the moving axis (`axis_of`).
 
-    ``direction``: function from a key to the index (0 to 2) of the direction in which the tool deviates.
+    It has one column per Legendre order from ``first`` to ``last``, each 1 um rms over the stroke. ``direction``: returns, for the key of
+    an effect, the index (0 to 2) of the direction in which the tool deviates.
     """
 
     def moved(path: Path, at: Places, key: str, values: Values) -> F3:

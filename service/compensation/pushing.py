@@ -76,8 +76,8 @@ class Questions:
     """A job's answers to the questions of the push machine.
 
     ``validate``: reasons against the table, without touching the controller; ``approved_by``: the approver. ``probe`` and ``verify`` move
-    the machine; an error in them rolls back like a no and is raised again afterwards. ``approval``: given earlier for exactly this image on
-    exactly this base; None: the person who ordered the push approves it.
+    the machine; an error in them rolls the table back, as a failed check does, and is raised again afterwards. ``approval``: given earlier
+    for exactly this image on exactly this base; None: the person who ordered the push approves it.
     """
 
     validate: Callable[[], list[str]]
@@ -267,7 +267,7 @@ class Pushing:
         return PushActors(validate, approve, probe, verify)
 
     async def _run_question(self, question: Callable[[], Awaitable[Verdict]]) -> Verdict:
-        """Let the job measure. An error counts as a no and is raised again when the old table is in force."""
+        """Run the job's probe or verification. An error in it fails the check; `_pushed` raises it again once the old table is in force."""
 
         async def ask() -> Verdict:
             return await question()

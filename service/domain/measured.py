@@ -70,7 +70,7 @@ class CommandedPath:
 
     @property
     def counted_mm(self) -> tuple[float, float]:
-        """Where the readings begin and end to count, mm along this path."""
+        """Positions along this path between which readings count, mm from its first point."""
         arc = self.arc_mm
         first, last = self.measured or (0, len(arc) - 1)
         return float(arc[first]), float(arc[last])

@@ -27,7 +27,7 @@ class Columns:
     """Readings of a run, one row each, n rows.
 
     ``q_mm``: commanded positions, shape (n, 3); ``direction``: +1 or -1; ``deviation_mm``: None for a sealed run; ``valid``: all true if
-    the document does not state it (``valid_stated``); ``further``: other columns by name, in order.
+    the document does not state it (``valid_stated`` False); ``further``: other columns by name, in order.
     """
 
     t_s: F1

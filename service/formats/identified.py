@@ -118,10 +118,10 @@ Values = tuple[F2, F2, F2]
 def table_values(
     known: Identified, field: Callable[[F2], F2], sets: tuple[Grids, ...], reference_mm: F1, *, smooth: bool = False
 ) -> tuple[Values, ...]:
-    """Return the nine one-axis tables that best correct a field, for each set of grids; zero at the reference and linear in the field.
+    """Return, for each set of grids, the nine one-axis tables that best correct a field. Each table is zero at the reference.
 
-    ``field``: positions (n, 3) to deviations (n, 3), mm. ``smooth``: the field consists of the terms of ``known``, so its main effects are
-    polynomials, for which as many positions as coefficients suffice.
+    ``field``: function from positions (n, 3) to deviations (n, 3), mm; the tables depend linearly on it. ``smooth``: the field is a sum of
+    terms of ``known``, so polynomials through few positions per axis replace its evaluation at every position.
     """
     stroke = known.machine.stroke_mm
     fits = [[line_fit(grids[a], stroke[a]) for grids in sets] for a in range(3)]

@@ -1,9 +1,10 @@
 """Volumetric compensation as a network of stock LinuxCNC HAL components: lincurve, mult2, sum2.
 
-A table is one lincurve, a product two of them and a mult2. A lincurve has 2 to 16 points and holds its end values beyond them;
-``halcmd setp`` changes it live. The sums end in the signals ``drive-x`` and so on, the commands of the servos; motor-pos-fb gets the
-command before the sum. The network does not know the direction of motion, so lost motion belongs in COMP_FILE. The file replaces the lines
-that connect motor-pos-cmd to motor-pos-fb, and is loaded after ``addf motion-controller``.
+A one-axis table becomes a lincurve; a product of two functions becomes two lincurves and a mult2. A lincurve has 2 to 16 points and holds
+its end values beyond them; ``halcmd setp`` changes it live. A chain of sum2 adds the corrections to the command of an axis and ends in the
+signal ``drive-x``, ``drive-y`` or ``drive-z``, which commands the servo; motor-pos-fb gets the command without corrections. The network
+does not know the direction of motion, so lost motion belongs in COMP_FILE. The file replaces the lines that connect motor-pos-cmd to
+motor-pos-fb; load it after ``addf motion-controller``.
 """
 
 from __future__ import annotations

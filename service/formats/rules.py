@@ -139,10 +139,10 @@ Evidence = Literal["verified by execution", "by manual"]
 
 @dataclass(frozen=True, slots=True)
 class SignRule:
-    """Conversion of an error to a number in a file.
+    """How a format writes an error as a number.
 
-    ``per_error``: +1 or −1. ``adds_position``: the number is a reached position. ``sure``: False if no manual states the sign explicitly;
-    then the 10 µm step must be verified on the machine before anything is loaded.
+    ``per_error``: factor of the error, +1 or −1. ``adds_position``: the nominal position is added. ``sure``: whether a manual states the
+    sign explicitly; if not, verify the 10 µm step (docs/reference/formats.md) on the machine before loading a table.
     """
 
     per_error: Literal[1, -1]

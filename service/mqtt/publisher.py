@@ -314,7 +314,7 @@ class Publisher:
             return
         self._untidy = 0
         if dropped:
-            log.warning("broker away for too long; oldest alarms dropped, results wait", broker=str(self._broker), dropped=dropped)
+            log.warning("broker away for too long; oldest alarms dropped, all results kept", broker=str(self._broker), dropped=dropped)
             self._on_drop(dropped)
 
     def _connected(self) -> None:

@@ -170,7 +170,7 @@ class StretchComparison:
     def from_box(self, boot_id: int) -> None:
         """Raise RunInterrupted if the box was restarted: its earlier readings must not be joined to new ones."""
         if boot_id != self._on.boot_id:
-            raise RunInterrupted("the ball-bar's box was restarted since the path was broken off", "the path begins again")
+            raise RunInterrupted("the ball-bar's box was restarted since the path was interrupted", "the path begins again")
 
     def add(self, sample: BarSample) -> None:
         """Add the next sample. Raises StretchDiffers if the stretch reads otherwise, or could not be read."""
@@ -198,7 +198,10 @@ class StretchComparison:
         if self.off_mm is not None:
             return
         if len(self._off) < LEAST_READINGS:
-            raise StretchDiffers("the stretch that is read twice gave too few readings", "look at bar and box; the path begins again")
+            raise StretchDiffers(
+                "too few valid readings when the path's last stretch was measured again",
+                "check the ball-bar and its box; the path begins again",
+            )
         off = np.array(self._off)
         noise_mm = 1.4826 * float(np.median(np.abs(off - np.median(off)))) / np.sqrt(off.size)
         self.off_mm = float(np.median(off))

@@ -22,7 +22,7 @@ def figure_name(key: str) -> tuple[str, str]:
 
 
 def number(value: float | None) -> str:
-    """A value with zero to two decimals by its size; a dash for None."""
+    """A value with two decimals below 1, one below 100, none from there on; a dash for None."""
     if value is None:
         return "–"
     size = abs(value)

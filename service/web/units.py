@@ -57,19 +57,19 @@ def rounded(value: float | None, u: float | None, unit: str, system: str) -> tup
 
 
 def shown(value: float | str | None, unit: str, system: str, decimals: int | None = None) -> str:
-    """A number for a screen, without its unit.
+    """A number as text in the reader's unit, without the unit's sign.
 
     Parameters
     ----------
     value : float, str or None
-        A number gets digits by its size. A text that holds a rounded number keeps its resolution; any other text is unchanged. None becomes
-        a dash.
+        A number is rounded to ``decimals``, or as `number` does. A text that holds a rounded number keeps its resolution; any other text is
+        unchanged. None becomes a dash.
     unit : str
         Unit of ``value``: ``"µm"``, ``"mm"``, ``"mm/min"``; others are not converted.
     system : str
         `METRIC` or `INCH`.
     decimals : int, optional
-        Decimals in ``unit``; another unit gets as many as keep that resolution.
+        Decimals in ``unit``; a value in inches gets as many as keep that resolution.
     """
     other = _INCHES.get(unit) if system == INCH else None
     if isinstance(value, str):
@@ -80,7 +80,7 @@ def shown(value: float | str | None, unit: str, system: str, decimals: int | Non
 
 
 def _converted_text(text: str, other: _InchUnit) -> str:
-    """A number that was rounded in the metric unit, in the other unit."""
+    """Convert a text that holds a rounded metric number to the inch unit, with the same resolution; any other text is unchanged."""
     try:
         number_read = float(text.replace("\u2212", "-"))
     except ValueError:

@@ -90,7 +90,7 @@ class Motion:
 
 
 def _lengths(vertices_mm: F) -> F:
-    """Return the length from the first vertex to each: (n,) mm."""
+    """Return the length of a polyline up to each vertex, (n,) mm."""
     steps = np.linalg.norm(np.diff(vertices_mm, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 

@@ -103,7 +103,7 @@ def from_dict(data: dict[str, Any]) -> FaultScenario:
 
 def _fault(entry: Any, number: int) -> Fault:
     if not isinstance(entry, dict) or "kind" not in entry:
-        raise FaultScenarioError(f"fault {number}: a table with kind is expected")
+        raise FaultScenarioError(f"fault {number}: expected a table [[fault]] with the key kind")
     types = {field.name: field.type for field in dataclasses.fields(Fault)}
     for key, value in entry.items():
         if key not in types:

@@ -117,7 +117,7 @@ def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
 def _sized(
     e: Hidden, wanted: float, perfect: PerfectMachine, runs: list[Run], model_projector: Projector
 ) -> tuple[Hidden, Visibility] | None:
-    """Return the effect at the strength for the wanted ``snr_local``, within its physical limits; None if it leaves no trace at all."""
+    """Scale an effect to the wanted ``snr_local`` within its physical limits; return it and its visibility, None if it leaves no trace."""
     low, high = (CATALOGUE | OUTSIDE)[e.name][3]
     seen = visibility(e, perfect, runs, model_projector)
     if seen.raw_rms_um < 1e-6:

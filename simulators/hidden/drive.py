@@ -1,6 +1,6 @@
 """Effects of the drives: lost motion, quadrant glitches, cyclic errors, servo lag, friction, vibration.
 
-In the docstrings of effects, "wild" is the departure from the textbook form if `Hidden.wild` is not 0.
+If ``e.wild`` (`Hidden.wild`) is not 0, an effect departs from its textbook form.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from abbe.simulators.hidden.track import Track, carriage_mm
 
 @effect("backlash")
 def backlash(e: Hidden, track: Track, out: Bend) -> None:
-    """Lost motion of width ``strength`` um; wild: part of it is elastic wind-up that gives way over some tenths of a millimetre."""
+    """Lost motion of width ``strength`` um; if ``e.wild``, part of it is elastic wind-up that gives way over tenths of a millimetre."""
     width, soft = e["strength"] * UM, e.freedom(0.1, 0.35, 1)
     out.drive[:, e.axis] = carriage_mm(track, e.axis, lambda x: np.full(x.shape, 0.5 * width * (1.0 - soft)))
     out.drive[:, e.axis] += wind_up(track, e.axis, soft * width, e.freedom(0.1, 0.8, 2) or 1.0)
@@ -20,7 +20,7 @@ def backlash(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("backlash_position_dependent")
 def backlash_position_dependent(e: Hidden, track: Track, out: Bend) -> None:
-    """Lost motion strength (1 + k x), x = -1 to 1 over the stroke; wild: the width bends along the screw, part of it is wind-up."""
+    """Lost motion strength (1 + k x), x = -1 to 1 over the stroke; if ``e.wild``, it also varies as x^2, and part of it is wind-up."""
     a, k, bow, soft = e.axis, e["k"], e.freedom(0.05, 0.3, 1, signed=True), e.freedom(0.0, 0.3, 2)
     low, high = track.low_mm[a], track.high_mm[a]
 
@@ -40,9 +40,9 @@ def wind_up(track: Track, axis: int, width_mm: float | F, over_mm: float) -> F:
 
 @effect("reversal_spike")
 def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
-    """Friction holds the axis back after a reversal: by ``strength`` um at 1000 mm/min, growing as feed^p, decaying within d0_mm.
+    """Friction holds the axis back after a reversal. The lag is ``strength`` um at 1000 mm/min and grows as feed^p.
 
-    The lag rises to its full size within a small part of d0_mm; wild: it differs between the two directions, and its decay has a tail.
+    It rises within a small part of d0_mm and decays over d0_mm; if ``e.wild``, its size depends on the direction and its decay has a tail.
     """
     if not track.moving:
         return
@@ -57,7 +57,7 @@ def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("cyclic_error")
 def cyclic_error(e: Hidden, track: Track, out: Bend) -> None:
-    """Waves with the pitch and half of it; wild: amplitude and phase vary along the screw, and there is a third harmonic."""
+    """Waves with the pitch and half of it; if ``e.wild``, amplitude and phase vary along the screw, and there is a third harmonic."""
     a = e.axis
     x, place = track.q_mm[:, a], middle(track, a)
     angle = 2.0 * np.pi * x / e["pitch_mm"] + e.freedom(0.2, 1.0, 1, signed=True) * np.sin(2.0 * place + e.freedom(0.0, 6.0, 2))
@@ -88,7 +88,7 @@ def lagging(track: Track, lag_s: float, second: float) -> F:
 
 @effect("contour_lag")
 def contour_lag(e: Hidden, track: Track, out: Bend) -> None:
-    """All axes trail by ``strength`` ms; wild: a second, faster lag of the current loop takes part of it."""
+    """All axes trail by ``strength`` ms; if ``e.wild``, part of it is a second, faster lag of the current loop."""
     second = e.freedom(0.05, 0.25, 1)
     # a circle shrinks with the second moment of the impulse response: this scaling keeps it at 2 strength^2
     out.drive += lagging(track, e["strength"] * MS / np.sqrt(1.0 - second + second * second), second)
@@ -96,7 +96,7 @@ def contour_lag(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("servo_mismatch")
 def servo_mismatch(e: Hidden, track: Track, out: Bend) -> None:
-    """One axis trails the others by ``strength`` ms (negative: it leads); wild: the lag depends on speed."""
+    """One axis trails the others by ``strength`` ms (negative: it leads); if ``e.wild``, the lag depends on speed."""
     a = e.axis
     stiff = e.freedom(0.05, 0.25, 1, signed=True)
     lag = lagging(track, e["strength"] * MS, e.freedom(0.0, 0.2, 2))[:, a]
@@ -108,7 +108,7 @@ def stick_slip(e: Hidden, track: Track, out: Bend) -> None:
     """Well below the speed v_c (mm/s) the axis sticks and jumps: a saw-tooth of amplitude ``strength`` um every period_mm of travel.
 
     The amplitude falls with speed as exp(-(v / v_c)^2) (Stribeck friction) and is 0 at standstill. The phase follows the travel, from a
-    random start; wild: teeth of unequal length.
+    random start; if ``e.wild``, the teeth differ in length.
     """
     if not track.moving:
         return
@@ -123,7 +123,7 @@ def stick_slip(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("vibration")
 def vibration(e: Hidden, track: Track, out: Bend) -> None:
-    """The axis vibrates at f_hz while the machine moves, with another phase in every run; wild: the amplitude varies slowly."""
+    """The axis vibrates at f_hz while the machine moves, with another phase in every run; if ``e.wild``, the amplitude varies slowly."""
     if not track.moving:
         return
     rng = e.rng(7, track.number)

@@ -1,4 +1,4 @@
-"""Effects of the instruments and their set-up ("wild": the departure from the textbook form if `Hidden.wild` is not 0)."""
+"""Effects of the instruments and their set-up. If ``e.wild`` (`Hidden.wild`) is not 0, an effect departs from its textbook form."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ DEAD_PATH_MM = 900.0
 
 @effect("bar_length_error")
 def bar_length_error(e: Hidden, track: Track, out: Bend) -> None:
-    """Every bar reads ``strength`` um too much; wild: the error varies slightly with the bar's length."""
+    """Every bar reads ``strength`` um too much; if ``e.wild``, the error varies slightly with the bar's length."""
     if track.kind == "bar":
         out.reading += e["strength"] * UM * (1.0 + e.freedom(0.02, 0.15, 1, signed=True) * (track.radius_mm / 150.0 - 1.0))
 
@@ -27,7 +27,7 @@ def mirror_tilt(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("laser_cosine")
 def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
-    """The beam is misaligned by ``strength`` mrad, in another direction in every set-up; wild: by another angle, too."""
+    """The beam is misaligned by ``strength`` mrad, in another direction in every set-up; if ``e.wild``, also by another angle."""
     if track.kind == "laser":
         aside = per_setup(e, track.setup)
         size = 1.0 + e.freedom(0.02, 0.12, 1) * float(np.sin(7.0 * aside[0]))
@@ -55,7 +55,7 @@ def zlib_of(text: str) -> int:
 
 
 def air_rise(e: Hidden, t_s: F) -> F:
-    """Return how much warmer the air is than the laser assumes, K, (n,): a wave of amplitude ``strength``; wild: a second, faster wave."""
+    """Return how much warmer the air is than the laser assumes, K, (n,): a wave of amplitude ``strength``; if ``e.wild``, two waves."""
     wave = np.sin(2.0 * np.pi * t_s / e["period_s"] + e["phase"])
     return np.asarray(e["strength"] * (wave + e.freedom(0.05, 0.25, 1) * np.sin(2.0 * np.pi * t_s / (0.31 * e["period_s"]) + e["phase"])))
 
@@ -69,7 +69,7 @@ def air_refraction(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("dead_path")
 def dead_path(e: Hidden, track: Track, out: Bend) -> None:
-    """The dead path, from laser to zero position, lies in air that warms by ``strength`` K/h; wild: unevenly."""
+    """The dead path, from laser to zero position, lies in air that warms by ``strength`` K/h; if ``e.wild``, unevenly."""
     if track.kind == "laser":
         hours = (track.t_s - track.t_s[0]) / 3600.0
         uneven = hours * (1.0 + e.freedom(0.1, 0.4, 1, signed=True) * (hours / 0.1 - 0.5))

@@ -1,4 +1,4 @@
-"""Effects outside the catalogue of effects ("wild": the departure from the textbook form if `Hidden.wild` is not 0)."""
+"""Effects outside the catalogue of effects. If ``e.wild`` (`Hidden.wild`) is not 0, an effect departs from its textbook form."""
 
 import numpy as np
 
@@ -48,7 +48,7 @@ def interference_burst(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("counterbalance_surge")
 def counterbalance_surge(e: Hidden, track: Track, out: Bend) -> None:
-    """The counterbalance moves the vertical axis up and down by ``strength`` um with period period_s; wild: not as a sine."""
+    """The counterbalance moves the vertical axis up and down by ``strength`` um with period period_s; if ``e.wild``, not as a sine."""
     if track.number >= 0:
         angle = 2.0 * np.pi * track.t_s / e["period_s"] + e["phase"]
         wave = np.sin(angle) + e.freedom(0.2, 0.6, 1) * np.sin(2.0 * angle + e.freedom(0.0, 6.0, 2))

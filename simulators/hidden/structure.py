@@ -1,6 +1,6 @@
 """Effects of slides, bed and ram: play across the travel, a bed that bends, sag, error motions beyond the present model.
 
-In the docstrings of effects, "wild" is the departure from the textbook form if `Hidden.wild` is not 0.
+If ``e.wild`` (`Hidden.wild`) is not 0, an effect departs from its textbook form.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from abbe.simulators.hidden.track import Track
 
 @effect("lateral_play")
 def lateral_play(e: Hidden, track: Track, out: Bend) -> None:
-    """A carriage steps sideways by ``strength`` um when it reverses; wild: over some travel, and more at one end of the guide."""
+    """A carriage steps sideways by ``strength`` um when it reverses; if ``e.wild``, over some travel, and more at one end of the guide."""
     a = e.axis
     half = 0.5 * e["strength"] * UM * (1.0 + e.freedom(0.05, 0.3, 1, signed=True) * middle(track, a))
     over = e.freedom(0.02, 0.4, 2) or 1e-9
@@ -24,7 +24,7 @@ def lateral_play(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("nonrigid_bed")
 def nonrigid_bed(e: Hidden, track: Track, out: Bend) -> None:
-    """A straightness error that changes sign along the ``other`` axis: A sin(pi x / L)(2 y / L_y - 1); wild: asymmetric in both axes."""
+    """A straightness error that changes sign along the ``other`` axis: A sin(pi x / L)(2 y / L_y - 1); if ``e.wild``, not symmetric."""
     a, other = e.axis, int(e["other"])
     x = 0.5 * (middle(track, a) + 1.0)
     across = middle(track, other)
@@ -37,7 +37,7 @@ def nonrigid_bed(e: Hidden, track: Track, out: Bend) -> None:
 def ram_sag(e: Hidden, track: Track, out: Bend) -> None:
     """The ram (axis Z) sinks as it extends: -A z^2 (1 + beta y), z = 0 to 1, y = -1 to 1 (height), A = ``strength`` um.
 
-    It sinks along gravity and tilts by the slope of this curve; wild: with a cubic part. No effect on a machine whose Z is vertical.
+    It sinks along gravity and tilts by the slope of this curve. If ``e.wild``, the curve has a cubic part. No effect if Z is vertical.
     """
     if track.vertical == 2:
         return

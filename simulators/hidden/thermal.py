@@ -1,6 +1,6 @@
 """Thermal effects: bodies that warm up from power-on (time 0 of the campaign clock), and what they move.
 
-In the docstrings of effects, "wild" is the departure from the textbook form if `Hidden.wild` is not 0.
+If ``e.wild`` (`Hidden.wild`) is not 0, an effect departs from its textbook form.
 """
 
 import numpy as np
@@ -30,14 +30,14 @@ def warmth(t_s: F, tau_s: float, *, slow_share: float = 0.0, slow_s: float = 1.0
 
 
 def rise(e: Hidden, t_s: F) -> F:
-    """Return the temperature rise of an effect's body as a fraction of its final rise; wild: part of it has another time constant."""
+    """Return the temperature rise of an effect's body as a fraction of its final rise; if ``e.wild``, with a second time constant."""
     ratio = float(np.exp(e.freedom(0.6, 1.4, 11, signed=True)))
     return warmth(t_s, e["tau_s"], slow_share=e.freedom(0.15, 0.6, 12), slow_s=e["tau_s"] * ratio)
 
 
 @effect("axis_thermal_growth")
 def axis_thermal_growth(e: Hidden, track: Track, out: Bend) -> None:
-    """The screw grows from x_fixed, finally by ``strength`` K; wild: warmer where the nut works, so that the strain is uneven."""
+    """The screw grows from x_fixed, finally by ``strength`` K; if ``e.wild``, unevenly, because it is warmer where the nut works."""
     a = e.axis
     x = track.q_mm[:, a]
     span = track.high_mm[a] - track.low_mm[a]
@@ -54,7 +54,7 @@ def spindle_thermal_drift(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("squareness_thermal")
 def squareness_thermal(e: Hidden, track: Track, out: Bend) -> None:
-    """One squareness changes, finally by ``strength`` urad: C0Y (XY), B0Z (ZX) or A0Z (YZ); wild: the column bends as it tilts."""
+    """One squareness changes, finally by ``strength`` urad: C0Y (XY), B0Z (ZX) or A0Z (YZ); if ``e.wild``, the column bends as it tilts."""
     carriage, direction, sign = {"XY": (1, 0, -1.0), "ZX": (2, 0, 1.0), "YZ": (2, 1, -1.0)}[e.key]
     place = middle(track, carriage)
     half = 0.5 * (track.high_mm[carriage] - track.low_mm[carriage])
@@ -66,7 +66,7 @@ def squareness_thermal(e: Hidden, track: Track, out: Bend) -> None:
 def bar_thermal(e: Hidden, track: Track, out: Bend) -> None:
     """The bar is ``strength`` K too warm from the hand when a set-up begins, so it is longer and reads too little.
 
-    wild: the excess varies from set-up to set-up, and two time constants act.
+    If ``e.wild``, the excess varies from set-up to set-up, and two time constants act.
     """
     if track.kind != "bar":
         return

@@ -208,7 +208,7 @@ class _Columns:
 
 
 def usual(suspect: SuspectEffect, columns: int) -> F1:
-    """Coefficients for the middle of the usual range, in the first column, for any power law of the strength."""
+    """Return coefficients for the middle of the usual range; only the first is not 0, and the strength may be any power of it."""
     effect = suspect.effect
     sizes = [abs(effect.strength(c * effect.per_unit * np.eye(columns)[0], suspect.values)) / effect.per_unit for c in (1.0, 4.0)]
     power = np.log(sizes[1] / sizes[0]) / np.log(4.0)

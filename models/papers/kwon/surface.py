@@ -135,7 +135,9 @@ def anova_from_sums(ss_reg: float, ss_res: float, df_reg: int, df_res: int, ss_t
 def critical_f(df_reg: int, df_res: int, alpha: float = 0.01) -> float:
     """Return F(df_reg, df_res, alpha), the value that chance exceeds with probability alpha."""
     if not 0.0 < alpha < 1.0 or df_reg < 1 or df_res < 1:
-        raise ValueError(f"critical F: alpha {alpha:g} must lie in (0, 1) and {df_reg}, {df_res} degrees of freedom be 1 or more")
+        raise ValueError(
+            f"critical F: alpha must lie in (0, 1), got {alpha:g}; degrees of freedom must be 1 or more, got {df_reg} and {df_res}"
+        )
     return float(scipy.special.fdtri(df_reg, df_res, 1.0 - alpha))
 
 

@@ -157,7 +157,7 @@ class Addition:
 
 
 def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, names: tuple[str, ...], order: int) -> tuple[Addition, ...]:
-    """Possible additions to these runs, cheapest first; every cause states a fact about the runs.
+    """Return possible additions to these runs, cheapest first. Each cause is a fact about the runs, e.g. "no ball-bar was used".
 
     Parameters
     ----------
