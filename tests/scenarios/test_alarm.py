@@ -6,10 +6,11 @@ import asyncio
 import json
 import os
 import re
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, closing, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -47,6 +48,7 @@ from abbe.service.verification.alarm_states import Alarm
 from abbe.service.verification.alarms import acknowledge, alarms_of
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims
+from tests.system.serve_bench import Broker, Process, payload
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(600)]
 RATE_HZ = 50
@@ -196,13 +198,25 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
     assert "kept: push 1: worst body diagonal" in doc["outcome"]
 
 
-def test_the_command_raises_the_alarm_and_says_what_a_bad_campaign_file_is(
-    start_sims: Callable[..., Sims], capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def receiver(tmp_path: Path) -> Iterator[tuple[Broker, Process]]:
+    """A broker, and somebody who listens to it."""
+    broker = Broker(tmp_path)
+    with closing(broker.process), closing(broker.subscriber()) as process:
+        yield broker, process
+
+
+def test_once_checks_tells_raises_the_alarm_ends_with_1_and_says_what_a_bad_campaign_file_is(
+    start_sims: Callable[..., Sims], receiver: tuple[Broker, Process], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    timetable = '[[schedule]]\nname = "weekly"\ncron = "0 6 * * 1"\nrecipe = "quick-check"\non_alarm = "propose"\n'
-    sims = start_sims("--speed", "100", "--seed", "2", extra=f"[verify]\nhelix_rms_um = 1\n[web]\nport = 0\n{timetable}")
+    broker, heard = receiver
+    timetable = '[[schedule]]\nname = "weekly"\ncron = "0 6 * * 1"\nrecipe = "quick-check at 20 Hz"\non_alarm = "propose"\n'
+    out = f'[verify]\nhelix_rms_um = 1\n[mqtt]\nurl = "{broker.url}"\ntopic_prefix = "plant/abbe"\n[web]\nport = 0\n{timetable}'
+    sims = start_sims("--speed", "200", "--seed", "2", extra=out)
     assert run(["serve", str(sims.machine_file), "--once"]) == 1, capsys.readouterr().err
     capsys.readouterr()
+    result = payload(heard.expect("sim/verification"))
+    assert (result["verdict"], result["schedule"]) == ("fail", "weekly (once)")
     assert run(["alarm", "list", str(sims.machine_file), "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)["alarms"]
     assert (doc["state"], doc["schedule"]) == ("raised", "weekly (once)")

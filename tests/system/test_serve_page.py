@@ -139,7 +139,7 @@ def test_history_in_the_browser(tmp_path: Path, chromium: Browser) -> None:
 
 def test_it_refreshes_itself_and_says_when_the_service_is_gone(tmp_path: Path, chromium: Browser) -> None:
     port = free_port()
-    with closing(service(tmp_path, schedules=[["fast", "*/3 * * * * *", "quick"]], port=port)) as running, browser(chromium) as seen:
+    with closing(service(tmp_path, schedules=[["fast", "* * * * * *", "quick"]], port=port)) as running, browser(chromium) as seen:
         running.expect("planned")
         open_page(seen, port)
         seen.page.locator("tr[data-id]").nth(1).wait_for(timeout=20_000)

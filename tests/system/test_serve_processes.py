@@ -113,14 +113,15 @@ def ended(pid: int, within_s: float) -> bool:
 @pytest.mark.scenario
 def test_the_page_is_killed_during_a_check_and_no_sample_is_missing(tmp_path: Path) -> None:
     port, who = free_port(), tokens(tmp_path)
-    timetable = ["[[schedule]]", 'name = "yearly"', 'cron = "0 0 1 1 *"', 'recipe = "quick-check"']
-    machine = Machine(tmp_path, 60.0, "[web]", f"port = {port}", *timetable)
+    recipe = "quick-check at 50 Hz"
+    timetable = ["[[schedule]]", 'name = "yearly"', 'cron = "0 0 1 1 *"', f'recipe = "{recipe}"']
+    machine = Machine(tmp_path, 100.0, "[web]", f"port = {port}", *timetable)
     with closing(machine.process), running(tmp_path, abbe("serve", machine.file), port, who) as abbe_serve:
-        number = abbe_serve.start("quick-check").json()["id"]
+        number = abbe_serve.start(recipe).json()["id"]
         with connect(f"ws://127.0.0.1:{port}/api/v1/live", additional_headers=who["viewer"]) as live:
             while not ((job := json.loads(live.recv(timeout=60))["job"]) and job["done"] > 0):
                 pass
-            assert (job["id"], job["state"], job["recipe"]) == (number, "running", "quick-check")
+            assert (job["id"], job["state"], job["recipe"]) == (number, "running", recipe)
             killed, killed_s = abbe_serve.web, time.monotonic()
             os.kill(killed, signal.SIGKILL)
             with pytest.raises(ConnectionClosed):
@@ -205,39 +206,40 @@ def test_jobs_by_everybody(tmp_path: Path) -> None:
         assert all("recipe quick" in record.target for record in records if record.outcome == "done 202")
 
 
-def test_a_job_is_started_once_steered_and_refused_and_the_page_ends_when_the_core_is_killed(tmp_path: Path) -> None:
-    with bench(tmp_path, YEARLY, ENDLESS) as made:
-        first = made.start("endless", **{"Idempotency-Key": "k1"})
-        number = first.json()["id"]
-        again = made.start("endless", **{"Idempotency-Key": "k1"})
-        assert (again.status_code, again.json()["id"]) == (202, number)
-        other = made.start("quick", **{"Idempotency-Key": "k1"})
-        assert (other.status_code, "another request" in other.json()["detail"]) == (409, True)
-        busy = made.start("quick")
-        assert (busy.status_code, "by hand: endless" in busy.json()["detail"]) == (409, True)
-        assert made.start("no-such").status_code == 422
-        assert made.http.post("/api/v1/jobs", json={"recipe": 7}, headers=made.who["operator"]).status_code == 422
-        assert made.http.post("/api/v1/jobs", json={"recipe": "quick", "x": 1}, headers=made.who["operator"]).status_code == 422
-        made.until(number, "running")
-        for how, state in (("pause", "pausing"), ("resume", "running"), ("stop", "stopping")):
-            answer = made.http.post(f"/api/v1/jobs/{number}/{how}", headers=made.who["operator"])
-            assert (answer.status_code, answer.json()["state"] in {state, "done: cannot tell"}) == (202, True), how
-        assert made.until(number, "done: cannot tell")["ended_utc"]
-        late = made.http.post(f"/api/v1/jobs/{number}/stop", headers=made.who["operator"])
-        assert (late.status_code, "has ended" in late.json()["detail"]) == (409, True)
-        status = made.http.get("/api/v1/status", headers=made.who["viewer"]).json()
-        assert status["job"] is None
-        assert status["last"][0]["cause"]["code"] == "SEQ-004"
-        with Store.open(url_of(tmp_path)) as store:  # whoever is shut out meanwhile: the next word of his is refused
-            People(store, SystemClock()).disable("a-operator")
-        assert made.start("quick").status_code == 401
-        page = made.web
-        made.process.kill()
-        assert ended(page, 10.0)
+@pytest.fixture(scope="module")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("shared")
 
 
-def frozen_and_thawed(made: Running) -> None:
-    """The core stands still: the page says so, still knows the past, and goes on when the core does."""
+@pytest.fixture(scope="module")
+def made(shared_folder: Path) -> Iterator[Running]:
+    """One service for the tests from here on: each leaves it at rest."""
+    with bench(shared_folder, YEARLY, ENDLESS) as running:
+        yield running
+
+
+def test_live_events_are_for_those_who_may_look(made: Running) -> None:
+    address, viewer = f"ws://127.0.0.1:{made.port}/api/v1/live", made.who["viewer"]
+    for headers in ({}, {**viewer, "Origin": "http://evil.example"}, {"Authorization": "Bearer abbe_000000000000_" + "A" * 43}):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(address, additional_headers=headers)
+        assert refused.value.response.status_code == 403
+    with connect(address, additional_headers=viewer) as live:
+        first = json.loads(live.recv(timeout=10))
+        assert first.keys() == {"event", "revision", "job", "devices", "mqtt_connected", "attention"}
+        assert first["devices"][0]["state"] == "not used yet"
+        number = made.start("quick").json()["id"]
+        made.until(number, "done: pass")
+        while json.loads(live.recv(timeout=10))["devices"][0]["state"] != "answered":
+            pass
+        live.send("hello")  # nobody listens to it
+        with pytest.raises(ConnectionClosed) as closed:
+            listen(live, 10)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1008
+
+
+def test_a_core_that_stands_still_is_told_and_the_page_still_knows_the_past_and_goes_on_with_it(made: Running) -> None:
     viewer = made.who["viewer"]
     assert made.http.get("/readyz").status_code == 200
     with connect(f"ws://127.0.0.1:{made.port}/api/v1/live", additional_headers=viewer) as live:
@@ -259,26 +261,32 @@ def frozen_and_thawed(made: Running) -> None:
     assert made.http.get("/readyz").status_code == 200
 
 
-def test_live_events_are_for_those_who_may_look_and_a_frozen_core_is_told(tmp_path: Path) -> None:
-    with bench(tmp_path, YEARLY) as made:
-        address, viewer = f"ws://127.0.0.1:{made.port}/api/v1/live", made.who["viewer"]
-        for headers in ({}, {**viewer, "Origin": "http://evil.example"}, {"Authorization": "Bearer abbe_000000000000_" + "A" * 43}):
-            with pytest.raises(InvalidStatus) as refused:
-                connect(address, additional_headers=headers)
-            assert refused.value.response.status_code == 403
-        with connect(address, additional_headers=viewer) as live:
-            first = json.loads(live.recv(timeout=10))
-            assert first.keys() == {"event", "revision", "job", "devices", "mqtt_connected", "attention"}
-            assert first["devices"][0]["state"] == "not used yet"
-            number = made.start("quick").json()["id"]
-            made.until(number, "done: pass")
-            while json.loads(live.recv(timeout=10))["devices"][0]["state"] != "answered":
-                pass
-            live.send("hello")  # nobody listens to it
-            with pytest.raises(ConnectionClosed) as closed:
-                listen(live, 10)
-            assert closed.value.rcvd is not None
-            assert closed.value.rcvd.code == 1008
-        frozen_and_thawed(made)
-        code, took_s = made.process.terminate()
-        assert (code, took_s < 5.0) == (0, True)
+def test_a_job_is_started_once_steered_and_refused_and_the_page_ends_when_the_core_is_killed(made: Running, shared_folder: Path) -> None:
+    """Last in this file: it kills the service that the tests before it share."""
+    first = made.start("endless", **{"Idempotency-Key": "k1"})
+    number = first.json()["id"]
+    again = made.start("endless", **{"Idempotency-Key": "k1"})
+    assert (again.status_code, again.json()["id"]) == (202, number)
+    other = made.start("quick", **{"Idempotency-Key": "k1"})
+    assert (other.status_code, "another request" in other.json()["detail"]) == (409, True)
+    busy = made.start("quick")
+    assert (busy.status_code, "by hand: endless" in busy.json()["detail"]) == (409, True)
+    assert made.start("no-such").status_code == 422
+    assert made.http.post("/api/v1/jobs", json={"recipe": 7}, headers=made.who["operator"]).status_code == 422
+    assert made.http.post("/api/v1/jobs", json={"recipe": "quick", "x": 1}, headers=made.who["operator"]).status_code == 422
+    made.until(number, "running")
+    for how, state in (("pause", "pausing"), ("resume", "running"), ("stop", "stopping")):
+        answer = made.http.post(f"/api/v1/jobs/{number}/{how}", headers=made.who["operator"])
+        assert (answer.status_code, answer.json()["state"] in {state, "done: cannot tell"}) == (202, True), how
+    assert made.until(number, "done: cannot tell")["ended_utc"]
+    late = made.http.post(f"/api/v1/jobs/{number}/stop", headers=made.who["operator"])
+    assert (late.status_code, "has ended" in late.json()["detail"]) == (409, True)
+    status = made.http.get("/api/v1/status", headers=made.who["viewer"]).json()
+    assert status["job"] is None
+    assert status["last"][0]["cause"]["code"] == "SEQ-004"
+    with Store.open(url_of(shared_folder)) as store:  # whoever is shut out meanwhile: the next word of his is refused
+        People(store, SystemClock()).disable("a-operator")
+    assert made.start("quick").status_code == 401
+    page = made.web
+    made.process.kill()
+    assert ended(page, 10.0)
