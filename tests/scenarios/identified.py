@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from abbe.models.machine import AXES
+from abbe.models.paths import DIAGONALS
 from abbe.service.campaigns.measure import measure
 from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.sequences.control import Watching
 from abbe.service.sequences.recipes.campaigns import identification, quick_check
-from abbe.service.sequences.recipes.recipe import Linear
+from abbe.service.sequences.recipes.recipe import Diagonal, Linear
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
@@ -26,9 +27,9 @@ from tests.scenarios.conftest import simulated
 
 MACHINE = ("--seed", "2", "--boot-id", "20260601")
 """The simulated machine; its controller counts as switched on all the time."""
-RATE_HZ = 50
-POSITIONS = 13
-"""Of a line: every move costs a dozen questions over the wire, and half of the usual positions tell the same smooth errors."""
+RATE_HZ = 20
+POSITIONS, STEPS = 11, 6
+"""Of a line and of a diagonal: every move costs a dozen questions over the wire, and half of the usual ones tell the same smooth errors."""
 
 
 def copy_identified(factory: pytest.TempPathFactory, folder: Path) -> None:
@@ -38,7 +39,7 @@ def copy_identified(factory: pytest.TempPathFactory, folder: Path) -> None:
 
 
 def _identify(folder: Path) -> None:
-    with simulated(folder, *MACHINE, "--speed", "80") as sims:
+    with simulated(folder, *MACHINE, "--speed", "200") as sims:
         loaded = load_machine(sims.machine_file)
         with Store.open(loaded.database_url) as store:
             asyncio.run(_measure(site_of(loaded.machine), store))
@@ -46,7 +47,8 @@ def _identify(folder: Path) -> None:
 
 async def _measure(site: Site, store: Store) -> None:
     full = identification(site.machine, rate_hz=RATE_HZ, name="june")
-    tests = [t for t in full.tests if not t.label.startswith("line") and not t.label.endswith(("ZYX", "helix4", "helix5"))]
+    tests = [t for t in full.tests if t.label in ("helix1", "helix2", "helix3")]
+    tests += [Diagonal(f"step-{d}-XYZ", f"D{d}XYZ", "identify", d, STEPS, "XYZ").plan(site.machine) for d in DIAGONALS]
     tests += [
         Linear(f"line{AXES[a]}{k}", f"L{AXES[a]}{k}", "identify", a, at_share=(at, at), positions=POSITIONS).plan(site.machine)
         for a in range(3)

@@ -68,12 +68,16 @@ def test_ball_bar_unplugged_in_mid_run(command, start_sims):
     assert bar_chunks(sims.machine_file.parent) > 5  # what was measured is kept
 
 
-def test_laser_beam_lost(command, start_sims):
+DIAGONAL = 'format = "abbe-recipe/1"\nname = "one"\n[[test]]\nkind = "diagonal"\nlabel = "d"\nsetup = "D"\ndiagonal = "ppp"\nsteps = 20\n'
+
+
+def test_laser_beam_lost(command, start_sims, tmp_path):
     sims = start_sims("--speed", "20")
+    (tmp_path / "one.toml").write_text(DIAGONAL)
     # The first readings of a line of 42 are stored: the beam goes while it is being read, not while it is zeroed for the next one.
     first = (lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, "the first readings of a laser line")
     with meanwhile(*first, lambda: sims.ask("beam", blocked=True)):
-        ended = command("measure", str(sims.machine_file), "--recipe", "verification")
+        ended = command("measure", str(sims.machine_file), "--recipe", "one.toml")
     refused(ended, "ILK-007", "beam")
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")

@@ -30,7 +30,7 @@ def identified(tmp_path_factory):
     """A simulated machine and the campaigns `june` (identification) and `start` (verification), measured once for all tests."""
     folder = tmp_path_factory.mktemp("identified")
     copy_identified(tmp_path_factory, folder)
-    with simulated(folder, *MACHINE, "--speed", "60") as sims:
+    with simulated(folder, *MACHINE, "--speed", "150") as sims:
         yield sims
 
 
@@ -177,7 +177,7 @@ def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_u
 
 SCHEDULE = """[[schedule]]
 name = "daily"
-recipe = "quick-check"
+recipe = "quick-check at 20 Hz"
 cron = "0 3 * * *"
 [web]
 port = 0

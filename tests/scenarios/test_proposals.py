@@ -184,7 +184,7 @@ def test_an_approval_ends_and_binds_who_and_what(shop):
         store.proposals.approve(
             ProposalApproval(proposal_id=other, name="anna", login="anna", digest=good.digest, expiry="2099-01-01T00:00:00.000000Z")
         )  # prolonged by hand
-        with pytest.raises(TableRefused, match="APPROVAL: what anna approved is not this table"):
+        with pytest.raises(TableRefused, match="APPROVAL: anna approved another table"):
             try_push(shop, store, other)
         assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched
@@ -214,7 +214,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
         change_row(shop.url, sealed, bend, sealed=True)
         with pytest.raises(StoreError, match="was changed after it was stored"):
             try_push(shop, store, plain)
-        with pytest.raises(TableRefused, match=r"(?s)HASH.*APPROVAL: what anna approved is not this table"):
+        with pytest.raises(TableRefused, match=r"(?s)HASH.*APPROVAL: anna approved another table"):
             try_push(shop, store, sealed)
         assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched

@@ -14,6 +14,7 @@ from abbe.service.storage.store import Store
 from tests.scenarios.test_push import bench, push, steep
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(300)]
+QUICK = ("--recipe", "quick-check", "--rate-hz", "20")
 
 
 def fleet(url, capsys):
@@ -23,7 +24,7 @@ def fleet(url, capsys):
 
 
 def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(start_sims, tmp_path, capsys):
-    sims = start_sims("--speed", "40")
+    sims = start_sims("--speed", "150")
     url, file = f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}", str(sims.machine_file)
 
     async def kept():
@@ -32,7 +33,7 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
 
     asyncio.run(kept())
     assert fleet(url, capsys)["verdict"] == "verified"
-    assert run(["measure", file, "--recipe", "quick-check", "--name", "first"]) == 0
+    assert run(["measure", file, *QUICK, "--name", "first"]) == 0
     assert re.search(r"^check 1: (pass|fail|cannot tell): ", capsys.readouterr().out, re.MULTILINE)
     first = fleet(url, capsys)
     assert first["verified"]["why"] == "check"
@@ -53,7 +54,7 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
     assert run(["report", "first", "--machine", file, "--out", str(target)]) == 0
     assert "Unverified now. Unverified since the rollback of" in capsys.readouterr().out
 
-    assert run(["measure", file, "--recipe", "quick-check", "--name", "second"]) == 0
+    assert run(["measure", file, *QUICK, "--name", "second"]) == 0
     capsys.readouterr()
     assert fleet(url, capsys)["verified"]["why"] == "check"
     assert run(["report", "second", "--machine", file, "--out", str(target)]) == 0
@@ -61,7 +62,7 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
 
 
 def test_the_check_of_an_accepted_table_is_its_check_and_an_ended_certificate_marks_it(start_sims, tmp_path, capsys):
-    sims = start_sims("--speed", "100")
+    sims = start_sims("--speed", "150")
     folder = sims.machine_file.parent
     url, file = f"sqlite:///{folder / 'abbe.sqlite3'}", str(sims.machine_file)
     (tmp_path / "another").mkdir()
@@ -75,9 +76,9 @@ def test_the_check_of_an_accepted_table_is_its_check_and_an_ended_certificate_ma
     asyncio.run(kept())
     good = sims.machine_file.read_text()
     sims.machine_file.write_text(good.replace("ballbar = 2099-12-31", "ballbar = 2020-03-31"))
-    assert run(["measure", file, "--recipe", "quick-check"]) == 2
+    assert run(["measure", file, *QUICK]) == 2
     assert "a table that this database did not push" in capsys.readouterr().err
-    assert run(["measure", file, "--recipe", "quick-check", "--accept-table"]) == 0
+    assert run(["measure", file, *QUICK, "--accept-table"]) == 0
     out = capsys.readouterr().out
     assert "check 1: cannot tell: the certificate of the ball-bar ended on 2020-03-31, so the figures cannot be judged; " in out
     line = fleet(url, capsys)

@@ -40,7 +40,7 @@ Runs = list[Run]
 
 def plan_of(site: Site, name: str, *, diagonals: tuple[str, ...] = DIAGONALS, helix: bool = True) -> CampaignPlan:
     """A short verification: what a decision needs and no more."""
-    tests = [Helix("check-helix", "VB", "holdout", (300.0, 250.0, 100.0), 100.0, turns=3, rate_hz=50).plan(site.machine)] if helix else []
+    tests = [Helix("check-helix", "VB", "holdout", (300.0, 250.0, 100.0), 100.0, turns=3, rate_hz=20).plan(site.machine)] if helix else []
     tests += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 4, "").plan(site.machine) for d in diagonals]
     return CampaignPlan(name, tuple(tests))
 
@@ -73,7 +73,7 @@ BASE = {"scale": 60e-5, "shear": -20e-5}
 @contextmanager
 def made_shop(folder: Path) -> Iterator[Shop]:
     """The machine, its table in force and its verification with it, measured."""
-    with simulated(folder, "--speed", "60", "--seed", "5") as sims:
+    with simulated(folder, "--speed", "150", "--seed", "5") as sims:
         made = Shop(sims, site_of(sims), f"sqlite:///{folder / 'abbe.sqlite3'}")
         asyncio.run(_prepared(made))
         yield made
