@@ -5,12 +5,14 @@ what
 the drives get (``drive-x..z``, after everything that the control adds), never the commands. Its instruments see only where the tool is.
 
 The first control gets a 3-D grid into its network, the second one its axes' own tables as COMP_FILE. Both run at the same time: nearly
-all of it is the time that axes take. They are therefore as quick as the control lets them be (`VELOCITY`, `ACCELERATION`).
+all of it is the time that axes take. They are therefore as quick as the control lets them be (`VELOCITY`, `ACCELERATION`). The long run
+only adds more places to stand at.
 """
 
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from itertools import pairwise
 
@@ -44,6 +46,8 @@ PITCH_MM = 10.0
 """Between two points of an axis' own table; the waves of the screws are six of them."""
 SLOW_MM = 0.01
 WHOLE_S = 90.0
+POINTS, POSITIONS = (200, 25) if os.environ.get("ABBE_TEST_LONG") else (80, 12)
+"""Of the volume and of each axis, where the tool stands to be compared."""
 
 
 class Behind:
@@ -186,10 +190,10 @@ def between(table: list[tuple[float, float]], at: float) -> float:
 
 
 async def volumetric(machine: Instance) -> dict[str, float]:
-    """Identify with bar and laser, push a grid, stand at 200 random points."""
+    """Identify with bar and laser, push a grid, stand at random points."""
     truth = Truth(2)
     rng = np.random.default_rng(7)
-    points = tour(np.round(rng.uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (200, 3)), 5))
+    points = tour(np.round(rng.uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (POINTS, 3)), 5))
     async with controller(machine) as cnc:
         behind = Behind(machine, cnc, truth)
         begin = time.monotonic()
@@ -219,7 +223,7 @@ async def by_files(machine: Instance) -> dict[str, float]:
     truth = Screws(3)
     rng = np.random.default_rng(8)
     nodes = [np.arange(0.0, length + 1e-9, PITCH_MM) for length in MACHINE.length_mm]
-    at = [np.sort(np.round(rng.uniform(n[0], n[-1], 25), 5)) for n in nodes]
+    at = [np.sort(np.round(rng.uniform(n[0], n[-1], POSITIONS), 5)) for n in nodes]
     begin = time.monotonic()
     async with controller(machine) as cnc:
         behind = Behind(machine, cnc, truth)
