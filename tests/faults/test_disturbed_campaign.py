@@ -1,4 +1,4 @@
-"""A small campaign with a fault every 20 s of device time ends with the same solution, within its uncertainty, as the undisturbed one.
+"""A small campaign with a fault every 12 s of device time ends with the same solution, within its uncertainty, as the undisturbed one.
 
 The full one (the planner's hour, speed 60, a fault every 20 s) is ``python -m tests.experiments.campaigns.disturbed``.
 """
@@ -12,7 +12,7 @@ from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
 from tests.experiments.campaigns.disturbed import MACHINE, both, summary
 
-SPEED, EVERY_S, SEED = 60.0, 20.0, 5
+SPEED, EVERY_S, SEED = 100.0, 12.0, 5
 
 
 def campaign() -> CampaignPlan:
@@ -21,8 +21,8 @@ def campaign() -> CampaignPlan:
     recipes = (
         *shared_setups(
             (
-                Helix("helix", "B1", "identify", centre, 100.0, turns=3.0, chord_mm=3.0, feed_mm_min=6000.0, rate_hz=250),
-                Helix("back", "B1", "identify", centre, 60.0, turns=3.0, chord_mm=3.0, feed_mm_min=6000.0, rate_hz=250, direction=-1),
+                Helix("helix", "B1", "identify", centre, 100.0, turns=3.0, chord_mm=3.0, feed_mm_min=6000.0, rate_hz=100),
+                Helix("back", "B1", "identify", centre, 60.0, turns=3.0, chord_mm=3.0, feed_mm_min=6000.0, rate_hz=100, direction=-1),
             ),
             "test",
         ),
