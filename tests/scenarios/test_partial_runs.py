@@ -27,7 +27,7 @@ WHY = r"stopped: \d+\.\d % of the path; not judged"
 
 def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, start_sims, capsys):
     sims = start_sims("--speed", "10")
-    words = ("measure", str(sims.machine_file), "--helix", "300,250,100,80", "--name", "june")
+    words = ("measure", str(sims.machine_file), "--helix", "300,250,100,60", "--name", "june")
     process = abbe(*words)
     wait_for(lambda: bar_chunks(sims.machine_file.parent) > 3, 60, "samples of the helix")
     _, err = interrupt(process, signal.SIGINT)

@@ -16,7 +16,7 @@ from tests.scenarios.world import axes_at_rest, bar_chunks, interrupt, refused, 
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
-HELIX = ("--helix", "300,250,100,150")
+HELIX = ("--helix", "300,250,100,100")
 """At the speed of the simulated machine this path takes some seconds."""
 
 
@@ -69,7 +69,7 @@ def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on_but_no_other
     assert axes_at_rest(measuring.sims)
     assert err.splitlines()[-1] == "stopped: `abbe measure MACHINE.toml --resume CAMPAIGN` resumes it"
     assert measuring.runs() == [("helix", "stopped")]
-    for change in (("--helix", "300,250,100,140"), ("--recipe", "quick-check")):
+    for change in (("--helix", "300,250,100,90"), ("--recipe", "quick-check")):
         line = refused(command("measure", measuring.file, "--resume", "june", *change), "SEQ-007")
         assert line.startswith("error SEQ-007: campaign 'june' was begun with another recipe")
     code, out, err = command("measure", measuring.file, "--resume", "june")
