@@ -70,6 +70,7 @@ label = "cx"
 setup = "cup"
 centre_mm = [300.0, 250.0, 100.0]
 radius_mm = 100.0
+rate_hz = 20
 plane = "XY"
 [[test]]
 kind = "circle"
@@ -77,6 +78,7 @@ label = "cy"
 setup = "cup"
 centre_mm = [300.0, 250.0, 100.0]
 radius_mm = 100.0
+rate_hz = 20
 plane = "XY"
 direction = -1
 [[test]]
@@ -85,6 +87,7 @@ label = "h1"
 setup = "cup2"
 centre_mm = [300.0, 250.0, 100.0]
 radius_mm = 80.0
+rate_hz = 20
 turns = 3.0
 """
     + "".join(
@@ -130,7 +133,7 @@ def verified(folder: Path) -> None:
 def stored(tmp_path_factory) -> Iterator[Path]:
     """A folder with a machine file and a database: two measured campaigns, solution, discovery, push, verification."""
     folder = tmp_path_factory.mktemp("report")
-    with simulated(folder, "--speed", "100", "--seed", "5") as sims, pytest.MonkeyPatch.context() as patch:
+    with simulated(folder, "--speed", "200", "--seed", "5") as sims, pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         (folder / "axis.toml").write_text(AXIS)
         (folder / "small.toml").write_text(SMALL)
