@@ -73,7 +73,7 @@ WAYS = {
     ),
     "warmer between before and after": (
         lambda s: Push(s, *s.here, s.tables(), lambda: s.sims.ask("air", plus_c=3.0)),
-        "cannot tell whether it is better: the air had",
+        "cannot tell whether it is better: the air was at",
     ),
 }
 """Ways in which the verification says no: what is pushed and what happens, and what stands in the journal."""
@@ -104,7 +104,7 @@ async def test_what_is_not_clearly_better_goes_back(shop: Shop, way: str) -> Non
 RAISING = {
     "a figure is missing": ({"plan": {"diagonals": ("ppp", "npp", "pnp")}}, MeasurementFault, "body diagonal ppn is missing"),
     "no valid reading": ({"alter": empty}, MeasurementFault, "only 0 valid readings"),
-    "not a number": ({"alter": not_numbers}, MeasurementFault, "no finite number"),
+    "not a number": ({"alter": not_numbers}, MeasurementFault, "not a finite number"),
 }
 
 
