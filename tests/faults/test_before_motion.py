@@ -66,13 +66,13 @@ async def test_a_box_whose_range_is_set_to_nothing(place: tuple[Bench, Store]) -
     b, store = place
     b.sim.world.ballbar.switch(inch=False, range_mm=0.02, zero_mm=0.0)
     await of_firmware_1_1(b)
-    await refused(b, store, "Helix", Refused, r"range is set to \+-0\.02 mm, needed are 0\.1")
+    await refused(b, store, "Helix", Refused, r"range is set to \+-0\.02 mm, but \+-0\.1 mm are needed")
 
 
 async def test_a_box_that_cannot_send_so_fast(place: tuple[Bench, Store], monkeypatch: pytest.MonkeyPatch) -> None:
     b, store = place
     monkeypatch.setattr("abbe.simulators.ballbar.wire.MAX_RATE_HZ", device.MAX_RATE_HZ // 20)
-    await refused(b, store, "Helix", Refused, "100 Hz are wanted, the box sends at most 50")
+    await refused(b, store, "Helix", Refused, "100 Hz requested, but the box sends at most 50")
 
 
 @pytest.mark.parametrize(

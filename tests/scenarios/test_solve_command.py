@@ -235,7 +235,7 @@ def test_a_folder_does_not_pass_for_a_stored_campaign_of_its_name(command, small
         import_folder(store, write_folder(tmp_path / "other", site.doc, runs))
     code, _, err = command("solve", small, "--model", "rigid6", "--db", "sqlite:///d.sqlite3")
     assert code == 2
-    assert "another campaign 'c1'" in err
+    assert "a different campaign 'c1'" in err
     assert "the machine (chain" not in err  # its readings do
 
 

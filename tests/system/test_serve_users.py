@@ -60,12 +60,14 @@ def test_open_to_everybody_is_refused_in_one_line(tmp_path: Path, refused: Refus
     assert "error CFG-001: [web] certificate" in refusal('certificate = "abbe.crt"\nkey = "abbe.key"\n')
 
 
-def test_an_audit_that_cannot_be_written_is_said_when_the_service_starts(tmp_path: Path, refused: Refused) -> None:
+def test_an_audit_that_cannot_be_written_is_said_when_the_service_starts(tmp_path: Path) -> None:
+    """In a process of its own: beside other tests, their traces would stand among its lines."""
     (tmp_path / "m.toml").write_text(MACHINE + "port = 0\n")
     (tmp_path / "abbe.sqlite3.audit-key").mkdir()
-    lines = refused(tmp_path / "m.toml")
-    assert lines[-1].startswith(f"error AUD-001: the audit cannot be used: {tmp_path}/abbe.sqlite3.audit-key: ")
-    assert not any("Traceback" in line for line in lines)
+    with closing(abbe("serve", tmp_path / "m.toml")) as process:
+        assert process.wait() == 2
+    assert process.lines[-1].startswith(f"error AUD-001: the audit cannot be used: {tmp_path}/abbe.sqlite3.audit-key: ")
+    assert not any("Traceback" in line for line in process.lines)
 
 
 def test_a_login_over_tls(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def test_what_cannot_be_solved_says_so():
     path = straight_line(BOX[:, 0], BOX[:, 1], 8)
     with pytest.raises(MeasurementFault, match="run r1: it is sealed"):
         run_data(run_of(stored("laser_diagonal", path, None, nominal_beam=[1, 0, 0])))
-    with pytest.raises(MeasurementFault, match="run r1: test 'gauge_block' is not one"):
+    with pytest.raises(MeasurementFault, match="run r1: the solver does not know the test 'gauge_block'"):
         run_data(run_of(stored("gauge_block", path, np.zeros(16))))
     few = stored("laser_diagonal", path, np.zeros(16), nominal_beam=[1, 0, 0])
     few["columns"]["valid"] = [1] * 9 + [0] * 7

@@ -101,7 +101,7 @@ def test_users_by_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, ca
 
     assert abbe("user", "add", "ana", "admin", stdin=PHRASE + "\n") == (0, "user 'ana' is admin\n")
     assert abbe("user", "add", "met", "metrologist", stdin=PHRASE)[0] == 0
-    assert abbe("user", "add", "bob", "viewer", stdin="short\n")[1].startswith("error USR-001: a password has 12 to 256 characters")
+    assert abbe("user", "add", "bob", "viewer", stdin="short\n")[1].startswith("error USR-001: a password needs 12 to 256 characters")
     assert abbe("user", "add", "bob", "viewer", PHRASE)[1].startswith("error USE-001")  # a password is not an argument
     assert abbe("user", "disable", "ana")[1].startswith("error USR-002: 'ana' is the only admin")
     assert abbe("user", "password", "met", stdin=PHRASE + " 2\n")[0] == 0

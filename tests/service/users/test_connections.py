@@ -138,8 +138,8 @@ async def test_who_is_connected_and_asks_stays_while_others_come() -> None:
 )
 @pytest.mark.parametrize("drop_by_drop", [False, True])
 async def test_what_does_not_come_to_its_end_is_cut(said: bytes, drop_by_drop: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEADERS_S", 0.3)
-    monkeypatch.setattr(connections, "BODY_S", 0.3)
+    monkeypatch.setattr(connections, "HEADERS_S", 1.0)
+    monkeypatch.setattr(connections, "BODY_S", 1.0)
     async with serving() as site:
         stream = await site.opened(said)
         ended = asyncio.create_task(is_let_go(stream))

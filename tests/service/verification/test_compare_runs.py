@@ -55,7 +55,7 @@ def test_what_cannot_be_compared_says_why() -> None:
     helix = replace(one.run, test="ballbar_helix")
     assert "only runs of one test" in incomparable_reason(one, LoadedRun("june/c2", "mill-7", helix, one.data, ()))
     moved = circle(2, centre_mm=[5.0, 0.0, 0.0])
-    assert remarks([one, moved]) == ["june/c2 was measured elsewhere than june/c1 (centre_mm): the difference holds that too"]
+    assert remarks([one, moved]) == ["june/c2 was measured elsewhere than june/c1 (centre_mm): the difference includes this"]
     assert remarks([one, circle(5)]) == []
 
 
