@@ -53,7 +53,7 @@ class SignCommissioning:
 
 @dataclass
 class CommissioningContext:
-    """Open devices, database, machine and places of the ball-bar for one commissioning."""
+    """What one commissioning needs: open devices, database, machine, and the places that the ball-bar reads."""
 
     session: Session
     store: Store
@@ -107,7 +107,7 @@ async def commission(session: Session, store: Store, site: Site, *, progress: Pr
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """The tables to write: a first small step of all axes, then one step per axis; step sizes in whole units of the control."""
+    """The test tables: one with a small step in every axis, then one per axis with a larger step; steps in whole units of the control."""
 
     lsb_nm: int
     small_mm: float
@@ -150,7 +150,7 @@ async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> Si
 
 
 def _base_tables(site: Site, base: Base) -> NineTables:
-    """The tables in force; zeros where there is no correction."""
+    """Return the tables in force; zeros if there is no correction."""
     if base.tables is not None:
         return base.tables
     grids = grid_positions(site.machine, GRID)
@@ -160,7 +160,7 @@ def _base_tables(site: Site, base: Base) -> NineTables:
 
 
 def _stepped(context: CommissioningContext, tables: NineTables, axes: tuple[int, ...], step_mm: float) -> NineTables:
-    """The tables with a step for some axes, over the whole reach of the bar."""
+    """Add a step to the tables of some axes, over the whole reach of the bar."""
     for axis in axes:
         centre, reach = context.bar.centre_mm[axis], context.bar.radius_mm + 1.0
         low_mm = centre - (1.0 if axis == UPRIGHT else reach)  # the places are on the upper hemisphere

@@ -1,8 +1,8 @@
-"""Commissioning of a controller's capabilities: attempts that it must refuse, and attempts that it must accept, prove each flag.
+"""Commissioning of a controller's capabilities: each flag is proved by attempts that it must refuse and attempts that it must accept.
 
 The inactive bank holds a copy of the table in force for every attempt. So the same corrections act as before, whatever the controller
-wrongly accepts and wherever the test is interrupted. Nobody has to open, press or restart anything; properties that only this could show
-are reported as not shown.
+wrongly accepts and wherever the test is interrupted. Nobody has to open, press or restart anything; what only such an action
+could show is reported as not shown.
 
 `Trial` attempts one operation and records whether it was refused. `while_moving` checks that an activation is refused while an axis moves:
 it moves one axis slowly by a few millimetres, up if there is room, and back.
@@ -55,7 +55,7 @@ class Trial:
     Parameters
     ----------
     controller : Controller
-        Identified.
+        A controller that has been identified.
     base : Base
         The table in force when the test began, of which the test writes copies.
     owner, stranger : int
@@ -87,7 +87,7 @@ class Trial:
         self.judge(flag, bool(why), f"refuses {what}", f"accepts {what}")
 
     def check_counted(self, before: int, after: int, what: str) -> None:
-        """Record whether the generation counted exactly one change."""
+        """Record whether the controller's generation counter rose by exactly one."""
         self.judge("generation", after == (before + 1) % 2**32, f"counts {what}", f"does not count {what} ({before} → {after})")
 
     def is_proved(self, flag: str) -> bool:
@@ -96,7 +96,7 @@ class Trial:
         return bool(of_it) and all(of_it)
 
     async def status(self) -> CompStatus:
-        """The present state of the banks; also collects the boot id."""
+        """Return the present state of the banks; also note the boot id."""
         now = await self.controller.comp_status()
         self.boots.add(now.boot_id)
         return now
@@ -112,12 +112,12 @@ class Trial:
         return ""
 
     async def rewrite(self) -> None:
-        """Write one register pair of the inactive bank again with its own content."""
+        """Write one register pair of the inactive bank again, with the content that it already has."""
         other = 1 - (await self.status()).active_bank
         await self.controller.write_bank(other, self.base.image[2 * ID_WORD : 2 * ID_WORD + 4], first=ID_WORD)
 
     async def take_lease(self) -> None:
-        """Take the lease, also from a second owner that the controller wrongly accepted."""
+        """Take the lease, even from a second owner that the controller wrongly accepted."""
         if await self.refusal_of(self.controller.lease(self.owner, LEASE_MS)):
             await self.refusal_of(self.controller.release(self.stranger))
             await self.controller.lease(self.owner, LEASE_MS)

@@ -42,7 +42,7 @@ ONLY_FRESH = "the tables assume that no table was active during the measurement:
 
 @dataclass(frozen=True)
 class Exported:
-    """Files for a control, the kinds of tables that were compared, and notes for people."""
+    """Files for a control, the kinds of tables among which the best was chosen, and notes for people."""
 
     files: tuple[TextFile, ...]
     choices: tuple[FormatChoice, ...]
@@ -98,7 +98,7 @@ def control_for(key: str) -> ControlModel:
     Raises
     ------
     FormatRefused
-        There is neither.
+        There is no control and no format of this key.
     """
     if key in CONTROLS:
         return CONTROLS[key]
@@ -126,7 +126,7 @@ def control_for(key: str) -> ControlModel:
 
 
 def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> FormatSettings:
-    """Settings for the writers: reference, decimals of the control's unit, Fanuc's unit."""
+    """Return the settings for writing table files: reference point, decimals that the control's unit needs, and unit for Fanuc."""
     x, y, z = (float(v) for v in reference_mm)
     return FormatSettings(
         reference_mm=(x, y, z),
@@ -137,7 +137,7 @@ def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> F
 
 
 def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh: bool = False) -> Exported:
-    """The best tables that a control (or a format alone) can hold, as its files.
+    """Return the best tables that a control (or a format alone) can hold, as the text of its files.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
     Raises
     ------
     FormatRefused
-        There is no such format, or the tables do not fit it.
+        There is no such format, the tables do not fit it, or no table reduces the errors.
     """
     control = control_for(key)
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
@@ -164,7 +164,7 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
 
 
 def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Write each part in the format that the control uses for it."""
+    """Write each part of a compensation (own, cross, lattice, motions) in the format that the control uses for it."""
     own = Compensation(comp.own)
     cross = Compensation(comp.cross, comp.products)
     if control.own == control.cross:
@@ -242,7 +242,7 @@ SUFFIXES = {
 
 
 def belongs(file: TextFile, key: str) -> bool:
-    """Whether a file in a control's folder has this format, by its name."""
+    """Whether the name of a file in a control's folder fits this format."""
     return file.name.lower().endswith(SUFFIXES.get(key, ""))
 
 
@@ -373,7 +373,7 @@ def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSe
     Raises
     ------
     KeyRefused, SignatureRefused
-        There is no key, no valid span, no machine file, or the solution belongs to another machine.
+        There is no key or no machine file, the days of validity are out of range, or the solution belongs to another machine.
     """
     keys.read_key(seal.key)
     if config is None:

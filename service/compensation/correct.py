@@ -150,7 +150,7 @@ async def _push(context: PushContext, admission: Admission, made: StoredProposal
 
 
 def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
-    """Prepare a run as the solved runs were: remove what the table in force did beyond its smooth corrections."""
+    """Prepare a run as the solved runs were prepared: remove what the table in force did beyond its smooth corrections."""
     if table is None:
         return run
     lost = np.array([v for v, _ in solved.joint.backlash_mm().values()])
@@ -179,7 +179,7 @@ class _PushQuestions:
         return self.admission.precheck
 
     def drift_reasons(self) -> list[str]:
-        """Return the reason if a newer run shows drift, or if there is no newer run; else nothing."""
+        """Return one reason if a newer run shows drift, or if there is no newer run; otherwise an empty list."""
         if self.drift_mm is None:
             return [NO_NEWER_RUN]
         return [reason] if (reason := drift_reason(self.drift_mm, self.context.site.limits)) else []

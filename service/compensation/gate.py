@@ -66,7 +66,7 @@ class PushPrecheck:
     def reasons(self, drift_mm: float | None = None) -> list[str]:
         """All reasons against pushing the proposal now.
 
-        ``drift_mm``: rms residual of its solution in a newer run, which the solution did not use, mm.
+        ``drift_mm``: rms residual of the proposal's solution in a newer run, which the solution did not use, mm.
         """
         candidate = self.proposed.candidate
         if drift_mm is not None and candidate.digest == content_digest(candidate):
@@ -130,7 +130,7 @@ async def precheck(
 
 
 def _drifted(candidate: Candidate, drift_mm: float) -> Candidate:
-    """The candidate with the drift that became known after signing; it is checked only, never stored."""
+    """Return the candidate with a drift that became known after it was signed; this copy is only checked, never stored."""
     later = replace(candidate, evidence=replace(candidate.evidence, drift_mm=drift_mm))
     digest = content_digest(later)
     return replace(later, digest=digest, seal=EvidenceSeal(later.seal.role, digest))
@@ -181,7 +181,7 @@ async def check_preconditions(context: PushContext) -> LevelStatus:
     Raises
     ------
     TableRefused
-        The control was never commissioned, or allows no such push.
+        The control was never commissioned, or allows no push of this kind.
     AbbeError, DriverError
         From `recover` and `check_devices`.
     """

@@ -87,7 +87,7 @@ def _pushed(own: Journal, journal: JournalView) -> ProposalStatus | None:
 def valid_approval(
     proposed: Proposed, approvals: Sequence[ProposalApproval], now_s: float, *, two_people: bool
 ) -> tuple[ProposalApproval | None, str]:
-    """The last valid approval; otherwise None and the reason."""
+    """Return the last valid approval and an empty text; otherwise None and the reason."""
     why = "not approved yet: run abbe comp approve"
     for row in reversed(approvals):
         if two_people and same_person(row.name, proposed.by):

@@ -50,7 +50,7 @@ def compare(store: Store, number: int, with_what: str) -> TableDifference:
 
 
 def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
-    """Compare nine tables with nine others on the new grid; ``old`` None: with no correction."""
+    """Compare nine new tables with nine old ones on the grid of the new ones; ``old`` None: no correction was in force."""
     found = []
     for a, moved in enumerate(AXES):
         grid = new.position_mm[a]
@@ -63,7 +63,7 @@ def changes(old: NineTables | None, new: NineTables) -> tuple[CurveChange, ...]:
 
 
 def rows(found: TableDifference) -> list[tuple[str, ...]]:
-    """One row of text per table, µm; U is k = 2."""
+    """Return one row of text per table, µm, with the expanded uncertainty U (k = 2)."""
     out: list[tuple[str, ...]] = []
     for c in found.curves:
         k, change = c.worst, c.change_mm
@@ -74,7 +74,7 @@ def rows(found: TableDifference) -> list[tuple[str, ...]]:
 
 
 def largest(found: TableDifference) -> str:
-    """The largest change of all nine tables, as a sentence."""
+    """Return a sentence on the largest change in all nine tables."""
     c = max(found.curves, key=lambda one: abs(one.change_mm[one.worst]))
     k = c.worst
     size, expanded = c.change_mm[k] * 1e3, 2e3 * c.u_mm[k]

@@ -48,7 +48,7 @@ MONTH = timedelta(days=30)
 class Promise:
     """Computed tables and the model's prediction for them.
 
-    ``tables``: absolute, rounded to the controller's unit; ``change``: their change of the tables in force, before rounding. ``drift_mm``:
+    ``tables``: absolute, rounded to the controller's unit; ``change``: what they add to the tables in force, before rounding. ``drift_mm``:
     rms residual of the solution in the newest run that it did not use, None without one. ``ended_s``, ``last_s``: end of the oldest and of
     the newest identifying run, seconds UTC.
     """
@@ -125,7 +125,7 @@ async def candidate_context(
 
 
 def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
-    """The tables in force `MONTH` ago by the journal: the first push's base if none was kept by then, ``base`` if none ever was."""
+    """The tables in force `MONTH` ago: the first kept push's base if no push was kept by then, ``base`` if none ever was."""
     kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
     if not kept:
         return base.tables
@@ -148,7 +148,7 @@ GRID = (25, 21, 19)
 
 @dataclass(frozen=True)
 class Proposal:
-    """Tables from a campaign: absolute and rounded (``tables``), their unrounded ``change`` of those in force, and the prediction."""
+    """Tables from a campaign (absolute, rounded), what they add to the tables in force (``change``, unrounded), and the prediction."""
 
     solved: Solved
     tables: NineTables
@@ -158,7 +158,7 @@ class Proposal:
 
 @dataclass(frozen=True)
 class GatheredCampaign:
-    """A campaign's complete runs and the table in force, with which all of them were measured."""
+    """A campaign's complete runs, and the table that is in force and was in force during all of them."""
 
     campaign: CampaignRecord
     records: list[RunRecord]
@@ -323,7 +323,7 @@ def by_whom() -> str:
 
 
 async def load_runs(store: Store, run_ids: list[int]) -> list[Run]:
-    """Load runs off the event loop."""
+    """Load runs in a thread, so that the event loop is not blocked."""
     return await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])
 
 

@@ -1,6 +1,6 @@
-"""Push one table for a job: run the push machine (`abbe.service.push`) with the job's questions, and translate its end into errors.
+"""Push one table for a job: run the push machine (`abbe.service.push`) with the job's answers, and turn a bad end into an error.
 
-The machine runs in a task of its own: a cancelled job ends only when no unverified table is in force.
+The push machine runs in a task of its own: a cancelled job ends only when no unverified table is in force.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ class Pushing:
             await self.clock.sleep(STILL_POLL_S)
 
     async def _drive(self, book: StoreBook, order: OperationOrder, wanted: WantedTable | RestoredTable, questions: Questions) -> Ended:
-        """Run the machine in a task of its own; a cancellation is raised after its end, with a note on the table in force."""
+        """Run the push machine in a task of its own; raise a cancellation only after its end, with a note on the table in force."""
         port = ControllerPort(self.controller, self._actors(wanted, questions), self.clock)
         task = asyncio.ensure_future(execute.push(port, book, order, stop=self._stop_reason))
         cancelled: asyncio.CancelledError | None = None
@@ -233,7 +233,7 @@ class Pushing:
         return self._stop or ("stopped by a person" if self.control.stopping or self.control.aborting else "")
 
     async def _failed(self, port: ControllerPort, book: StoreBook, failed: BaseException) -> BaseException:
-        """After a journal error or a defect: try recovery once and note on the error how that ended."""
+        """Try recovery once after a journal error or a defect; add a note to the error about how that ended, and return it."""
         try:
             ended = await run_to_end(execute.recover(port, book))
         except Exception as again:  # noqa: BLE001 - the first failure is raised in any case, with what is known
@@ -300,7 +300,7 @@ class Pushing:
             self._notes += getattr(error, "__notes__", [])
 
     def _outcome(self, ended: Ended) -> PushResult:
-        """The result or error of the push, with all notes of the job's own error."""
+        """Return the result of the push, or raise its error with all notes of the job's own error added."""
         try:
             return self._pushed(ended)
         except AbbeError as error:
@@ -310,7 +310,7 @@ class Pushing:
             raise
 
     def _pushed(self, ended: Ended) -> PushResult:
-        """The result of an ended push, or the error that it stands for."""
+        """Return the result of a push that has ended, or raise the error that describes its end."""
         known = facts(ended.journal)
         why = known.why or ended.why
         detail = str(self._error) if self._error is not None else why

@@ -123,8 +123,8 @@ def _summary(ended: execute.Ended, before: PushState) -> str | None:
 async def accept(controller: TableController, store: Store, site: Site, by: str = "a person") -> str:
     """Record that a person vouches for the active table, and close every open push of it, whatever machine name it was begun under.
 
-    An interrupted push that can be finished is finished instead, and nothing is accepted: the person has looked at another table. ``by`` is
-    kept in the journal. Returns what was done.
+    An interrupted push that can be finished is finished instead and nothing is accepted: another table may be in force then than the person
+    saw. ``by`` is kept in the journal. Returns what was done.
 
     Raises
     ------
@@ -175,7 +175,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
 
 
 def _open_with(crc: int, known: KnownTables) -> set[str]:
-    """Journal of the last push of this table, if that push is open: a recovery under another name or address would roll the table back."""
+    """Name the journal of the last push of this table if that push is open: recovery under another name or address would roll it back."""
     push = known.pushed.get(crc)
     return {push.chain} if push is not None and push.may_be_active else set()
 
@@ -339,7 +339,7 @@ async def finish_when_safe(
 
 
 def _blocked_by(look: Outcome) -> str:
-    """Return what blocks the rollback, as one look at the controller shows it; empty if nothing does."""
+    """Return what blocks the rollback, by the last reading of the controller; empty if nothing does."""
     if isinstance(look, Done):
         return look.value.unsafe if isinstance(look.value, Truth) else "no answer"
     # The message of the link counts down: its text would differ, and notify, at every look.

@@ -1,4 +1,4 @@
-"""A person orders the previous table back: a push of its own, through the same machine and into the same journal.
+"""Bring the previous table back on a person's order: a push of its own, by the same push machine and into the same journal.
 
 No probe and no verification is measured: the journal knows the image, byte for byte, as one that was in force, verified or put there by
 a person. Everything else is as for any push: interlocks, lease, two read-backs, compare-and-swap, and rollback if the push breaks off.
@@ -35,7 +35,7 @@ from abbe.service.tables.table_gate import unverified_crcs
 
 @dataclass(frozen=True, slots=True)
 class KnownTable:
-    """A table that was in force, in full from the journal, and how the journal knows it."""
+    """The bytes of a table that was once in force, from the journal, and a sentence on when it was in force."""
 
     image: bytes
     semantic_digest: str
@@ -44,7 +44,7 @@ class KnownTable:
 
 @dataclass(frozen=True, slots=True)
 class RollbackResult:
-    """The push that restored a table, and which table that is."""
+    """The push that restored a table, and a sentence that names this table."""
 
     pushed: PushResult
     how: str
@@ -52,7 +52,7 @@ class RollbackResult:
 
 @dataclass(frozen=True, slots=True)
 class RollbackRequest:
-    """Who orders a rollback, why, under which order number, and what may stop it. Stored with the table and in its journal."""
+    """Who orders a rollback, why, under which order number, and what may stop it. Stored with the table and in the push journal."""
 
     who: str
     reason: str
@@ -185,7 +185,7 @@ def table_before_last_kept(journal: JournalView, base: Base) -> KnownTable:
 
 @dataclass(frozen=True, slots=True)
 class RollbackOrder:
-    """The order: replace the table of push ``push``, in force with ``crc``, by the table before it."""
+    """An order to replace the table of push ``push``, which is in force and has this CRC, by the table before it."""
 
     push: int
     crc: int
@@ -228,7 +228,7 @@ async def _attempt(controller: TableController, store: Store, site: Site, order:
 
 
 def check_unchanged(store: Store, machine: str, order: RollbackOrder, control: str = "") -> None:
-    """Refuse an order for another table than the journal has in force now.
+    """Refuse an order if the table that it replaces is not the one in force by the journal.
 
     Raises
     ------

@@ -33,7 +33,7 @@ OWNERS = 0xFFFF
 
 
 def record(state: PushState, **doc: object) -> Operation:
-    """The operation that writes a journal entry."""
+    """Return the operation that writes a journal entry."""
     return Operation(OperationKind.RECORD, state=state, doc=doc)
 
 
@@ -46,7 +46,7 @@ def in_force(f: PushFacts, truth: Truth) -> str:
 
 
 def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
-    """Expectation of the journal and report of the controller, for a person to compare."""
+    """Return what the journal expects and what the controller reports, for a person to compare."""
     reported = {"boot": truth.boot, "gen": truth.gen, "active": truth.active, "crc": list(truth.crc), "states": list(truth.states)}
     return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": reported}
 
@@ -54,8 +54,8 @@ def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
 def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
     """Next operation of a rollback.
 
-    ``state``: of the last entry: ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry, from which
-    each lease of the rollback gets a higher owner id than the one before.
+    ``state``: that of the last entry, namely ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry;
+    it gives each lease of the rollback a higher owner id than the one before.
     """
     if known.rested:
         return Operation(OperationKind.END, text="the rollback is blocked now")
@@ -162,7 +162,7 @@ def _begin_restaging(truth: Truth, bank: int) -> Operation:
 
 
 def _ours(content: bytes, base: bytes, size: int) -> bool:
-    """Whether a bank holds nothing but chunks of the old table, and nothing where they are missing."""
+    """Whether each chunk of a bank is either that of the old table or still blank (zeros)."""
     chunks = [(content[at : at + size], base[at : at + size]) for at in range(0, len(base), size)]
     return len(content) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 

@@ -1,7 +1,7 @@
 """Run the push machine: get the next operation, do it through a port, learn from its outcome. Tests run the same loop on a model.
 
 `ControllerPort` is the port to a real controller: it turns each operation into one call of the driver, and errors of the driver into
-outcomes: Refused, nothing changed; Doubt, the result is unknown. It decides nothing.
+outcomes: Refused (nothing changed) or Doubt (the result is unknown). It decides nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Rows = list[tuple[str, str, list[tuple[int, int]]]]
 
 
 class Port(Protocol):
-    """Does one operation on a controller, or asks an actor. Faults of controller and link are outcomes, not exceptions."""
+    """Does one operation on a controller, or asks one of the `PushActors`. Faults of controller and link are outcomes, not exceptions."""
 
     async def execute(self, op: Operation, journal: Journal) -> Outcome:
         """Do the operation; ``journal`` is the push so far."""
@@ -104,7 +104,7 @@ async def _drive(
 
 @dataclass(frozen=True, slots=True)
 class PushActors:
-    """Answers to the machine's questions: check of the table, approval, probe, verification."""
+    """Functions that answer the push machine's questions: check of the table, approval, probe, verification."""
 
     validate: Callable[[Journal], Awaitable[list[str]]]
     approve: Callable[[Journal], Awaitable[o.Approval | None]]
@@ -133,7 +133,7 @@ class ControllerPort:
     Parameters
     ----------
     controller : TableController
-        Identified.
+        A controller that has been identified.
     clock : Clock
         Monotonic time, in which approvals expire.
     """
@@ -230,7 +230,7 @@ class ControllerPort:
             ended.cancel()
 
     async def _look(self) -> Truth:
-        """One look. Only here is a restart of the controller no error: the new boot id tells the push machine."""
+        """Read the controller's state. Only here is a restart of the controller no error: its new boot id tells the push machine."""
         if not self._map:
             self._map = (await self._c.identify()).firmware
         try:

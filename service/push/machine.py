@@ -77,7 +77,7 @@ def _leave(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _begin(known: Knowledge, order: OperationOrder) -> Operation:
-    """Read the table in force twice between two looks."""
+    """Read the table in force twice, with a look at the controller's state before and after; then record the snapshot."""
     if known.stop or known.unanswered >= MAX_UNANSWERED:
         return Operation(OperationKind.END, text=known.stop or "the controller does not answer")
     active = known.start.active if known.start else 0
@@ -234,7 +234,7 @@ def _unconfirmed(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _not_in_force(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
-    """The old table acts. A control that laid the new one aside for its next start has to discard it: it would act unverified."""
+    """End the push: the old table acts. A new one that the control laid aside for its next start is discarded: it would act unverified."""
     if truth.states[f.target] is BankState.LAID_ASIDE and truth.crc[f.target] == f.crc:
         return _forget(f, known, truth)
     if known.forgets:
@@ -267,7 +267,7 @@ def _verify(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
-    """Let the machine be measured (probe or verification); every answer but a clear yes rolls back."""
+    """Have the machine measured (probe or verification); roll back on every answer but a clear yes."""
     why = _why_back(known)
     if why:
         return record(PushState.ROLLBACK, why=why)
@@ -301,7 +301,7 @@ def _keep(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _why_back(known: Knowledge) -> str:
-    """Why to roll back (after a crash, on a stop, without answers); empty to go on."""
+    """Return why to roll back (after a crash, on a stop, without answers); empty: go on."""
     if not known.mine:
         return "interrupted before it was verified"
     return known.stop or ("the controller does not answer" if known.unanswered >= MAX_UNANSWERED else "")

@@ -91,7 +91,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Approval:
-    """A person's (or the policy's) yes to exactly one table on exactly one base.
+    """Consent of a person (or of the policy) to exactly one table on exactly one base.
 
     ``digest``: of what was approved (`abbe.service.push.journal.approval_digest`). ``expiry``: when the approval ends, UTC as text, part of
     the digest. ``until_s``: the same in monotonic host time, because the wall clock can be set.
@@ -139,7 +139,7 @@ class Knowledge(NamedTuple):
     """What a process has learned since its start or since the last journal entry; a crash loses all of it.
 
     A process that did not begin the push (``mine`` false) knows nothing, and this alone makes the push machine recover. It is a plain tuple
-    for speed: tests of all faults make millions.
+    for speed: the tests of all faults create millions of them.
 
     Parameters
     ----------
@@ -328,13 +328,13 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class Coherent:
-    """A closed bracket of reads: nothing changed between its first look and its last, ``truth``."""
+    """A closed bracket of reads: nothing changed between its first look and its last. ``truth`` is the last look."""
 
     truth: Truth
 
 
 def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
-    """Next operation of a bracket, a full read between two looks; None: the looks differ, so something changed in between.
+    """Next operation of a bracket (a full read between two looks), or its end. None: the two looks differ, so something changed.
 
     ``count``: registers to read, 0 for the length in the image's header. ``again``: read a second time and decode independently.
     """

@@ -27,9 +27,9 @@ ZERO_MM = 0.5e-6
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Correction of the axis ``corrected`` over the travel of the axis ``moved``, added to the command.
+    """Correction of the axis ``corrected`` over the travel of the axis ``moved``; the control adds it to the command.
 
-    ``left_mm``: the machine's measured error in this column with the table in force; a correction of opposite sign reduces it.
+    ``left_mm``: the measured error that remains in this column with the table in force; a correction of opposite sign reduces it.
     ``reverse_mm``: corrections for the reverse approach, or empty; ``reversal_mm``: measured mean difference, reverse minus forward.
     """
 
@@ -65,7 +65,7 @@ class TableEvidence:
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSeal:
-    """Who vouches for the table: role, and SHA-256 of the signed content; empty without a signature."""
+    """Who vouches for the table: role, and SHA-256 of the signed content; both are empty without a signature."""
 
     role: str = ""
     digest: str = ""
@@ -259,7 +259,7 @@ def _seal(c: Candidate) -> Iterator[str]:
 
 
 def number_reasons(candidate: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """All reasons against the numbers of a candidate of correct form."""
+    """Yield all reasons against the numbers of a candidate whose form has been checked."""
     odd = [reason for column in candidate.columns if (reason := _odd(column))]
     if odd:
         yield from odd
@@ -308,7 +308,7 @@ def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float]
 
 
 def together_reasons(axis: str, total_mm: float, limits: PushLimits) -> Iterator[str]:
-    """The reason if the largest values of an axis' three tables add up to too much; ``total_mm``: their sum."""
+    """Yield the reason if the largest values of an axis' three tables add up to too much; ``total_mm``: their sum."""
     if total_mm > limits.value_mm:
         allowed = f"allowed are {limits.value_mm * 1e3:.1f} µm ([limits] table_value_um)"
         yield f"VALUE: the tables of {axis} together reach {total_mm * 1e3:.1f} µm, {allowed}"
