@@ -36,11 +36,11 @@ SIDE = 4
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Error of the lower envelope of delays with a power-law distribution, in units of the 24th smallest delay.
+    """Table of the error of a lower envelope of delays with a power-law distribution, in units of the 24th smallest delay.
 
-    ``shape``: estimated exponent, for which the others hold. ``bias``: how much too high the line lies in the middle. ``half``, ``tilt``:
-    half the 95.45 % width of the error there, and of the rise from end to end. Simulated on 40 000 and 60 000 clouds with exponents 0.6 to
-    4.5 (tests/experiments/campaigns/envelope_constants.py).
+    ``shape``: estimated exponents, one per column of the table. ``bias``: how much too high the line lies in its middle. ``half``: half the
+    width of the 95.45 % interval of the error in the middle. ``tilt``: the same for the rise from end to end. Simulated on 40 000 and
+    60 000 clouds with exponents 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
     """
 
     shape: tuple[float, ...]
@@ -112,7 +112,7 @@ def lower_envelope(x: F1, y: F1) -> Envelope:
 
 
 def _edge_of_delays(lowest: F1) -> tuple[float, float]:
-    """Return the 24th smallest delay, and the exponent with which the number of delays grows with their size."""
+    """Return the 24th smallest delay, and the exponent a of the smallest delays: the number of delays below d grows as d^a."""
     top, scale = float(lowest.max()), float(np.partition(lowest, LOWEST - 1)[LOWEST - 1])
     if scale <= 0.0:
         return 0.0, 1.0  # all delays are equal: the line has no bias
@@ -151,9 +151,9 @@ def _above(x: F1, y: F1, a: int, b: int, c: int) -> bool:
 class ClockFit:
     """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, the shortest delay subtracted.
 
-    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host time there, ``u_rate`` of the rate,
-    ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number left out because
-    they came impossibly early.
+    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host time in this middle, ``u_rate`` of
+    the rate, ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number left
+    out because they came impossibly early.
     """
 
     device_s0: float
@@ -232,7 +232,7 @@ def fit_clock(device_s: F1, arrived_s: F1, *, least_delay_s: float = 0.0, u_dela
 
 
 def _too_early(x: F1, y: F1, lowest: tuple[int, int]) -> int | None:
-    """Return the index of that one of the ``lowest`` points which lies impossibly far below the line of all others, if any."""
+    """Return the index of a ``lowest`` point that lies impossibly far below the line under all others, or None."""
     for k in lowest:
         rest_x, rest_y = np.delete(x, k), np.delete(y, k)
         line = lower_envelope(rest_x, rest_y)
@@ -260,7 +260,7 @@ def relative_rate(device: ClockFit, other: ClockFit) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Break:
-    """A break between the pairs ``index - 1`` and ``index``: the device restarted, or a clock was set by ``step_s`` of host time."""
+    """A break between the pairs ``index - 1`` and ``index``: the device restarted, or a clock stepped by ``step_s`` of host time."""
 
     index: int
     kind: Literal["restart", "step"]
@@ -270,7 +270,7 @@ class Break:
 def breaks(device_s: F1, arrived_s: F1) -> tuple[Break, ...]:
     """Find all breaks of a device's clock, in order.
 
-    At a restart, device time falls. At a step, the smallest delays jump to another level and stay there; after a spike they come back.
+    At a restart, device time falls. At a step, the smallest delays jump to another level and stay there; after a mere spike they return.
     """
     x, y = np.asarray(device_s, dtype=np.float64), np.asarray(arrived_s, dtype=np.float64)
     falls = np.flatnonzero(np.diff(x) < 0.0) + 1
@@ -312,7 +312,7 @@ class _Split:
 
 
 def _lowest(x: F1, y: F1) -> int:
-    """Return the index of the earliest arrival of a block after its trend is removed."""
+    """Return the index of the earliest arrival of a block, relative to the trend of the block."""
     if x[-1] <= x[0]:
         return int(np.argmin(y))
     trend = (y[-1] - y[0]) / (x[-1] - x[0])
@@ -320,7 +320,7 @@ def _lowest(x: F1, y: F1) -> int:
 
 
 def _best_split(x: F1, y: F1) -> _Split:
-    """Find the best split into two levels with a common slope; medians ignore blocks that arrived late as a whole."""
+    """Find the best split into two levels with a common slope; it uses medians, which ignore a block in which all arrivals are late."""
     best, least = _Split(0, 0.0, 0.0, 1.0, 0.0), np.inf
     first, second = np.triu_indices(x.size, 1)
     slopes = (y[second] - y[first]) / (x[second] - x[first])

@@ -1,6 +1,7 @@
 """Find the standstills in the readings of a program that Abbe did not start, and assign them to the planned ones.
 
-A place is a planned standstill: a target, mm, along the measured direction.
+Below, "place" means a planned standstill, given by its target along the measured direction, mm. The deviation of a standstill at a place is
+its reading minus the target, less a constant offset.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Possible pairs, ordered by standstill: place, standstill, deviation, and the largest change of the deviation to this place."""
+    """Possible pairs of place and standstill, ordered by standstill. ``off``: deviation; ``reach``: `places_reach` of the place."""
 
     place: I1
     stand: I1
@@ -92,7 +93,7 @@ def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: flo
 
 
 def places_reach(targets: F1, sides: F1) -> F1:
-    """Return the largest change of the deviation from the previous place to each place, mm, shape (n,)."""
+    """Return by how much the deviation may change at most from the previous place to each place, mm, shape (n,)."""
     away = np.abs(targets[:, None] - targets[None, :])
     other = (away > 1e-6) & ((sides[:, None] * sides[None, :]) >= 0.0)
     nearest = np.where(other, away, np.inf).min(axis=1)
@@ -117,7 +118,7 @@ def _reversed(some: _Candidates) -> _Candidates:
 
 
 def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, mirrored: bool = False) -> tuple[F1, I1]:
-    """Return the least cost of a chain that ends at each candidate, and its predecessor (-1: none); ``mirrored``: chains run backwards."""
+    """Return the least cost of a chain that ends at each pair, and the pair before it (-1: none); ``mirrored``: chains run backwards."""
     targets, sides, noise = about
     cost, back = single_cost.copy(), np.full(single_cost.size, -1, dtype=np.intp)
     sign = -1 if mirrored else 1
@@ -136,8 +137,10 @@ def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, m
 
 
 def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], about: tuple[F1, F1, F1]) -> tuple[int, int, int] | None:
-    """Return (standstill, place, other place) if an equally good assignment pairs them differently; both places are one if it differs in
-    the standstill of this place."""
+    """Find an equally good assignment that differs from ``pairs``; return a standstill and the two places to which it may belong, or None.
+
+    Both places are the same if ``pairs`` leaves this standstill out and gives its place another one.
+    """
     targets, levels, reach = about
     taken = {s: k for k, s in pairs.items()}
     for p in np.flatnonzero(through < cost + SURE):
@@ -188,7 +191,7 @@ def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Sta
     t_s, y : array, shape (n,)
         Sample times and readings.
     smallest_move : float
-        Smallest planned move, in the unit of ``y``.
+        Smallest planned move between standstills, in the unit of ``y``.
     least_s : float
         Shortest standstill that counts.
     """
@@ -220,7 +223,7 @@ def _runs(still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[tuple[
 def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
     """Return the side of approach of each standstill: +1 from smaller readings, -1 from larger, 0 unknown.
 
-    The last earlier sample that differs from it by more than an overshoot decides. ``smallest``: smallest planned move.
+    The last sample before the standstill whose difference is larger than an overshoot decides. ``smallest``: smallest planned move.
     """
     out, least = np.zeros(len(found)), CLEAR * noise_of(y)
     for s in range(1, len(found)):
@@ -280,14 +283,14 @@ class Dwells:
 def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
     """Match the standstills of a stream to the planned ones, in order, and take the planned readings from them.
 
-    A standstill without a partner is reported and shifts no other.
+    A missing or unplanned standstill is reported and does not shift the others.
 
     Parameters
     ----------
     t_s, y : array, shape (n,)
         Sample times, and readings in the unit of the targets.
     planned : tuple of PlannedDwell
-        In order; two neighbours have different targets.
+        In order; neighbours must have different targets (`merged`).
     settle_s : float
         First part of each standstill, in which the axes settle and no readings are taken.
     zero : float, optional
@@ -297,7 +300,7 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
     Raises
     ------
     ValueError
-        The stream or the plan is too short; two neighbours have one target; the reading jumped while nothing moved; less than half of the
+        The stream or the plan is too short; neighbours have the same target; the reading jumped while nothing moved; less than half of the
         plan was found; or two matches are equally good.
     """
     if t_s.size < 10 or len(planned) < 2:
@@ -334,7 +337,7 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
 
 
 def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
-    """Refuse a jump between two standstills without motion: the instrument lost counts, and all later readings are wrong."""
+    """Raise ValueError if the reading jumps without motion: the instrument lost counts, and all later readings are wrong."""
     for before, after in pairwise(found):
         by = after.level - before.level
         if after.first - before.last <= JUMP_SAMPLES and abs(by) < tolerance:
@@ -346,9 +349,9 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
 
 
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
-    """Tell whether the standstill of place ``k`` may belong to an earlier or later pass over the same target.
+    """Tell whether the standstill of place ``k`` may also be that of the previous or next pass over the same target.
 
-    This is so if two passes have a turning point between them and only one of the three standstills was found.
+    This is so if only one turning point lies between both passes, and neither it nor the other pass has a standstill.
     """
     if k in (0, targets.size - 1):
         return False
@@ -359,7 +362,7 @@ def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
 
 
 def _check_moves(found: tuple[Standstill, ...], pairs: dict[int, int], targets: F1) -> None:
-    """Refuse a step without samples between two standstills, unless such a move was planned."""
+    """Raise ValueError if the reading steps between two standstills without samples in between, unless such a move was planned."""
     taken = {s: k for k, s in pairs.items()}
     for s, (before, after) in enumerate(pairwise(found)):
         by = after.level - before.level
@@ -392,9 +395,9 @@ def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[
 
 
 def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
-    """Map each planned index to the index of its standstill; refuse if two assignments are equally good.
+    """Map the index of each place to that of its standstill; ValueError if two assignments are equally good.
 
-    Without ``zero``, try the offsets between the first few and the last few standstills and targets.
+    Without ``zero``, try all offsets that pair one of the first few standstills and targets, or one of the last few.
     """
     levels = np.array([s.level for s in found])
     if levels.size == 0:
@@ -419,7 +422,7 @@ def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float |
 
 
 def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
-    """Return the pairs; refuse if another assignment is equally good."""
+    """Return the pairs of a match; ValueError if another assignment is equally good."""
     if best.rival is None:
         return best.pairs
     stand, ours, other = best.rival
@@ -429,14 +432,14 @@ def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
 
 
 def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
-    """Tell whether two matches give most of their common standstills different targets."""
+    """Tell whether two matches assign most of the standstills that both contain to different places."""
     first, second = ({s: k for k, s in pairs.items()} for pairs in (one, other))
     both = first.keys() & second.keys()
     return 2 * sum(first[s] != second[s] for s in both) > len(both)
 
 
 def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[float, float]) -> list[DwellReading | None]:
-    """Split the settled part of a standstill into as many equal parts as the plan has readings there, and average each."""
+    """Split the settled part of a standstill into as many equal parts as it has planned readings, and average each."""
     settle_s, noise = how
     at = np.arange(stand.first, stand.last + 1)
     at = at[(t_s[at] >= stand.start_s) & (t_s[at] <= stand.end_s)]
@@ -449,7 +452,7 @@ def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[
 
 
 def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
-    """Return the mean without outliers and its uncertainty from the local scatter, which counts at least as the noise of the stream."""
+    """Return the mean without outliers, and its uncertainty from the local scatter or, if larger, the noise of the stream."""
     keep = np.abs(y - np.median(y)) <= CLEAR * max(noise, 1.4826 * float(np.median(np.abs(y - np.median(y)))))
     kept = y[keep]
     scatter = max(noise, float(np.std(kept, ddof=1)) if kept.size > 1 else 0.0)
@@ -463,7 +466,7 @@ def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
 
 
 def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
-    """Return one line per difference from the plan, for people; standstills count from 1."""
+    """Return one line of text per difference from the plan; the text numbers standstills from 1."""
     lines = [f"standstill {k + 1} of {len(planned)} (at {planned[k].target:.3f} mm) is missing" for k in found.missing]
     for after, stand in found.extra:
         place = "before the first" if after < 0 else f"after standstill {after + 1}"

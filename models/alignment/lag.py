@@ -16,7 +16,7 @@ SLACK = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """``lag_s`` > 0: the signal is late by this time, with standard uncertainty ``u_s``. ``determined``: the readings show a lag."""
+    """Lag of a signal, s, positive if it is late, and its standard uncertainty ``u_s``. ``determined``: the readings suffice to find it."""
 
     lag_s: float
     u_s: float

@@ -70,11 +70,11 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Positioning:
-    """All figures of ISO 230-2 of a bidirectional test, mm. Arrays have the shape (m,); None: one cycle has no scatter.
+    """All figures of ISO 230-2 of a bidirectional test, mm. Arrays have the shape (m,). None: a single cycle shows no scatter.
 
     ``mean_forward_mm``, ``mean_backward_mm``, ``mean_mm``: mean deviations; ``reversal_mm``: B_i; ``s_forward_mm``, ``s_backward_mm``:
-    standard deviations of the approaches. ``lowest``, ``most``: fewest and most approaches of a position from one side. All others are
-    named by the standard's symbols.
+    standard deviations of the approaches. ``lowest``, ``most``: fewest and most approaches of a position from one side. All other
+    names are the standard's symbols.
     """
 
     position_mm: F1
@@ -132,8 +132,8 @@ def positioning(readings: Approaches, budget: ScaleBudget | None = None) -> Posi
     ----------
     readings : Approaches
     budget : ScaleBudget, optional
-        Without it the uncertainties contain only the scatter of the cycles. A single cycle takes the scatter of the reversals B_i about
-        their mean, which is too large where lost motion changes along the axis.
+        Without it the uncertainties contain only the scatter of the cycles. For a single cycle they use the scatter of the reversals B_i
+        about their mean instead, which is too large where lost motion changes along the axis.
     """
     budget = budget or ScaleBudget()
     fwd, bwd = _side(readings.forward_mm), _side(readings.backward_mm)
@@ -177,7 +177,7 @@ def _side(values: F2) -> _Side:
 
 
 def _of_mean(side: _Side, reversal: F1) -> F1:
-    """Standard uncertainty of the means; for single readings, from the scatter of the reversals, each a difference of two readings."""
+    """Standard uncertainty of the means; for single readings from the scatter of the reversals, which are differences of two readings."""
     from_reversal = float(np.std(reversal, ddof=1)) / np.sqrt(2.0)
     return np.where(side.n > 1.0, side.s / np.sqrt(side.n), from_reversal)
 
@@ -188,7 +188,7 @@ def _of_s(side: _Side) -> F1:
 
 
 def _range(at: F1, upper: F1, lower: F1, u: F1, budget: ScaleBudget) -> Value:
-    """max(upper) - min(lower), with the uncertainty of the two positions that decide it and of the length scale between them."""
+    """Return max(upper) - min(lower), with the uncertainty at the two positions of these extremes and of the length scale between them."""
     hi, lo = int(np.argmax(upper)), int(np.argmin(lower))
     scale = budget.per_length * float(abs(at[hi] - at[lo]))
     apart = float(np.hypot(u[hi], u[lo])) if hi != lo else 0.0

@@ -1,8 +1,8 @@
 """ISO 230-4: circular tests. Circular deviation G, bidirectional G(b), radial deviation F and hysteresis H of a plane.
 
 The deviation of a ball-bar's length around a circle is c + a cos + b sin + the machine's deviation; a and b are the centring error of the
-set-up. G refers to the least squares circle of its path, G(b) and H to the common one of both paths. F is given about the set-up's centre
-and about the least squares centre, G also by the minimum zone (two concentric circles as close as possible).
+set-up. G refers to the least squares circle of its path, G(b) and H to the least squares circle common to both paths. F is given about the
+set-up's centre and about the least squares centre, G also by the minimum zone (two concentric circles as close as possible).
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def circular(path: CircularTest) -> OnePath:
 def both_ways(forward: CircularTest, backward: CircularTest) -> BothWays:
     """Evaluate two paths of one set-up, about their common least squares centre.
 
-    H compares the means of the same degree of both paths, where both have readings.
+    H is the largest difference between the paths' mean readings in the same degree, where both have readings.
 
     Raises
     ------

@@ -15,9 +15,9 @@ FACE = frozenset({"pp", "np"})
 class Diagonals:
     """The diagonals of a volume (four) or of one plane (two).
 
-    ``each``: by name. ``E_d``, ``B_d``, ``M_d``: largest bidirectional systematic deviation, reversal, and range of the bidirectional
-    means, each with the name of its diagonal; ``R_d``: largest repeatability, None without repeats. ``missing``: diagonals that the
-    standard asks for and that were not measured; if there are any, the figures are lower bounds.
+    ``each``: evaluation of each diagonal, by name. ``E_d``, ``B_d``, ``M_d``: largest bidirectional systematic deviation, reversal, and
+    range of the bidirectional means, each with the name of its diagonal; ``R_d``: largest repeatability, None without repeats. ``missing``:
+    diagonals that the standard asks for and that were not measured; if there are any, the figures are lower bounds.
     """
 
     each: Mapping[str, Positioning]

@@ -1,7 +1,7 @@
-"""Trials of a whole campaign: each draws readings, calibrations, temperatures and omitted orders, solves and predicts.
+"""Monte Carlo trials of a campaign: each draws readings, calibrations, temperatures and omitted orders, solves and predicts.
 
-A batch of results has 10^4 trials of 3 figures per point, so at most `MOST_POINTS` points are allowed at a time. More points can be worked
-in parts: except for a single approach, the same seed draws the same trials for any points.
+A batch of results has 10^4 trials of 3 figures per point, so at most `MOST_POINTS` points are allowed at a time. More points can be handled
+in several calls: the same seed draws the same errors for any points, except the scatter of `StatedInputs.single_approach`.
 
 Linear trials apply the solver's gain to a whole batch at once. Exact trials iterate like the solver with the exact reading of every run
 (finite rotations, length of the bar, tilted mirror). They are slow, and show that the linear trials are good enough.
@@ -38,7 +38,7 @@ CHUNK_READINGS = 4_000_000
 
 @dataclass(frozen=True)
 class CampaignTrials:
-    """Inputs of a solution and their influence on a prediction at points.
+    """Monte Carlo trials of the prediction at m points: the uncertain inputs of a solution and their influence.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class CampaignTrials:
     predict_per_unit : array, shape (3 m, len(sources.terms))
         Deviation at the points per unit of each coefficient, x y z of the first point first.
     distributions : dict
-        Per source name.
+        Distribution of each source's inputs, by name of the source; normal if it is missing.
     """
 
     sources: ErrorSources
@@ -56,11 +56,11 @@ class CampaignTrials:
     distributions: Mapping[str, Distribution]
 
     def value(self) -> F1:
-        """Prediction at the estimate, shape (3 m,)."""
+        """Return the predicted deviation for the estimated coefficients, mm, shape (3 m,)."""
         return np.asarray(self.predict_per_unit @ self.sources.coefficients)
 
     def linear(self) -> Draw:
-        """Trials through the solver's gain, results (trials, 3 m)."""
+        """Return a function that draws trials, shape (trials, 3 m), with the solver linearised (its gain)."""
         n = len(self.sources.solution.terms)
         readings = ((self.predict_per_unit[:, :n] @ self.response.gain[:n]).T * self._reading_sd()[:, None]).astype(np.float32)
         others = self._others()
@@ -75,7 +75,7 @@ class CampaignTrials:
         return draw
 
     def exact(self) -> Draw:
-        """Trials through the exact readings, iterated; all other inputs stay linear."""
+        """Return a function that draws trials with the exact reading of every run, solved by iteration; all other inputs stay linear."""
         solution, gain, sd = self.sources.solution, self.response.gain, self._reading_sd()
         n = len(solution.terms)
         measured = np.concatenate([run.deviation_mm for run in solution.data])
@@ -93,7 +93,7 @@ class CampaignTrials:
         return draw
 
     def _with_others(self, out: F2, others: list[tuple[str, F2]], rng: np.random.Generator) -> F2:
-        """Add the prediction and draws of all other sources to the results, in place."""
+        """Add the prediction and the draws of all other sources to ``out``, in place."""
         for name, factor in others:
             out += self._drawn(name, rng, (len(out), len(factor))) @ factor
         scatter = self.sources.inputs.repeatability_mm if self.sources.inputs.single_approach else 0.0
@@ -103,13 +103,13 @@ class CampaignTrials:
         return out
 
     def _settled(self, measured: F1, gain: F2, theta: F1) -> F1:
-        """Iterate with the exact model as the solver does, at its final weights and sizes."""
+        """Iterate with the exact model as the solver does, with its final weights and priors."""
         for _ in range(EXACT_ROUNDS):
             theta = gain @ (measured - _predicted(self.sources.solution, theta) + self.response.design @ theta)
         return np.asarray(theta)
 
     def _others(self) -> list[tuple[str, F2]]:
-        """Sources that are not noise of readings, each as a factor (inputs, 3 m) of the results."""
+        """Return all sources but the noise of readings: name, and effect of each of its inputs on the results, shape (inputs, 3 m)."""
         b, out = self.predict_per_unit, []
         for s in self.sources.sources:
             if s.name in (*READINGS, "repeatability"):
@@ -141,7 +141,7 @@ class CampaignTrials:
 
 
 def _clamped(plus: F2, subtracted: F2) -> F2:
-    """Factor (inputs, 3 m) of the contribution of the estimated sizes, clipped at every point as in `predict_deviation`.
+    """Return the effect (inputs, 3 m) of the source ``estimated_sizes``, clipped at every point as in `predict_deviation`.
 
     All points use the same draws and stay correlated; the contribution at one point does not depend on the other points.
     """
@@ -153,7 +153,7 @@ def _clamped(plus: F2, subtracted: F2) -> F2:
 
 
 def _powered(covariance: F3, power: float) -> F3:
-    """Power of each of m symmetric matrices, (m, 3, 3), on its positive eigenvalues; the others become zero."""
+    """Raise the positive eigenvalues of m symmetric matrices, shape (m, 3, 3), to a power; set the others to zero."""
     value, vector = np.linalg.eigh(covariance)
     positive = value > 1e-12 * np.maximum(value[:, -1:], 1e-300)
     powered = np.where(positive, np.where(positive, value, 1.0) ** power, 0.0)
@@ -174,8 +174,8 @@ def campaign_trials(
 ) -> CampaignTrials:
     """Prepare trials of a solution for a prediction at points, shape (m, 3); tool and frame as in `predict_deviation`.
 
-    ``distributions``: by name of the source, of unit standard deviation (``u`` 1 for normal and rectangular), e.g. `LIMITS`; all others are
-    normal. The repeatability of the machine is part of the readings' noise and drawn with it.
+    ``distributions``: by name of the source, e.g. `LIMITS`; each has unit standard deviation (``u`` 1 for normal and rectangular). All
+    other sources are normal. The repeatability of the machine is part of the readings' noise and drawn with it.
 
     Raises
     ------

@@ -60,14 +60,14 @@ class Interval:
 
 
 def apart_from_zero(vectors: F2, covariance: F3, probability: float = PROBABILITY) -> NDArray[np.bool_]:
-    """Whether the coverage ellipsoid of each vector excludes zero: pure noise does so in 5 % of all cases.
+    """Whether the coverage ellipsoid of each vector excludes zero; at 95 % this happens to 5 % of all vectors of pure noise.
 
     Parameters
     ----------
     vectors : array, shape (n, c)
         Estimates, e.g. deviations in mm.
     covariance : array, shape (n, c, c)
-        Of each; it may be flat in some directions. Where it is not finite, nothing is known.
+        Covariance of each vector; it may be singular. A vector whose covariance is not finite does not exclude zero.
 
     Returns
     -------

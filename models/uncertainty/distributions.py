@@ -52,8 +52,8 @@ class Distribution:
     shape : "normal" | "rectangular" | "t"
         Normal: a standard uncertainty is known. Rectangular: only limits are known. t: mean of few repeats (GUM-S1 6.4.9).
     u : float
-        Normal, rectangular: standard deviation (half-width of the rectangle: u sqrt 3). t: scale, s / sqrt(n) of the repeats; the standard
-        deviation is then u sqrt(dof / (dof - 2)).
+        Normal, rectangular: the standard deviation (a rectangle has the half-width u sqrt 3). t: the scale s / sqrt(n) of n repeats with
+        standard deviation s; the standard deviation of the distribution is then u sqrt(dof / (dof - 2)).
     dof : float
         Degrees of freedom of t, above 2, so that it has a variance.
 

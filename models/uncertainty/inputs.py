@@ -23,13 +23,13 @@ class StatedInputs:
     Attributes
     ----------
     u_wavelength : float
-        Of the laser's wavelength after air compensation, relative; one laser in all runs. It counts only for a solution whose unknowns do
-        not include the wavelength.
+        Relative standard uncertainty of the laser's wavelength after air compensation; all runs share one laser. It counts only for a
+        solution whose unknowns do not include the wavelength.
     u_scale_temperature_k, scale_expansion_per_k : float
         Standard uncertainty of each scale's temperature, K, and expansion coefficient of the scales, 1/K. 0.2 K stands for a Pt100 on the
         scale and a drift of ±0.3 K during the campaign. The three axes are independent.
     u_bar_temperature_k, bar_expansion_per_k : float
-        The same for the ball-bar, against its calibration temperature; one thermometer serves all bar runs.
+        The same for the ball-bar, relative to its calibration temperature; one thermometer serves all bar runs.
     repeatability_mm : float
         Standard deviation of the machine from one approach of a point to the next, per component. The readings' scatter contains it, so
         the budget subtracts it from the noise of the readings, down to zero. Default 0: not known separately.
@@ -38,7 +38,7 @@ class StatedInputs:
     single_approach : bool
         False (default): the predicted deviation is the mean of many approaches. True: that of one approach, with its repeatability on top.
     orders_above : int
-        How many Legendre orders above the solution's the machine's errors may still have; 0: none.
+        Number of Legendre orders above those of the solution that the machine's errors may contain; 0: none.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Deviation of a machine over its volume by one solution, with covariance: whole, or the part of chosen error motions.
+"""Deviation of a machine over its volume as one solution gives it, with covariance: of all error motions, or of chosen ones.
 
 Only the stored part of a solution is needed: terms, coefficients and their covariance from all sources.
 """
@@ -18,7 +18,7 @@ from abbe.models.machine import Machine
 
 @dataclass(frozen=True)
 class KnownField:
-    """A machine's error motions by one solution, with their covariance.
+    """A machine's error motions as one solution gives them, with their covariance.
 
     Parameters
     ----------
@@ -66,14 +66,14 @@ class KnownField:
         return KnownField(self.machine, terms, self.coefficients[at], self.covariance[np.ix_(at, at)], self.scatter_mm)
 
     def estimate_of(self, names: Iterable[str]) -> F1:
-        """Coefficients of these motions and parameters, all others zero, shape (P,); ValueError as of `index`."""
+        """Estimated coefficients of these motions and parameters, all others zero, shape (P,); ValueError as in `index`."""
         at = self.index(names)
         out = np.zeros_like(self.coefficients)
         out[at] = self.coefficients[at]
         return out
 
     def linear(self, values: Mapping[str, float]) -> F1:
-        """Coefficients of these scale errors (``EXX``, mm/mm) and squareness errors (``C0Y``, rad), all others zero, shape (P,).
+        """Coefficients that give these scale errors (``EXX``, mm/mm) and squareness errors (``C0Y``, rad), all others zero, shape (P,).
 
         Raises
         ------
@@ -89,7 +89,7 @@ class KnownField:
         return out
 
     def root(self) -> F2:
-        """Factor R, for random draws: R R^T is the covariance with negative eigenvalues set to zero, shape (P, P)."""
+        """Factor R for random draws, shape (P, P): R R^T is the covariance with negative eigenvalues set to zero."""
         values, vectors = np.linalg.eigh(self.covariance)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -111,7 +111,7 @@ def field_map(known: KnownField, points_mm: F2, motions: Iterable[str] | None = 
     known : KnownField
     points_mm : array, shape (m, 3)
     motions : iterable of str, optional
-        Only the joint effect of these motions; None: of all.
+        Motions whose joint effect is returned; None: all.
 
     Raises
     ------

@@ -73,7 +73,7 @@ def adaptive(
     Parameters
     ----------
     draw : callable
-        Returns the results of one batch. Memory is about three times one batch of results, which takes 0.24 MB per point.
+        Returns the results of one batch of trials, shape (trials, m). A batch takes 0.24 MB per point; the peak is about three times that.
     rng : Generator
         Seeded by the caller; the same seed gives the same figures.
     digits : int
@@ -81,12 +81,12 @@ def adaptive(
     share : float
         Tolerance as a fraction of half a unit of the last digit; `VALIDATION_SHARE` for trials passed to `validate`.
     largest : int
-        Most trials; results that have not settled by then are marked in ``settled``.
+        Most trials; ``settled`` is False for results that are not stable by then.
 
     Raises
     ------
     ValueError
-        ``digits`` is neither 1 nor 2, the share is not between 0 and 1, or fewer than one batch is allowed.
+        ``digits`` is neither 1 nor 2, ``share`` is not in (0, 1], or ``largest`` is less than one batch.
     """
     batch = batch_size(probability)
     if digits not in (1, 2) or not 0.0 < share <= 1.0:
@@ -137,7 +137,7 @@ def _figures(results: F2, probability: float) -> F2:
 
 
 def _known(figures: list[F2]) -> F2:
-    """Numerical uncertainty of every figure, (6, m): twice the standard deviation of its mean over batches; inf if these are too few."""
+    """Numerical uncertainty of every figure, (6, m): twice the standard deviation of its mean over batches; inf for too few batches."""
     if len(figures) < FEWEST_BATCHES:
         return np.full(figures[0].shape, np.inf)
     return np.asarray(2.0 * np.std(figures, axis=0, ddof=1) / np.sqrt(len(figures)))
@@ -173,9 +173,10 @@ def validate(value: F1, expanded: F1, found: MonteCarlo, *, digits: int = 1) -> 
     Parameters
     ----------
     value, expanded : array, shape (m,)
+        Estimates, and expanded uncertainties U by the law of propagation.
     found : MonteCarlo
-        Of the same results and probability, from ``adaptive(..., digits=digits, share=VALIDATION_SHARE)``: interval ends known to a fifth
-        of the tolerance of this check (GUM-S1 8.2).
+        Trials of the same results at the same probability, from ``adaptive(..., digits=digits, share=VALIDATION_SHARE)``, so that the ends
+        of their intervals are known to a fifth of the tolerance of this check (GUM-S1 8.2).
     digits : int
         Significant digits of u; the tolerance is half a unit of the last.
 

@@ -54,7 +54,7 @@ class Budget:
         raise KeyError(name)
 
     def text(self) -> str:
-        """The budget as a table for people, micrometres."""
+        """Return the budget as a text table in micrometres."""
         rows = [f"{'source':<72}{'u, um':>8}{'share':>8}"]
         rows += [f"{line.text:<72}{1e3 * line.u_mm:8.3f}{line.share:8.1%}" for line in self.lines]
         rows.append(f"{'together':<72}{1e3 * self.u_mm:8.3f}{1.0:8.1%}")
@@ -74,7 +74,7 @@ def budget_at(prediction: Prediction, index: int) -> Budget:
 
 
 def budget_over(prediction: Prediction) -> Budget:
-    """Budget over all predicted points: mean variances, so root-mean-square uncertainties. Take a grid over the volume."""
+    """Budget over all predicted points, best a grid over the volume: mean variances, so root-mean-square uncertainties."""
     return _budget(prediction, np.arange(len(prediction.points_mm)))
 
 
@@ -138,7 +138,7 @@ class Prediction:
 
     @property
     def u_vector_mm(self) -> F1:
-        """Root of the sum of the three variances, shape (m,): rms length of the error vector of the prediction."""
+        """Rms length of the prediction's error vector, shape (m,): root of the sum of the three variances."""
         return np.asarray(np.sqrt(np.einsum("mii->m", self.covariance_mm2)))
 
     @property
@@ -233,15 +233,15 @@ def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFre
 
 
 def _not_negative(covariance: F3) -> F3:
-    """Set negative eigenvalues to zero, (m, 3, 3): the uncertainty of the prior sizes must never make a prediction more certain."""
+    """Set negative eigenvalues to zero, shape (m, 3, 3), so that a source never makes a prediction more certain."""
     value, vector = np.linalg.eigh(covariance)
     return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))
 
 
 def unobserved_directions(solution: JointSolution) -> F2:
-    """Changes of the smooth terms, each of typical size, that leave no trace in any reading, shape (terms, q), mm and rad.
+    """Return q combinations of the smooth terms, of typical size, that leave no trace in any reading, shape (terms, q), mm and rad.
 
-    Lost motion and set-up unknowns are marginalised first, with their priors.
+    Lost motion and set-up unknowns are first marginalised with their priors.
     """
     n = len(solution.terms)
     typical = term_prior_sd(solution.machine, solution.terms, Priors())
@@ -254,7 +254,7 @@ def unobserved_directions(solution: JointSolution) -> F2:
 
 
 def unobserved_mm(solution: JointSolution, points_mm: F2, frame: RigidFree, tool_mm: F1 | None = None) -> F1:
-    """Rms length at points (m, 3) of the deviation that no reading shows, if errors have their typical sizes, shape (m,), mm."""
+    """Return the rms length of the deviation that no reading shows, if errors have typical sizes, at points (m, 3), mm, shape (m,)."""
     hidden = unobserved_directions(solution)
     if not hidden.shape[1]:
         return np.zeros(len(points_mm))
@@ -280,11 +280,11 @@ class CompensableMask:
 
     @property
     def share(self) -> float:
-        """Part of the points that may be compensated, 0 to 1."""
+        """Fraction of the points that may be compensated, 0 to 1."""
         return float(self.points.mean())
 
     def text(self) -> str:
-        """One line for people."""
+        """Return one sentence on the points that are not compensated."""
         left = int((~self.points).sum())
         if left == 0:
             return "The deviation is larger than its uncertainty everywhere."
@@ -328,6 +328,6 @@ def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest
 
 
 def _along_factor(prediction: Prediction, along: NDArray[np.float64]) -> F1:
-    """Coverage factor along each deviation: that of the fewest degrees of freedom among the components that take part."""
+    """Coverage factor along each deviation, for the fewest degrees of freedom of its components that are not zero."""
     dof = np.where(np.abs(along) > 1e-9, prediction.dof, np.inf).min(axis=1)
     return coverage_factor(dof, prediction.probability or PROBABILITY)

@@ -1,4 +1,4 @@
-"""Inputs of a campaign's solution and their influence on it: one error source per input (GUM 5.1).
+"""Error sources of a campaign's solution: each input and its influence on the solution (GUM 5.1).
 
 The estimate is linear in its inputs, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
 posterior covariance C. So the covariance splits exactly, C = C A^T W A C + C P^-1 C: into the noise of each instrument and the prior of
@@ -31,7 +31,7 @@ def variances(sources: ErrorSources, per_unit: F2) -> F1:
     ----------
     sources : ErrorSources
     per_unit : array, shape (m, len(sources.terms))
-        Result per unit of each coefficient, orders above the solution's included.
+        Result per unit of each coefficient, including the orders above the solution's.
     """
     total = np.zeros(len(per_unit))
     for s in sources.sources:
@@ -43,9 +43,9 @@ def variances(sources: ErrorSources, per_unit: F2) -> F1:
 
 
 def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
-    """Factor F of the joint covariance F F^T of m results, shape (m, q), for correlated draws.
+    """Factor F of the joint covariance F F^T of m results, shape (m, q), for correlated draws; ``per_unit`` as in `variances`.
 
-    The contribution of the estimated sizes is clipped so that it never makes a combination of these results more certain.
+    The source ``estimated_sizes`` is clipped so that it never makes a combination of these results more certain.
     """
     turn, small = scipy.linalg.qr(per_unit, mode="economic") if len(per_unit) > per_unit.shape[1] else (None, per_unit)
     total = np.zeros((len(small), len(small)))
@@ -62,7 +62,7 @@ def joint_factor(sources: ErrorSources, per_unit: F2) -> F2:
 
 
 def approach_variance_mm2(sources: ErrorSources) -> float:
-    """Variance per component that a single approach of a point adds; 0 without `StatedInputs.single_approach`."""
+    """Variance that a single approach of a point adds to each component; 0 unless `StatedInputs.single_approach` is set."""
     return float(sum(s.scatter_mm**2 for s in sources.sources))
 
 
@@ -74,7 +74,7 @@ def _root(covariance: F2) -> F2:
 
 @dataclass(frozen=True)
 class Response:
-    """Design, weights and covariance of one solution, for the solver's final sizes of noise and priors.
+    """Design, weights and covariance of one solution; noise and priors have the sizes that the solver estimated.
 
     Attributes
     ----------
@@ -85,12 +85,12 @@ class Response:
     kind : array of str, shape (n,)
         Instrument of each reading.
     covariance : array, shape (p, p)
-        Posterior covariance for those sizes: (A^T W A + P^-1)^-1.
+        Posterior covariance if these sizes are exact: (A^T W A + P^-1)^-1.
     pull : array, shape (p, p)
         Change of every unknown per standard deviation of each independent part of the prior (`prior_factor`): pull pull^T is the prior's
         share C P^-1 C.
     widening : array, shape (p, p)
-        What the solution's covariance has in addition because the sizes are estimated too; it can be negative in some directions.
+        Covariance of the solution minus ``covariance``: the sizes are uncertain, too. It can be negative in some directions.
     dof : float
         Degrees of freedom of all residuals together.
     """
@@ -110,16 +110,16 @@ class Response:
     def noise_factor(self, variance_mm2: F1 | None, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> F2:
         """Factor of the covariance that independent errors of some readings give the unknowns, shape (p, p).
 
-        ``variance_mm2``: of each reading (n,); None: one over its weight. ``mask``: the readings with errors.
+        ``variance_mm2``: variance of each reading, shape (n,); None: one over its weight. ``mask``: the readings with errors.
         """
         size = np.sqrt(self.weight) if variance_mm2 is None else np.sqrt(variance_mm2) * self.weight
         r = scipy.linalg.qr(self.design[mask] * size[mask, None], mode="r")[0][: self.design.shape[1]]
         return np.asarray(self.covariance @ r.T)
 
     def dof_of(self, kind: str) -> float:
-        """Degrees of freedom of one instrument's noise, estimated from its residuals: its part of `dof`, at least 1.
+        """Degrees of freedom of the noise estimate of one instrument: its part of `dof`, at least 1.
 
-        Each reading contributes one minus its leverage.
+        Parts are proportional to the sum over the readings of one minus the leverage.
         """
         left = self._left
         total = float(left.sum())
@@ -154,7 +154,7 @@ def response(solution: JointSolution) -> Response:
 
 
 def prior_factor(root: F2) -> F2:
-    """Triangular factor of the prior covariance root root^T: what each unknown adds to those before it, low orders of a motion first."""
+    """Return the lower triangular factor of root root^T: column j holds the part of unknown j that is independent of all before it."""
     scale = np.linalg.norm(root, axis=1)
     return np.asarray(scale[:, None] * scipy.linalg.qr((root / scale[:, None]).T, mode="r")[0].T)
 
@@ -169,10 +169,10 @@ def prior_factor(root: F2) -> F2:
 
 @kept
 def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term, ...], F2]:
-    """Terms of the solution and of the orders above it, and the factor of the latter's effect on all coefficients, shape (P, q).
+    """Return the P terms of the solution and of the orders above it, and the factor (P, q) of the covariance due to the latter.
 
-    The prediction keeps the chosen order. The value that the residuals suggest for the higher orders is therefore no correction: it counts
-    in full, as one more column of the factor.
+    The prediction leaves out the orders above. So the values that the residuals suggest for them do not correct it; they count in full as
+    uncertainty, as one more column of the factor.
     """
     above = omitted_terms(max((t.order for t in solution.terms), default=0), orders_above)
     terms = (*solution.terms, *above)
@@ -194,7 +194,7 @@ def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term
 
 
 def chosen_order(solution: JointSolution) -> int:
-    """Legendre order that the data support; the solution's terms above it contribute only uncertainty."""
+    """Return the Legendre order that the data support; terms of the solution above it contribute only uncertainty."""
     return solution.order
 
 
@@ -204,10 +204,10 @@ def omitted_terms(order: int, orders_above: int) -> tuple[Term, ...]:
 
 
 def omitted_prior_sd(solution: JointSolution, above: tuple[Term, ...]) -> F1:
-    """Prior standard deviation of the omitted terms, shape (len(above),): the documented value times the solver's scale for that motion.
+    """Return the prior standard deviation of the omitted terms ``above``, shape (len(above),).
 
-    The solver may have found this machine's errors larger or smaller than the documented priors. The omitted orders of a motion take the
-    scale of its highest solved order.
+    The solver may have found this machine's errors larger or smaller than the documented priors. So the documented value of an omitted
+    order is scaled as the solver scaled the highest solved order of the same motion.
     """
     documented = Priors()
     kept = term_prior_sd(solution.machine, solution.terms, documented)
@@ -259,9 +259,9 @@ class Source:
         Effect of q independent inputs of unit variance on the coefficients of `ErrorSources.terms`: the source's covariance is
         ``factor factor^T``.
     dof : float
-        Degrees of freedom of its size; inf if it is stated.
+        Degrees of freedom of the variance; inf if it is stated.
     scatter_mm : float
-        Further standard deviation at each point, per component.
+        Additional standard deviation of each component at each point, mm.
     subtracted : array, shape (P, r), optional
         Factor of a covariance to be subtracted, only for ``estimated_sizes``. The difference is clipped so that it never makes a prediction
         more certain (`abbe.models.uncertainty.prediction`).
@@ -283,8 +283,8 @@ class Source:
 class ErrorSources:
     """All sources of one solution.
 
-    ``terms``: the terms of the solution, then those of the orders above it; ``coefficients``: their values, zero above, shape
-    (len(terms),).
+    ``terms``: the terms of the solution, then those of the orders above it. ``coefficients``: their values, shape (len(terms),), zero for
+    the orders above.
     """
 
     solution: JointSolution
@@ -323,7 +323,7 @@ def error_sources(solution: JointSolution, inputs: StatedInputs | None = None) -
 
 @kept
 def _sources(solution: JointSolution, inputs: StatedInputs) -> tuple[tuple[Term, ...], tuple[Source, ...]]:
-    """All terms, and the sources as factors on their coefficients."""
+    """Return all terms, and the sources with their factors for these terms."""
     r = response(solution)
     n = len(solution.terms)
     found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
@@ -339,12 +339,12 @@ def _sources(solution: JointSolution, inputs: StatedInputs) -> tuple[tuple[Term,
 
 
 def _padded(factor: F2, above: int) -> F2:
-    """Append rows of zeros for the terms above."""
+    """Append ``above`` rows of zeros, for the terms of omitted orders."""
     return np.pad(factor, ((0, above), (0, 0)))
 
 
 def _merged(sources: list[Source]) -> list[Source]:
-    """Merge sources of the same name; the fewest degrees of freedom count."""
+    """Merge sources of the same name and keep the fewest degrees of freedom."""
     out: dict[str, Source] = {}
     for s in sources:
         have = out.get(s.name)
@@ -359,14 +359,14 @@ def _merged(sources: list[Source]) -> list[Source]:
 
 
 def _compressed(factor: F2) -> F2:
-    """The same covariance from no more columns than rows."""
+    """Return a factor of the same covariance with no more columns than rows."""
     if factor.shape[1] <= factor.shape[0]:
         return factor
     return np.asarray(scipy.linalg.qr(factor.T, mode="r")[0][: factor.shape[0]].T)
 
 
 def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
-    """Scatter of the readings per instrument, the machine's repeatability apart, and the uncertainty of the estimated sizes."""
+    """Return the noise of each instrument's readings without the machine's repeatability, and this repeatability as a source of its own."""
     out = []
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
@@ -382,9 +382,9 @@ def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
 
 
 def _widening(r: Response, n: int) -> tuple[F2, F2]:
-    """Uncertainty of the estimated sizes: covariance beyond that for fixed sizes, split into a positive and a negative part.
+    """Split `Response.widening` of the first n unknowns into factors of its positive and of its negative part.
 
-    It already allows for the few degrees of freedom of the sizes; its own are infinite, so that they do not count twice.
+    The widening already allows for the few degrees of freedom of the sizes, so its source gets infinitely many.
     """
     whole = r.widening[:n, :n]
     scale = np.sqrt(np.diag(r.covariance)[:n])
@@ -394,7 +394,7 @@ def _widening(r: Response, n: int) -> tuple[F2, F2]:
 
 
 def _priors(solution: JointSolution, r: Response) -> list[Source]:
-    """Influence of the prior of every unknown on the estimate; of correlated unknowns, each counts with its independent part."""
+    """Return the priors of all unknowns as sources; a correlated unknown counts with its independent part (`prior_factor`)."""
     order = chosen_order(solution)
     above = {t.name for t in solution.terms if t.order > order}
     terms = {t.name for t in solution.terms}
@@ -412,7 +412,7 @@ def _prior_source(name: str, is_term: bool) -> str:
 
 
 def _calibration(solution: JointSolution, r: Response, inputs: StatedInputs) -> list[Source]:
-    """Errors that all readings of one instrument share: the laser's wavelength, the bar's temperature."""
+    """Return the errors that all readings of an instrument share: the laser's wavelength, the bar's temperature."""
     out = []
     lasers = any(run.kind == "laser" for run in solution.data)
     if lasers and inputs.u_wavelength > 0 and LASER_SCALE not in solution.estimate.names:
@@ -426,16 +426,16 @@ def _calibration(solution: JointSolution, r: Response, inputs: StatedInputs) -> 
 
 
 def _travel(run: RunData) -> F1:
-    """Distance along the beam from the first record, mm, which a wrong wavelength scales; zero for the ball-bar."""
+    """Return the distance along the beam from the first record, mm; a wrong wavelength falsifies the reading in proportion. 0: ball-bar."""
     if run.beam is None:
         return np.zeros(run.deviation_mm.size)
     return np.asarray((run.axes_mm - run.axes_mm[0]) @ run.beam)
 
 
 def _temperature(solution: JointSolution, inputs: StatedInputs) -> list[Source]:
-    """Uncertain scale temperature: a linear positioning error of each axis, alpha u_T times the travel from the start of its stroke.
+    """Return the uncertain scale temperature as a source: positioning error of each axis, alpha u_T times travel from the stroke's start.
 
-    It is written as the term of Legendre order 1, twice the fraction of the stroke (`abbe.models.geometry.bases.term_values`).
+    Its term is that of Legendre order 1, which is twice the fraction of the stroke (`abbe.models.geometry.bases.term_values`).
     """
     slope = inputs.u_scale_temperature_k * inputs.scale_expansion_per_k
     if slope == 0.0:

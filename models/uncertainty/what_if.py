@@ -28,10 +28,10 @@ Kind = Literal["rms", "largest", "range"]
 
 @dataclass(frozen=True)
 class ForecastFigure:
-    """Definition of a figure of the deviation.
+    """Definition of a figure of the deviation, such as its rms over the volume.
 
-    ``per_unit``: deviation at m points in k components per unit of each coefficient, shape (m, k, P). ``kind``: root mean square or largest
-    length over the points, or range of the only component.
+    ``per_unit``: k components of the deviation at m points per unit of each coefficient, shape (m, k, P). ``kind``: rms or largest length
+    over the points, or (with one component) range over the points.
     """
 
     name: str
@@ -99,7 +99,7 @@ def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: f
 
 
 def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure], *, draws: int = DRAWS, seed: int = SEED) -> list[Forecast]:
-    """Figures of the machine without correction, and with a part of the estimate corrected.
+    """Forecast figures of the machine without correction, and with a part of the estimate corrected.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _outcome(figure: ForecastFigure, before: F2, after: F2) -> Forecast:
 
 
 def _sizes(figure: ForecastFigure, coefficients: F2) -> F1:
-    """The figure for each column of coefficients, shape (draws,)."""
+    """Return the figure for each column of coefficients (P, draws), shape (draws,)."""
     m, k, p = figure.per_unit.shape
     values = (figure.per_unit.reshape(m * k, p) @ coefficients).reshape(m, k, -1)
     if figure.kind == "range":
@@ -136,6 +136,6 @@ def _sizes(figure: ForecastFigure, coefficients: F2) -> F1:
 
 
 def check_figures(known: KnownField, cup: tuple[F1, float] | None = None) -> list[ForecastFigure]:
-    """Figures that a check measures or a map shows: volume, body diagonals and, given ``cup`` (centre, radius), the helix about it."""
+    """Return the figures that a check run measures or a map shows: volume, body diagonals and, given ``cup`` (centre, radius), a helix."""
     out = [*volume_figures(known), *diagonal_figures(known)]
     return out if cup is None else [*out, helix_figure(known, *cup)]
