@@ -1,4 +1,4 @@
-"""Search a positioning test of one axis: first for a drift of its repeats, then in the catalogue for what exceeds their scatter."""
+"""Search a positioning test of one axis for a drift of its repeats, then for catalogue effects that exceed the scatter of the repeats."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHANCE = 1e-3
 
 @dataclass(frozen=True)
 class _Scatter:
-    """Scatter of repeated visits about each run's mean: ``sd_mm``, and the variance inflation ``long`` of sums of correlated neighbours."""
+    """Scatter of repeated visits: ``sd_mm``, and the factor ``long`` by which correlation of neighbours raises the variance of sums."""
 
     sd_mm: float
     long: float
@@ -35,7 +35,7 @@ class _Scatter:
 def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
     """Search a test of one axis for a drift of its repeats, and the rest for effects of the catalogue.
 
-    An effect must exceed the scatter of the repeats, which needs no noise model; otherwise the result of `axis_drift` stands.
+    The effects must exceed the scatter of the repeats, which is known without a noise model; otherwise the result is that of `axis_drift`.
     """
     drift = axis_drift(case)
     drifts = drift_at(case) if drift is not None and drift.verdict == "named" else {}
@@ -61,7 +61,7 @@ def _without(case: Case, drifts: dict[str, F1]) -> Case:
 
 
 def _combined(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, F1], table: tuple[Significance, ...]) -> Discovery:
-    """Join the drift and the other named effects to one finding; its residuals "before" are those of the readings with the drift."""
+    """Join the drift and the other named effects to one finding; its residuals "before" still contain the drift."""
     problem = whiten(case, baseline_of(case))
     before = predictions(problem, solve(problem, ()))
     fitted_setups = {r.path.setup for r in problem.runs}
@@ -83,7 +83,7 @@ def _combined(case: Case, drift: Discovery, found: Discovery, drifts: dict[str, 
 
 
 def _scatter(case: Case) -> _Scatter | None:
-    """Return the scatter of the fitted runs; None if no place was visited twice or all visits are equal."""
+    """Return the scatter of the fitted runs; None if they repeat too few places to tell, or if all repeats are equal."""
     runs = case.of("identify")
     if len(runs) < 2:
         return None
@@ -110,7 +110,7 @@ def _stacked(case: Case) -> tuple[F1, F1, F1]:
 def _exceeds_scatter(case: Case, found: Discovery, scatter: _Scatter) -> bool:
     """Check whether the finding shifts positions by more than their repeats allow, and every named effect exceeds its own U.
 
-    The shift is the change by the named effects; without any, the remaining residual.
+    The shift is what the named effects change in the residuals; without named effects, the residuals themselves.
     """
     if any(abs(e.strength) <= 2.0 * e.u_strength for e in found.effects):
         return False

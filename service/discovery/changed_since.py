@@ -100,7 +100,7 @@ def _before_of(store: Store, record: SolutionRecord) -> _Before:
 
 
 def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
-    """Return the table of each run of a solution; those of the solution itself if its runs have none."""
+    """Return the table of each run of a solution; if its runs state none, the tables that the solution states."""
     used = set(record.run_ids)
     tables = [r.start.table for r in store.runs.all(record.campaign_id) if r.id in used]
     return (
@@ -159,7 +159,7 @@ def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[
 
 
 def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[EffectFound]) -> ChangedSince:
-    """Compare after subtracting the effects that the solution subtracted too, and the campaign's own thermal and instrument effects."""
+    """Compare, after subtracting the effects that the old solution had subtracted and the campaign's own thermal and instrument effects."""
     left = remove_table(campaign, campaign_table(store, campaign).table)
     if before.version is not None:
         book = version(store, campaign.site.name, before.version).book.effects

@@ -45,7 +45,7 @@ def changed_lines(changed: ChangedSince | None) -> list[str]:
 
 
 def proved(changed: ChangedSince) -> bool:
-    """Check whether runs that did not choose the changes confirm them.
+    """Check whether the changes are confirmed by runs that were not used to choose them.
 
     Each half of the set-ups must be more likely with the changes that the other half chose. A visible gap must close. Both halves must have
     chosen every change, and each change must exceed its own U and have no close rival. No other finding in these runs may be the cause.

@@ -37,7 +37,7 @@ from abbe.service.runs.cases import case_of
 from abbe.service.runs.observations import run_data
 
 Search = Callable[[Case, tuple[Effect, ...], ProgressSink], Discovery]
-"""The computation: case, catalogue, progress sink."""
+"""Function that searches a case for effects of the catalogue and reports to a progress sink."""
 Thin = Callable[[list[Run]], list[Run]]
 
 
@@ -46,12 +46,12 @@ class DiscoveryJob:
     """Input of a discovery.
 
     ``campaign``: as measured. ``runs``: its runs, decimated (`abbe.service.campaign_data.decimation`) and without the effect of an active
-    table (``table_mm``, by run). ``case``: these runs without the effects of the model book: ``known_mm``, by run, with the labels
-    ``known`` from version ``base``. ``flags``: oddities of single runs, and what decimation hides. ``thinning``: the decimation in
-    numbers, None without any. ``since``: the solution to compare with.
+    table, which is in ``table_mm`` by run. ``case``: these runs, also without the effects of the model book (version ``base``), whose
+    contributions are in ``known_mm`` by run and whose labels are in ``known``. ``effects``: the catalogue. ``flags``: oddities of single
+    runs, and what decimation hides. ``thinning``: the decimation in numbers, None without any. ``since``: the solution to compare with.
 
-    ``expected_version``: the version that must still be the current one when this discovery adds its own. It is the newest version, or the
-    version that the continued discovery of the same readings added.
+    ``expected_version``: the version that must still be the current one when this discovery adds its own: the newest at its start, or the
+    one added by the discovery that it continues.
     """
 
     campaign: Campaign
@@ -175,7 +175,7 @@ class DiscoveryJournal:
         self.steps.append(step)
 
     def _persist(self, seq: int, step: DiscoveryStep, model: ModelBook | None) -> None:
-        """Write the state to the store; a journal in memory has none."""
+        """Write the state to the store; does nothing in memory."""
 
     @property
     def id(self) -> int | None:
@@ -229,5 +229,5 @@ def _enters(step: DiscoveryStep, finding: Finding) -> bool:
 
 
 def _version(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> ModelBook:
-    """Return the model book extended by the effects of a proved finding that shift readings."""
+    """Return the model book, extended by those effects of a proved finding that shift readings."""
     return extended_book(job.base, replace(finding, effects=entering(finding)), job.source, journal.id, job.effects)

@@ -1,7 +1,7 @@
 """Continue a discovery on the connected machine: measure the proposal, join it with the old campaign, search again.
 
-All state is stored. The document of a continuing campaign names its plan and the campaign that it continues. Both together give the joined
-campaign, whose readings identify its discovery. So the same command resumes wherever it was stopped.
+All state is stored. The document of a continuing campaign names its plan and the campaign that it continues. Joined, the two campaigns form
+a new one, whose discovery is found in the store by its readings. So the same command resumes wherever it was stopped.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Addition:
 
 
 def addition_count(store: Store, name: str) -> int:
-    """Count the additions in the chain of campaigns that ends with this one; their run labels are taken."""
+    """Count the additions in the chain of campaigns that ends with this one, to choose run labels that none of them has used."""
     before = {c.name: (c.doc.get("continues") or {}).get("campaign") for c in store.campaigns.all()}
     chain = [name]
     while (old := before.get(chain[-1])) is not None and old not in chain:

@@ -23,7 +23,7 @@ FOLLOWS: dict[State | None, frozenset[State]] = {
 }
 ENDS = frozenset({"EXPLAINED", "UNEXPLAINED"})
 VISIBLE = 1.05
-"""Smallest ratio of gap to noise floor, before the fit, at which holdout runs can judge; below it the effect does not show in them."""
+"""Smallest ratio of gap to noise floor, without the effect, at which holdout runs can judge; below it they do not show the effect."""
 CLOSED = 0.5
 """Share of the gap (`GapUm.closed`) that must close on the holdout runs. A wrong effect closes it on the fitted runs only."""
 LEFT = 1.5

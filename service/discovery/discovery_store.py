@@ -15,7 +15,7 @@ from abbe.service.storage.store import Store
 class StoredJournal(DiscoveryJournal):
     """A journal that writes each state to the store before the discovery proceeds, the last one together with the new model version.
 
-    ``base``: the model version whose effects were subtracted from the readings; None without any.
+    ``base``: the model version whose effects were subtracted from the readings; None if nothing was subtracted.
     """
 
     def __init__(self, store: Store, discovery_id: int, machine: str) -> None:

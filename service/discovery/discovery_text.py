@@ -30,7 +30,7 @@ ADDS = {
 AXES = "XYZ"
 MANY = 6
 CLEAR = 7.0
-"""Difference in evidence (natural logarithm) above which a rival's odds are stated as a power of ten: one in a thousand."""
+"""Difference in evidence (natural logarithm) above which a rival's odds are stated as a power of ten; 7 means one in a thousand."""
 ROLES = {
     "identify": "fitted",
     "holdout": "never fitted, only judge",

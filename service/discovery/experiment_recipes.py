@@ -29,7 +29,7 @@ SLOW = 0.4
 DENSER = 2.0
 """Factor on the number of turns of a path through a given place."""
 EQUATOR = 0.05
-"""A place below the equator by less than this (sine of the angle) still belongs to the upper half."""
+"""A place below a sphere's equator by less than this (sine of the angle) still belongs to the upper half."""
 KNOWN = (
     "centre_mm", "radius_mm", "turns", "axis", "opens", "law", "even", "chord_mm", "rate_hz", "length_calibrated", "u_length_mm",
 )  # fmt: skip
@@ -43,8 +43,8 @@ TURNED = "a person has to turn the bar or change its ball in between"
 class NextPlan:
     """What the machine measures next, and what a person has to do.
 
-    ``plan``: None if the sequencer can run none of it. ``by_hand``: additions for a person, with the reason unless the sequencer has no
-    such test. ``after_s``: least age of the last reading at the start of the plan, s, for a repeat late in the session.
+    ``plan``: None if the sequencer can run none of it. ``by_hand``: additions that a person has to do, with the reason if the sequencer
+    knows such a test but cannot run it here. ``after_s``: least age of the last reading at the start of the plan, s, for a late repeat.
     """
 
     plan: CampaignPlan | None
@@ -109,7 +109,7 @@ def _tests(
 def _within(
     add: str, machine: Machine, recipes: list[Recipe], max_feed_mm_min: float, place: tuple[float, float, float] | None
 ) -> tuple[TestPlan, ...] | str:
-    """Return the tests of recipes if they fit the strokes, else the reason as text; a second radius without room is halved once."""
+    """Return the tests of recipes if they fit the strokes, else the reason as text; a second radius that does not fit is halved once."""
     tries = [recipes]
     if add == "second_radius":
         tries.append([_shrunk(r, 0.5, place) if isinstance(r, Helix) else r for r in recipes])

@@ -17,7 +17,7 @@ def disagreeing(finding: Finding) -> list[Agreement]:
 
 
 def nothing_missing(finding: Finding) -> str:
-    """Return the verdict if nothing is missing in the fitted runs, with the other runs that disagree or could not be judged."""
+    """Return the verdict on a finding without missing effects; it names other runs that disagree or could not be judged."""
     off, open_ = disagreeing(finding), _unjudged(finding)
     if not off and not open_:
         return "the present model explains all runs to their noise"

@@ -1,8 +1,8 @@
-"""Centroid ballscrew table, version 1 (.tab; CNC7 v6.00 and later): encoder counts, one direction (cncsnw.com, "Laser Compensation").
+"""Centroid ballscrew table, version 1 (.tab; CNC7 v6.00 and later): corrections in encoder counts, the same for both directions.
 
 The first line holds the number of values and the signed travel from the first to the last, in counts. One whole number per line follows,
-the first at the reference. In the example of that page, 24 values over -1448819 counts are 40 mm apart at 40000 counts per inch. Versions 2
-and 3 (two directions, a longer heading) are not supported, because no description of them was available.
+the first at the reference. Source: cncsnw.com, "Laser Compensation"; in its example, 24 values over -1448819 counts are 40 mm apart at
+40000 counts per inch. Versions 2 and 3 (two directions, a longer heading) are not supported, because no description was available.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     Raises
     ------
     FormatRefused
-        The table is of another kind, has two directions or no reference, or the reference is not at one of its ends.
+        The table is of another kind, differs between the directions, or is not zero at the reference; or the reference is at neither end.
     """
     check_kinds(comp, LIMITS, WHAT)
     files = []

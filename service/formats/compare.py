@@ -13,7 +13,7 @@ from abbe.service.formats.model import Compensation, correction_at
 
 REMEDY = "do not load this file"
 ALIKE = 0.2
-"""Tables count as the expected ones times a factor if the remaining difference is below this share of them."""
+"""Largest difference at which tables still count as the expected ones times a factor, as a share of these."""
 FACTORS = (
     (-1.0, "the sign is wrong: it would double every error"),
     (1000.0, "1000 times too large: µm were taken for mm"),
@@ -36,7 +36,7 @@ class FormatDifference:
 
 
 def places_mm(*parts: Compensation) -> F2:
-    """Return the positions of the comparison, shape (n, 3): all points of the tables along each axis, and random points of their box."""
+    """Return positions at which to compare tables, mm, shape (n, 3): all table points along the middle of their box, random ones in it."""
     axes: list[list[F1]] = [[], [], []]
     for comp in parts:
         for t in comp.tables:
@@ -76,7 +76,7 @@ def check_same(found: Compensation, expected: Compensation, tolerance_mm: float)
     Raises
     ------
     TableContradicts
-        The message names the mistake (wrong sign or unit, exchanged directions or axes), if recognized, and the place.
+        A difference is larger. The message states its place and, if recognized, the mistake (wrong sign or unit, swapped directions, ...).
     """
     found_differences = differences(found, expected)
     worst = max(found_differences, key=lambda d: d.size_mm)

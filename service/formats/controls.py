@@ -1,8 +1,8 @@
-"""Capabilities of controls by their manuals, and the best use of a control for an identified machine.
+"""What controls can correct according to their manuals, and the best use of a control for an identified machine.
 
-`choices` gives the residual errors with each kind of table over the whole volume in both directions of motion, with the best-fit rigid
-motion removed and the numbers rounded as in the control. If the control limits the number of tables, those with the largest reduction are
-taken first.
+`choices` evaluates each kind of table by the errors that remain over the whole volume in both directions of motion, after removal of the
+best-fit rigid motion and with the numbers rounded as in the control. If the control limits the number of tables, those with the largest
+reduction are taken first.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ControlModel:
     Attributes
     ----------
     own, cross : str
-        Format of own-axis tables; format of cross and product tables; empty for none.
+        Format of own-axis tables, and of cross and product tables; empty if the control has no such tables.
     own_points, cross_points : int
         Largest number of points of a table.
     both_directions : bool
@@ -37,7 +37,7 @@ class ControlModel:
     lattice, nodes : str, int
         Format of a 3-D grid, and its nodes per axis.
     motions : str
-        Format of error motions for the control's own kinematic chain.
+        Format of the error motions from which the control computes corrections by its own kinematic chain.
     lookup : str
         Position at which the control looks up all tables but the own-axis ones.
     unit_mm : float
@@ -154,7 +154,7 @@ class FormatJudge:
         self._control = control
 
     def left_mm(self, comp: Compensation) -> F1:
-        """Return the length of the residual error at every node, first moving in +, then in −, mm, shape (2 n,)."""
+        """Return the length of the residual error, mm, shape (2 n,): at all n nodes while moving in +, then while moving in −."""
         stored = rounded(comp, self._control.unit_mm)
         parts = []
         for way, field in self._moving.items():
@@ -242,7 +242,7 @@ class _Builder:
         self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
 
     def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
-        """Combine the products with own-axis and cross tables, each on its own grid, for the error that the products leave."""
+        """Combine products with own-axis tables and the cross tables of ``pairs`` (axis, output), which correct what the products leave."""
         fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
         own = _own(self.known, self._control, tuple(t for t in fine if t.own))
         cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)
@@ -273,12 +273,12 @@ class _Builder:
 
 
 def _added_by(product: ProductTable, points_mm: F2) -> F2:
-    """Return the correction by one product, by which the other tables are reduced."""
+    """Return the correction by one product, mm: an additional error for the other tables, which need not correct it again."""
     return correction_at(Compensation(products=(product,)), points_mm)
 
 
 def rounded(comp: Compensation, unit_mm: float) -> Compensation:
-    """Round all corrections to the control's resolution, and angles to a thousandth of it (rad)."""
+    """Round all corrections to the control's resolution (mm), and angles to a thousandth of the same number (rad)."""
 
     def to(v: F1, unit: float = unit_mm) -> F1:
         return np.asarray(np.round(v / unit) * unit)

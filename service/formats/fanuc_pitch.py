@@ -1,4 +1,4 @@
-"""Fanuc stored pitch error compensation: whole numbers from point to point, between ``%`` lines.
+"""Fanuc stored pitch error compensation: a file of whole-number steps from point to point, between ``%`` lines.
 
 Point n holds the units added between (n - ref - 1) and (n - ref) intervals from the reference position, so their sum is zero at the
 reference (B-63980EN p. 100). The SUMS are rounded and the points hold the differences of rounded sums, so no sum is off by more than half a

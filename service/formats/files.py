@@ -24,7 +24,7 @@ class TextFile:
     text: str
 
     def lines(self) -> Iterator[tuple[int, str]]:
-        """Return the lines with their number, from 1."""
+        """Return the lines with their numbers, from 1."""
         return enumerate(self.text.splitlines(), start=1)
 
     def wrong(self, line: int, what: str, remedy: str = "correct the file; nothing was loaded") -> TableFileError:

@@ -99,7 +99,7 @@ def _com(axis: str, tables: list[AxisTable], settings: FormatSettings) -> str:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """Read the tables that the active line of the .CMA names (all .COM files without a .CMA).
+    """Read the tables that the active line of the .CMA names; without a .CMA, all .COM files.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return column names and rows with line numbers of a table between BEGIN and [END]."""
+    """Return the column names of a table between BEGIN and [END], and its rows with their line numbers."""
     lines = list(file.lines())
     if not lines or not lines[0][1].startswith("BEGIN "):
         raise file.wrong(1, "the first line is not BEGIN")

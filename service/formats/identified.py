@@ -72,7 +72,7 @@ def grid_mm(machine: Machine, axis: int, points: int, reference_mm: F1) -> F1:
 
 
 def line_fit(grid: F1, stroke_mm: F1) -> tuple[F1, F2]:
-    """Return sampling positions inside the stroke, and the matrix from values there to the best piecewise linear function on a grid.
+    """Return sampling positions inside the stroke, and the matrix that turns values there into the nodes of the best piecewise linear fit.
 
     A grid may reach beyond the stroke by part of a cell; a weak penalty on bends extrapolates the function there.
     """
@@ -112,7 +112,7 @@ def _sampled(known: Identified, name: str, grid: F1) -> F1:
 
 
 Values = tuple[F2, F2, F2]
-"""Corrections per axis, shape (points, 3 outputs), mm."""
+"""Corrections as functions of X, of Y and of Z, each of shape (points, 3 outputs), mm."""
 
 
 def table_values(
@@ -183,7 +183,7 @@ def lattice_of(known: Identified, grids: Grids, reference_mm: F1) -> Lattice:
 
 
 def motions_of(known: Identified, grids: Grids) -> Motions:
-    """Return all identified error motions. Together they hold for the measured tool, even if single motions are not observable."""
+    """Return all identified error motions. Together they are right for the measured tool, even if single motions are not observable."""
     curves = {}
     for name, (axis, _) in PLACES.items():
         if any(t.motion == name for t in known.terms):

@@ -24,7 +24,7 @@ POSITION_DECIMALS = 6
 
 
 def write(comp: Compensation, settings: FormatSettings, *, kind: int = 1) -> tuple[TextFile, ...]:
-    """Write one file per own-axis table: ``x.comp`` ... for ``COMP_FILE`` with ``COMP_FILE_TYPE = kind``.
+    """Write one file (``x.comp``, ...) per own-axis table, for ``COMP_FILE`` with ``COMP_FILE_TYPE = kind``.
 
     Raises
     ------

@@ -129,7 +129,7 @@ class Compensation:
 
     @property
     def cross(self) -> tuple[AxisTable, ...]:
-        """The tables between two axes."""
+        """The tables that correct one axis as a function of another."""
         return tuple(t for t in self.tables if not t.own)
 
     @property

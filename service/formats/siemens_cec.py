@@ -1,8 +1,8 @@
-"""Siemens sag and angularity compensation, $AN_CEC: any axis from any axis, pairs for the two directions, products.
+"""Siemens sag and angularity compensation, $AN_CEC: a table corrects any axis as a function of any axis.
 
-Directions: two tables with $AN_CEC_DIRECTION 1 and -1. Products: $AN_CEC_MULT_BY_TABLE[t] = n multiplies table t by table n (index n - 1).
-As in the manual's grid example (6FC5397-1BP40-3BA1 p. 259), only the product acts; the factor table by itself is switched off
-($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first (docs/reference/formats.md).
+If the two directions differ, there are two tables, with $AN_CEC_DIRECTION 1 and -1. For a product, $AN_CEC_MULT_BY_TABLE[t] = n multiplies
+table t by table n (index n - 1). As in the manual's grid example (6FC5397-1BP40-3BA1 p. 259), only the product acts; the factor table by
+itself is switched off ($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first (docs/reference/formats.md).
 Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the command.
 """
 
