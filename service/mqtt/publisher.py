@@ -247,7 +247,7 @@ class Publisher:
         return ended
 
     async def _probe(self) -> None:
-        """Fail early if nothing listens, or something that is not our broker; unlike aiomqtt's connecting, this can be cancelled.
+        """Fail early if nothing listens, or what listens is not our broker; unlike connecting by aiomqtt, this can be cancelled.
 
         aiomqtt connects in a thread that cannot be interrupted, and leaves a socket open if it refuses the broker's certificate.
         """
@@ -306,7 +306,7 @@ class Publisher:
                         await self._wake.wait()
 
     async def _tidy(self) -> None:
-        """Keep the outbox bounded, with a broker and without."""
+        """Keep the outbox bounded, whether or not a broker is connected."""
         try:
             dropped = await self._outbox.tidy()
         except StoreError as trouble:

@@ -184,7 +184,7 @@ def table_in_force(journal: Sequence[PushEntry]) -> ActiveTable | None:
     """Return the active table according to the journal of the last push; None if unknown.
 
     Before activation and after a failed push the old table is active, after KEEP the new one, after a person's acceptance the accepted one.
-    It is unknown between activation and the end of a push, and while a person has to look.
+    It is unknown between activation and the end of a push, and while the push waits for a person.
     """
     if not journal:
         return None

@@ -1,8 +1,8 @@
 """MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for the sequence numbers.
 
 `Agent` implements an MTConnect agent without assets, without the agent as a device, and without XPath (``path``) and streaming
-(``interval``). It observes at each request: it misses changes of a running check between two requests, but no check that ended, up to ten
-at once.
+(``interval``). It observes at each request: it misses changes of a running check between two requests, but no ended check, unless
+more than ten end between two requests.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def _result(check: Verification, verdict: str) -> Entries:
 
 
 def _condition(facts: PlantFacts) -> tuple[str, str, str]:
-    """Return text, level and code of the machine's condition by the last check."""
+    """Return text, level and code of the machine's condition, by the last check of the table in force, else by the state of that table."""
     if facts.verified is not None and not facts.verified.holds:
         state = facts.verified.state
         return ("", "Normal", "") if state == "verified" else (facts.verified.text, "Warning", state)

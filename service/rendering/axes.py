@@ -43,7 +43,7 @@ def tick_text(value: float, step: float) -> str:
 
 
 def data_range(values: Iterable[float | None], *, margin: float = 0.06, zero: bool = False) -> tuple[float, float]:
-    """Range of all finite values, widened on both sides by ``margin`` times the span; 0 .. 1 without any. ``zero``: include zero."""
+    """Range of all finite values, widened on both sides by ``margin`` times the span; 0 .. 1 if there are none. ``zero``: include zero."""
     good = [float(v) for v in values if finite(v)]
     if zero:
         good.append(0.0)
@@ -193,14 +193,14 @@ class PanelGrid:
         panel.draw_x(svg, labels[0] if last else "", count=5, numbers=last)
 
     def draw_columns(self, svg: Svg, y: float) -> None:
-        """Moved axis above each column."""
+        """Write the moved axis above each column."""
         for column, axis in enumerate(self.columns):
             x = self.LEFT + column * (self._width + self.gap) + self._width / 2.0
             svg.text((x, y), f"moving {axis}", "t-soft", anchor="middle")
 
 
 def draw_sequence(svg: Svg, at: XY, cell: float, top: float, unit: str) -> None:
-    """Key of the five colours for sizes from zero to ``top``; ``at``: upper left corner; ``cell``: width of a colour, pixels."""
+    """Draw the key of the five colours for sizes from zero to ``top``. ``at``: upper left corner; ``cell``: width of a colour, pixels."""
     x, y = at
     for i in range(SEQUENCE):
         svg.rect((x + i * cell, y), (cell, 9.0), f"f-seq{i + 1}")

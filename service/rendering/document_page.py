@@ -74,7 +74,7 @@ def default_name(document: Document) -> str:
 
 
 def form_of(target: Path) -> Callable[[Document], str | bytes]:
-    """Writer for a file name.
+    """Return the writer for the extension of a file name.
 
     Raises
     ------

@@ -21,7 +21,7 @@ U_OF = f"U (k = {tidy(COVERAGE)})"
 
 @dataclass(frozen=True, slots=True)
 class SummaryRow:
-    """One figure before and after the correction, ``u`` standard uncertainties in ``unit``."""
+    """One figure before and after the correction; ``u_before``, ``u_after``: standard uncertainties. All in ``unit``."""
 
     name: str
     unit: str
@@ -57,7 +57,7 @@ def stated(value: float | None, u: float | None) -> str:
 
 
 def summary_table(rows: Sequence[SummaryRow]) -> TextTable:
-    """Table of figures before and after the correction, with the columns about its result in bold."""
+    """Table of figures before and after the correction, with the columns that show the effect in bold."""
     head = ("Figure", "Before", "After", "Unit", "Smaller by", "Source")
     cells = [(r.name, stated(r.before, r.u_before), stated(r.after, r.u_after), r.unit, _times(r), r.source) for r in rows]
     return TextTable(head, cells, bold=("After", "Smaller by"))

@@ -55,7 +55,7 @@ STATEMENTS = (
 
 @dataclass(frozen=True)
 class _Found:
-    """A finding with the searched runs, their flags, and the states of the search with their reasons."""
+    """A finding with its campaign, the searched runs, flags (warnings), and the states of the search with their reasons."""
 
     finding: Finding
     campaign: Campaign
@@ -100,7 +100,7 @@ def found_report(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding,
 
 
 def simulation_report(job: DiscoveryJob, finding: Finding, verdict: tuple[str, str, str], made_utc: str) -> Document:
-    """Report of measured against simulated readings, without a search. ``verdict``: sign, word and sentence."""
+    """Report that compares measured with simulated readings, without a search. ``verdict``: sign, word and sentence."""
     title = f"Campaign {job.campaign.name} - measured against simulated"
     found = _of_job(job, DiscoveryJournal(), finding)
     made = _provenance(job, DiscoveryJournal())
@@ -189,7 +189,7 @@ def _card(effect: EffectFound) -> dict[str, str]:
 
 
 def gap_table(finding: Finding) -> TextTable:
-    """Table of the gap by role. Sealed runs are only counted, because their readings are unknown here."""
+    """Table of the gap (measured minus simulated) by role of the runs. Sealed runs are only counted: their readings are unknown here."""
     only_scatter = bool(finding.effects) and not entering(finding)  # explained scatter closes no gap
     by = "" if finding.effects or not _what(finding) else f" by {_what(finding)}"
     head = ("Runs", "Before (µm)", "After (µm)", "Noise floor (µm)", f"Gap closed{by}", "What they are for")
@@ -274,7 +274,7 @@ def telling_run(finding: Finding) -> str | None:
 
 
 def _traces(found: _Found) -> list[Trace]:
-    """Traces of the telling run: against time and, if an axis is named, against its position."""
+    """Traces of the run that `telling_run` names: against time and, if an axis is named, against its position."""
     finding, label = found.finding, telling_run(found.finding)
     if label is None:
         return []
@@ -293,7 +293,7 @@ def _traces(found: _Found) -> list[Trace]:
 
 
 def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
-    """Cells of one plane with the rms of the gap (before) divided by its noise."""
+    """Cells of the plane of axes ``a`` and ``b``, with the rms of the gap (before) divided by its noise; None if they span no area."""
     points, ratio = _points(found)
     if not len(points):
         return None

@@ -38,7 +38,7 @@ NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine
 
 @dataclass(frozen=True)
 class SolutionResult:
-    """A solution. ``number``: None unless it is stored; ``account``: source of the pictures, None unless it is new."""
+    """A solution. ``number``: None if it is not stored; ``account``: source of the pictures, only for a new solution."""
 
     solution: SolutionFile
     number: int | None = None

@@ -47,7 +47,7 @@ PLANES = ((0, 1, 2), (0, 2, 1))
 def solution_sections(found: Assessment, solution: SolutionFile) -> list[Section]:
     """Sections of a solution, printed before the figures of the report.
 
-    ``solution``: the same as stored, with tables and Monte Carlo if requested.
+    ``found``: a new solution; ``solution``: its document, with tables and Monte Carlo if requested.
     """
     shares = [MotionShare(m.name, m.share, m.status) for m in found.observability.motions]
     return [
@@ -76,7 +76,7 @@ def _parameters(found: Assessment) -> list[Block]:
 
 
 def solution_rows(found: Assessment) -> list[ParameterRow]:
-    """Rows of parameters; those of motions that are not observable carry a note (valid for this tool only)."""
+    """Rows of parameters; a motion that is not observable by itself carries a note (its value holds for this tool only)."""
     status = {m.name: m.status for m in found.observability.motions}
     rows = parameter_rows(found.joint)
     return [replace(r, note=f"{r.note}; {HIDDEN_NOTE}") if status.get(r.name) == "not observable" else r for r in rows]

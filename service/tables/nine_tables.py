@@ -50,7 +50,7 @@ def table_image(tables: NineTables, lsb_nm: int, table_id: int) -> TableImage:
 def check_test_step(tables: NineTables, active: NineTables | None, limits: PushLimits) -> None:
     """Refuse the tables of a test step that break a limit or are not zero at the reference; never clamp them.
 
-    Limited are size, change against the active table and steps between neighbours, but not curvature.
+    The limits apply to size, change against the active table and steps between neighbours, but not to curvature.
 
     Raises
     ------
@@ -138,7 +138,7 @@ class Base:
 
 
 async def read_base(controller: TableController) -> Base:
-    """Read the active bank and prove it against its CRC.
+    """Read the active bank and check it against its CRC.
 
     Raises
     ------

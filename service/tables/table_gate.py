@@ -1,4 +1,4 @@
-"""The gate before any motion or use of a table: the table in force must be verified, accepted by a person, or correct nothing.
+"""The gate before any motion or use of a table: a table in force that corrects anything needs an endorsement for this control.
 
 A control is known by its address alone (`control_of`), which may change. Each table contains a random number, so its CRC identifies it: the
 CRC is looked up in all journals of the database, under any machine name. A pushed table that was neither kept nor accepted is refused. An
@@ -65,7 +65,7 @@ class Endorsement:
 
     @property
     def not_here(self) -> str:
-        """Text for another machine, on which the endorsement does not hold."""
+        """Text of a refusal on another machine, where the endorsement does not hold."""
         push = f" (push {self.push})" if self.push and self.how == "verified" else ""
         return f"{self.how} on machine {self.machine!r}{push}, not on this one"
 
@@ -211,7 +211,7 @@ async def _corrects(controller: TableController, now: CompStatus) -> bool:
 
 
 async def check_in_force(controller: TableController, store: Store, site: Site) -> None:
-    """Refuse a table in force that is neither verified by a measurement nor accepted by a person.
+    """Refuse a table in force that a push left unverified, or that corrects something without an endorsement for this control.
 
     Raises
     ------

@@ -32,7 +32,7 @@ class LoginOrigin:
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Which count an attempt belongs to (account and place), its number of free failures, and its longest wait."""
+    """Which count an attempt belongs to (account and place), the number of failures without a wait, and the longest wait."""
 
     key: tuple[str, str]
     free: int = FREE
@@ -88,7 +88,7 @@ class Lockout:
         return self.wait_s(account, origin)
 
     def succeeded(self, account: str, origin: LoginOrigin) -> None:
-        """Clear the failures of this account at this place and remember the address. The caller counted the attempt as failed before."""
+        """Clear the failures of this account at this place and remember the address. The caller has counted the attempt as failed."""
         for rule in self._rules(account, origin):
             count = self._counts.get(rule.key)
             if rule.key[0]:

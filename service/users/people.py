@@ -205,7 +205,7 @@ class People:
         return user
 
     def known(self, name: str) -> bool:
-        """Whether there is such a user. Callers must not repeat an unknown name: it may be a mistyped password."""
+        """Whether there is such a user. Callers must not show or log an unknown name: it may be a mistyped password."""
         return bool(NAME.fullmatch(name)) and self._store.people.find(name) is not None
 
     def begin(self, user: UserRecord, instead_of: str = "") -> str:

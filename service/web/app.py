@@ -47,7 +47,7 @@ from abbe.service.web.schemas import Health, LatestChecks, Problem
 
 
 def add_api(app: FastAPI, sources: Sources) -> None:
-    """Add every route of the interface to the application itself: the auth middleware reads permissions from the application's routes."""
+    """Add every route of `/api/v1` directly to the application, because the auth middleware reads permissions from its routes."""
     for add in (add_measured, add_results, add_tables, add_plant, add_reports):
         add(app, sources)
 
@@ -59,8 +59,8 @@ PAGE_ROWS = 60
 class Parts:
     """Sources of the routes that need a core: jobs, live events, metrics.
 
-    ``recipes`` can be started, ``plans`` rehearsed in dry runs; ``campaigns``: recipes that end with a proposal; ``control``: identity of
-    the machine's control, empty if unknown.
+    ``recipes``: can be started; ``plans``: can be rehearsed in dry runs; ``campaigns``: recipes that end with a proposal; ``control``:
+    identity of the machine's control, empty if unknown.
     """
 
     core: CoreLine
@@ -82,16 +82,16 @@ def as_in_host_header(host: str) -> str:
 
 
 class Application(FastAPI):
-    """FastAPI with the security headers outermost, so that every response has them, even after a defect."""
+    """FastAPI with the security headers outermost, so that every response has them, even that to an unhandled error."""
 
     behind_tls = False
 
     def build_middleware_stack(self) -> ASGIApp:
-        """The middleware stack inside the security headers."""
+        """Return the middleware stack, wrapped in the security headers."""
         return SecurityHeaders(super().build_middleware_stack(), behind_tls=self.behind_tls)
 
     def openapi(self) -> dict[str, Any]:
-        """The OpenAPI document with the answers of the middleware."""
+        """Return the OpenAPI document, including the responses of the middleware."""
         return complete(super().openapi(), self.routes)
 
 
@@ -114,7 +114,7 @@ def create_app(
     version : str
         Version of this program, for the OpenAPI document.
     hosts : sequence of str
-        Allowed host names: a foreign page must not reach the service through a name of its own (DNS rebinding).
+        Allowed host names, so that a foreign page cannot reach the service through a name of its own (DNS rebinding).
     auth : Authenticator, optional
         Users and audit; without it every visitor may look and none may change anything.
     plant : FactsSource, optional
@@ -122,7 +122,7 @@ def create_app(
     parts : Parts, optional
         Sources of jobs, live events and metrics.
     api : Sources, optional
-        Sources of the interface `/api/v1`; without it only the routes of the home page exist.
+        Sources of the data behind `/api/v1`; without it the routes of stored data and the screens of plant and tables are missing.
     """
     # FastAPI's /docs loads scripts from a CDN, which plants cannot reach.
     app = Application(title="Abbe", version=version, docs_url=None, redoc_url=None, openapi_url=None)

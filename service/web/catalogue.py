@@ -33,7 +33,7 @@ HTTP: dict[int, tuple[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class ErrorEntry:
-    """An error code: name of its class, meaning, and HTTP status; None if the class has no status of its own."""
+    """An error code: name of its class, meaning, and HTTP status (None if the class has no status of its own)."""
 
     code: str
     name: str

@@ -62,8 +62,8 @@ class Link:
 class Frame:
     """Language, visitor and display options of one response.
 
-    ``path``, ``query``: address of the screen, without the language; ``paths``: addresses of the application, which limit the navigation
-    bar, None: all.
+    ``path``, ``query``: address of the screen, without the language; ``paths``: existing addresses, the only ones that the navigation bar
+    shows; None: all.
     """
 
     lang: str = DEFAULT

@@ -1,4 +1,4 @@
-"""The listening socket, its certificate, and whether other computers may reach it. The core checks them at its start."""
+"""The listening socket, its certificate, and whether other computers may reach it. The core checks all three when it starts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def check_certificate(certificate: str, key: str) -> None:
 
 
 def check_exposure(host: str, admins: Callable[[], int], *, tls: bool, names: Sequence[str] = (), behind_tls: bool = False) -> None:
-    """Refuse access from other computers without an admin or without encryption.
+    """Refuse to serve other computers unless there is an admin and the connection is encrypted.
 
     Parameters
     ----------

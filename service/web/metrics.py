@@ -76,7 +76,7 @@ def _of_core(snapshot: Snapshot) -> Iterator[Metric]:
 
 
 def add_metrics(app: FastAPI, store: Store, core: CoreLine, machine: str, control: str = "") -> None:
-    """Add the route to the application. It needs the permission ``read``, like the home page."""
+    """Add the route `/metrics` to the application. It needs the permission ``read``, like the home page."""
     registry = CollectorRegistry()
     registry.register(_MetricsCollector(store, core, machine, control))
     ProcessCollector(namespace="abbe_web", registry=registry)

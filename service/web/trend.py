@@ -132,7 +132,7 @@ def _limit(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]
 
 
 def _mark(point: Point, px: float, y: _PixelScale, unit: str) -> list[str]:
-    """Bar and mark of a point. The verdict has a shape as well as a colour."""
+    """Uncertainty bar and mark of a point; shape and colour of the mark show the verdict."""
     top, bottom, middle = y(point.value + point.uncertainty), y(point.value - point.uncertainty), y(point.value)
     bar = f'<path class="bar" d="M{px:.1f} {top:.1f}V{bottom:.1f}M{px - 4:.1f} {top:.1f}h8M{px - 4:.1f} {bottom:.1f}h8"/>'
     text = f"{number(point.value)} ± {number(point.uncertainty)} {unit}, {point.verdict}"

@@ -51,27 +51,27 @@ class ClientSession(InternalSession):
         return [ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadNotExecutable)) for _ in params]
 
     async def add_nodes(self, params: Any) -> Any:
-        """Refuse."""
+        """Refuse to add nodes."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     async def delete_nodes(self, params: Any) -> Any:
-        """Refuse."""
+        """Refuse to delete nodes."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     async def add_references(self, params: Any) -> Any:
-        """Refuse."""
+        """Refuse to add references."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     async def delete_references(self, params: Any) -> Any:
-        """Refuse."""
+        """Refuse to delete references."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     async def history_update(self, params: Any) -> Any:
-        """Refuse."""
+        """Refuse to change the history."""
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     def activate_session(self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None) -> ua.ActivateSessionResult:
-        """Activate a session; if certificates are known, only on a channel encrypted with one of them."""
+        """Activate a session; if client certificates are configured, only on a channel encrypted with one of them."""
         server = self.iserver
         if isinstance(server, ReadOnlyServer) and server.trusted is not None:
             server.must_be_known(peer_certificate)
@@ -128,7 +128,7 @@ class ReadOnlyServer(InternalServer):
 
 
 def seal(space: AddressSpace) -> int:
-    """Remove write access from all nodes and execute access from all methods, including the standard's; return the number of changes."""
+    """Remove write access from all nodes and execute access from all methods, also those of the standard; return the number of changes."""
     sealed = 0
     for nodeid in list(space.keys()):
         attributes = space[nodeid].attributes

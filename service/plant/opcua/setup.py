@@ -20,7 +20,7 @@ def check_opcua(setup: OpcUa) -> None:
     Raises
     ------
     ConfigError
-        Other computers could connect unencrypted or unknown; a certificate cannot be read; asyncua is not installed.
+        Other computers could connect without encryption or a known certificate; a certificate cannot be read; asyncua is not installed.
     """
     if setup.guarded and not (setup.certificate and setup.clients):
         raise ConfigError(

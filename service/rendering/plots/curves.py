@@ -154,7 +154,7 @@ LINES = ("s-c2", "s-c3 dash", "s-c4 dots")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ComparedReadings:
-    """Readings over a position with the lines that describe them. Values in um.
+    """Readings over a position, with lines that describe them, e.g. fits. Values in µm.
 
     ``lines``: up to three names with values at every position; the lower panel compares the readings with the first one.
     """

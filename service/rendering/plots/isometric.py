@@ -76,7 +76,7 @@ def draw_box(svg: Svg, paper: Paper, low: F2, high: F2) -> None:
 
 
 def label_edges(svg: Svg, paper: Paper, low: F2, high: F2) -> None:
-    """Range of X, Y and Z along the box, in mm."""
+    """Write the ranges of X, Y and Z, in mm, along the edges of the box."""
     middle = (low + high) / 2.0
     spots = (
         (np.array([middle[0], low[1], low[2]]), (-14.0, 26.0), "end"),
@@ -146,9 +146,9 @@ def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scal
     Parameters
     ----------
     colatitude_rad, longitude_rad : arrays, shapes (rows,), (columns,)
-        From the pole (0) to the equator (pi/2); full turn, first and last column in the same direction.
+        Colatitude from the pole (0) to the equator (pi/2); longitude over a full turn, so that first and last column coincide.
     values : array, shape (rows, columns)
-        um, outwards positive.
+        Probe error, µm, outwards positive.
     """
     low_value, high_value = extremes(values.ravel())
     relief = 0.22 / (4.0 * scale.step)
@@ -167,7 +167,7 @@ def lobing_plot(colatitude_rad: Array, longitude_rad: Array, values: Array, scal
 
 
 def _reference(svg: Svg, paper: Paper) -> None:
-    """Equator of the ball without error, and the directions of x' and y'."""
+    """Draw the equator of a ball without probe error, and the directions of x' and y'."""
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     svg.polyline([paper(np.array([np.cos(t), np.sin(t), 0.0])) for t in turn], "hidden-edge")
     for end, name, shift in ((np.array([1.3, 0.0, 0.0]), "x′ (θ = 0°)", 16.0), (np.array([0.0, 1.3, 0.0]), "y′ (θ = 90°)", -8.0)):
@@ -182,7 +182,7 @@ def _share(values: Array) -> Array:
 
 
 def _axis(svg: Svg, paper: Paper, axis: tuple[Array, str], name: str) -> None:
-    """Ticks with numbers along the front edges of the floor, and the label."""
+    """Draw ticks with numbers along one front edge of the floor, and the label."""
     values, label = axis
     low, high = float(values[0]), float(values[-1])
     step = nice_step(high - low, 4)

@@ -78,7 +78,7 @@ class SignedScale:
         return [k * self.step for k in range(-HALF + 1, HALF)]
 
     def draw_bar(self, svg: Svg, at: XY, unit: str, cell: float = 40.0) -> None:
-        """The bands with the numbers of their edges; ``at`` is the upper left corner."""
+        """Draw the colour key: the bands with the values at their edges. ``at``: upper left corner; ``cell``: width of a band, pixels."""
         x, y = at
         for band in range(BANDS):
             svg.rect((x + band * cell, y), (cell, 9.0), f"f-d{band + 1}")

@@ -92,7 +92,7 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts
 
 
 def _arrows(svg: Svg, panel: Panel, data: SlicePlane, ends: tuple[Array, Array], top: float, texts: SliceTexts) -> None:
-    """Arrows from the first ends to the second."""
+    """Draw an arrow from each node of the first grid in ``ends`` to its actual position in the second; a circle if not significant."""
     across, up, _ = PLANES[data.plane]
     (grid, actual), unit = ends, texts.error
     for index in np.ndindex(data.significant.shape):

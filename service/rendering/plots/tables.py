@@ -66,7 +66,7 @@ def table_plot(tables: Sequence[TableCurve], *, lsb_um: float | None = None, key
 
 @dataclass(frozen=True, slots=True)
 class CurveChange:
-    """One table of two sets on the grid of the new one, mm. ``u_mm``: standard uncertainty of the new entries."""
+    """One of the nine tables before and after a change, on the grid of the new one. ``u_mm``: standard uncertainty of the new entries."""
 
     moved: str
     corrected: str

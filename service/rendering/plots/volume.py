@@ -96,7 +96,7 @@ def _draw_arrows(svg: Svg, paper: Paper, field: ArrowField, scale: ArrowScale) -
 
 
 def _draw_key(svg: Svg, paper: Paper, scale: ArrowScale) -> None:
-    """Colours of the lengths, and a length in the plane of the paper; arrows at an angle to it are drawn shorter."""
+    """Draw the colours of the lengths, and a reference length in the plane of the paper; arrows at an angle to that plane look shorter."""
     y = HEIGHT - 34.0
     draw_sequence(svg, (24.0, y), 46.0, scale.top_um, "µm")
     bar = nice_step(scale.top_um, 3)

@@ -32,7 +32,7 @@ OCTETS: dict[int | str, dict[str, Any]] = {
 
 
 def add_measured(app: FastAPI, sources: Sources) -> None:
-    """Add the routes."""
+    """Add the routes of machines, campaigns, runs and samples to the application."""
     _add_machines(app, sources)
     _add_runs(app, sources)
     _add_samples(app, sources)
@@ -94,25 +94,25 @@ def _add_samples(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/runs/{number}/samples")
     @needs(Permission.READ)
     def stretch(number: Number, channel: ChannelName = "bar", first: First = 0, limit: Rows = 1000) -> measured.Samples:
-        """A stretch of a channel as it arrived."""
+        """Consecutive samples of one channel, as they arrived."""
         return measured.samples(sources.reader, number, channel, first, limit)
 
     @app.get("/api/v1/runs/{number}/samples.bin", response_class=Response, responses=OCTETS)
     @needs(Permission.READ)
     def packed(number: Number, first: First = 0, limit: Annotated[int, Query(ge=1, le=BINARY_ROWS)] = BINARY_ROWS) -> Response:
-        """A stretch of the ball-bar's samples, packed."""
+        """Consecutive samples of the ball-bar, packed as bytes."""
         data, total = measured.packed_samples(sources.reader, number, first, limit)
         return Response(data, media_type="application/octet-stream", headers={"Abbe-Total": str(total)})
 
     @app.get("/api/v1/runs/{number}/columns")
     @needs(Permission.READ)
     def columns(number: Number, first: First = 0, limit: Rows = 1000) -> measured.RunColumns:
-        """A stretch of the evaluated readings: position, time, deviation."""
+        """Consecutive evaluated readings: position, time, deviation."""
         return measured.columns(sources.reader, number, first, limit)
 
 
 def add_plant(app: FastAPI, sources: Sources) -> None:
-    """Add the routes."""
+    """Add the routes of devices, recipes, timetable and error codes to the application."""
     machine = sources.reader.machine
 
     @app.get("/api/v1/errors")

@@ -1,4 +1,4 @@
-"""A changing request is executed once per Idempotency-Key; a repetition gets the first answer again."""
+"""A request that changes something is executed once per Idempotency-Key; a repetition gets the first answer again."""
 
 from __future__ import annotations
 

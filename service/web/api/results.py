@@ -33,7 +33,7 @@ Motions = Annotated[list[Motion], Query(max_length=21, description="The map show
 
 
 def _no_number(value: object) -> object:
-    """Refuse a number of seconds, which people cannot check."""
+    """Refuse a time given as a number of seconds, which nobody can check by eye."""
     try:
         float(str(value))
     except ValueError:
@@ -46,7 +46,7 @@ After = Annotated[UtcTime | None, Query(description="Only later checks (UTC with
 
 
 def add_results(app: FastAPI, sources: Sources) -> None:
-    """Add the routes."""
+    """Add the routes of solutions, discoveries, checks and trends to the application."""
     _add_solutions(app, sources)
     _add_discoveries(app, sources)
     _add_checks(app, sources)
@@ -84,7 +84,7 @@ def _add_discoveries(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/discoveries/{number}")
     @needs(Permission.READ)
     def discovery(number: Number) -> results.DiscoveryDetail:
-        """A search with its states and its answer."""
+        """A search for missing effects, with its states and its result."""
         return results.discovery(sources.reader, number)
 
 
@@ -149,7 +149,7 @@ WRITTEN: dict[int | str, dict[str, Any]] = {
 
 
 def add_reports(app: FastAPI, sources: Sources) -> None:
-    """Add the route."""
+    """Add the route of the reports to the application."""
     few = asyncio.Semaphore(AT_A_TIME)
 
     @app.get("/api/v1/reports/{kind}/{number}", response_class=Response, responses=WRITTEN)

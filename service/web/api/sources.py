@@ -1,4 +1,4 @@
-"""Sources of the interface, and parameters that many routes share."""
+"""Sources of the data behind `/api/v1`, and parameters that many routes share."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Filter = Annotated[str | None, Query(description="Exact match.")]
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """Sources of the interface.
+    """Sources of the data behind `/api/v1`.
 
     ``devices`` returns the devices with their last state; ``rules``: limits and certificates of the machine file; ``tail``: the latest log
     lines, for the diagnostics.

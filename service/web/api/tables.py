@@ -30,7 +30,7 @@ LONGEST_BODY = 4096
 
 
 def add_tables(app: FastAPI, sources: Sources) -> None:
-    """Add the routes."""
+    """Add the routes of proposals, decisions and the push journal to the application."""
     _add_proposals(app, sources)
     _add_decisions(app, sources)
     _add_pushes(app, sources)
@@ -133,7 +133,7 @@ RESPONSES = ACCEPTED | REFUSALS
 
 
 def add_table_orders(app: FastAPI, core: CoreLine) -> None:
-    """Add the routes."""
+    """Add the routes that order a push or a rollback to the application."""
 
     @app.post("/api/v1/tables/rollback", status_code=202, responses=RESPONSES, response_model=JobState, max_body_size=LONGEST_BODY)
     @needs(Permission.APPROVE)

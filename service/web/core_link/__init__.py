@@ -1,1 +1,1 @@
-"""Connection to the core process: its latest state, and the answer while it is unavailable."""
+"""Connection to the core process: its latest state, requests to it and live samples; also the log tail of the web process."""

@@ -107,7 +107,7 @@ class CoreLine:
 
     @property
     def mqtt_connected(self) -> bool:
-        """Whether the broker is connected."""
+        """Whether the core is connected to the MQTT broker."""
         return self.snapshot().mqtt_connected
 
     @property
@@ -131,7 +131,7 @@ class CoreLine:
 
     @contextmanager
     def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[Snapshot]] | None]:
-        """Subscribe to snapshots; None: too many listeners, in all or of this account. Slow listeners skip to the newest."""
+        """Subscribe to snapshots; yield None if this account or all together have too many listeners. Slow ones skip to the newest."""
         if len(self._listeners) >= MOST_LISTENERS or list(self._listeners.values()).count(who) >= MOST_EACH:
             yield None
             return
@@ -152,17 +152,17 @@ class CoreLine:
     # ---- requests to the core ---------------------------------------------------------------------------------------
 
     async def start(self, recipe: str, key: str, who: str) -> Answer:
-        """Start a job. Raises CoreSilent without an answer: then the outcome is unknown; repeat the request with the same key."""
+        """Start a job. Raises CoreSilent if no answer comes: then the outcome is unknown; repeat the request with the same key."""
         number = next(self._numbers)
         return await self._ask(StartJob("start", number, recipe, key, who))
 
     async def steer(self, job: str, how: Steering, who: str) -> Answer:
-        """Stop, abort, pause or resume a running job. Raises CoreSilent without an answer."""
+        """Stop, abort, pause or resume a running job. Raises CoreSilent if no answer comes."""
         number = next(self._numbers)
         return await self._ask(SteerJob("steer", number, job, how, who))
 
     async def confirm_prompt(self, job: str, prompt: int, who: str) -> Answer:
-        """Confirm that one prompt of a job is done. Raises CoreSilent without an answer."""
+        """Confirm that a person has done what a prompt of a job asks. Raises CoreSilent if no answer comes."""
         return await self._ask(ConfirmPrompt("hand", next(self._numbers), job, prompt, who))
 
     async def roll_back(self, push: int, crc: int, reason: str, key: str, who: str) -> Answer:

@@ -73,8 +73,8 @@ class SampleBoard:
 
     @contextmanager
     def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[str | bytes]] | None]:
-        """Subscribe to the kept frames and all later ones: text (a path as JSON) and binary frames; None: too many listeners, in all or of
-        this account.
+        """Subscribe to the kept and all later frames: text (a path as JSON) and binary; yield None if this account or all together have too
+        many listeners.
         """
         if len(self._listeners) >= MOST_LISTENERS or list(self._listeners.values()).count(who) >= MOST_EACH:
             yield None

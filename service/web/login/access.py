@@ -16,7 +16,7 @@ MUTATING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 class Open(Enum):
-    """Marks routes that need no permission: login, pictures and style, and the two health checks."""
+    """Marks routes that need no permission: login, pictures and style sheet, and the two health checks."""
 
     PUBLIC = "public"
 
@@ -30,7 +30,7 @@ MOUNTS: dict[str, Need] = {"/static": PUBLIC}
 
 
 def needs(need: Need) -> Callable[[F], F]:
-    """Declare the permission of a route; the decorator stands directly above its function."""
+    """Declare the permission of a route; put this decorator directly above the route's function."""
 
     def declare(endpoint: F) -> F:
         setattr(endpoint, MARK, need)

@@ -104,7 +104,7 @@ class AuthMiddleware:
         return None
 
     def _foreign(self, request: HTTPConnection, visit: Visit, need: Need, *, changes: bool) -> Response | None:
-        """Refusal of a request from another site's page. Browsers always send an origin; a program with a token has no cookie to misuse."""
+        """Refuse a request from another site's page. Browsers always send an origin; a program with a token has no cookie to misuse."""
         origin = request.headers.get("origin")
         by_token = visit.principal.by == "token"
         if not (origin is None and by_token) and not is_ours(request, origin, behind_tls=self._behind_tls):
@@ -158,7 +158,7 @@ class _Log:
     unrecorded: bool = False
 
     async def answered(self, status: int) -> None:
-        """Record the status of the answer. Refusals are rate-limited per address; possible changes are always recorded."""
+        """Record the status of the answer. Per address few refusals are recorded (429: none); possible changes are always recorded."""
         if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.auth.recorded_refusals.take(self.visit.address)):
             return
         kind = "replayed" if self.visit.replayed else "done" if status < 400 else "refused" if status < 500 or self.refused else "failed"

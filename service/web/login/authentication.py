@@ -41,7 +41,7 @@ DEFAULT_ENDPOINT = Endpoint()
 class Authenticator:
     """Users, lockout, rate limits and audit of one service.
 
-    ``now_s``: monotonic seconds; ``rate_hz``, ``burst``: requests of one address per second, and at once.
+    ``now_s``: monotonic seconds; ``rate_hz``, ``burst``: allowed requests of one address, per second and at once.
     """
 
     def __init__(

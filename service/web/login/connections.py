@@ -71,12 +71,12 @@ class TimeLimitedProtocol(H11Protocol):
             self._wait_for(h11.SEND_BODY, LINGER_S)
 
     def pause_writing(self) -> None:
-        """Start the limit for a client that stopped reading."""
+        """Start the time limit for a client that stopped reading."""
         super().pause_writing()
         self._watch_reader(stopped=True)
 
     def resume_writing(self) -> None:
-        """End the limit: the client reads again."""
+        """End that time limit: the client reads again."""
         super().resume_writing()
         self._watch_reader(stopped=False)
 
@@ -99,7 +99,7 @@ class TimeLimitedProtocol(H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def _watch(self) -> None:
-        """Start the limit for the client's next step; partial data does not extend it."""
+        """Start the time limit for the client's next step; partial data does not extend it."""
         if self._upgraded:
             return
         state = self.conn.their_state

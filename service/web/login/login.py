@@ -118,7 +118,7 @@ def _login_origin(auth: Authenticator, request: Request, name: str) -> LoginOrig
 
 
 def _set_cookie(auth: Authenticator, request: Request, answer: Response, secret: str) -> None:
-    """Set a cookie that ends with the browser; the server alone limits the session."""
+    """Set a cookie that the browser drops when it is closed; only the server limits how long the session lasts."""
     tls = is_tls(request, behind_tls=auth.behind_tls)
     age = None if secret else 0
     answer.set_cookie(auth.cookie(tls=tls), secret, max_age=age, path="/", httponly=True, samesite="strict", secure=tls)

@@ -102,7 +102,7 @@ def _source(b: BudgetLineValue) -> SourceLine:
 
 
 def _worst(worst: WorstPoint) -> list[IntervalLine]:
-    """Components of the deviation with the stored 95 % interval (k from its degrees of freedom)."""
+    """Components of the deviation at the worst point, with the stored 95 % interval (k from the degrees of freedom)."""
     rows = zip(("dX", "dY", "dZ"), worst.deviation_um, worst.expanded_um, strict=True)
     return [_interval(name, value, expanded, "µm") for name, value, expanded in rows]
 

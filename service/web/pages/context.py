@@ -55,7 +55,7 @@ class PageContext:
 
 
 def can_be_stored(text: str) -> str:
-    """Validate a text of a query. Raises ValueError if a database cannot store it, since then no object has this name."""
+    """Return a text of a query unchanged. Raises ValueError if a database cannot store it, since then no object has this name."""
     if not storable(text):
         raise ValueError("the name has characters that cannot be stored")
     return text

@@ -38,14 +38,14 @@ _BARE = re.compile(rf"""(?i)({_BEFORE})(?!\*\*\*)\S+""")
 
 
 def blanked(text: str) -> str:
-    """A text without possible secrets: passwords in URLs, values after names of secrets, login headers, private keys."""
+    """A text with possible secrets hidden: passwords in URLs, values after names of secrets, login headers, private keys."""
     text = _URL.sub(rf"\1:{HIDDEN}", mask_secrets(_PEM.sub(HIDDEN, text)))
     text = _SCHEME.sub(rf"\g<1>{HIDDEN}", _HEADER.sub(rf"\g<1>{HIDDEN}", text))
     return _BARE.sub(rf"\g<1>{HIDDEN}", _QUOTED.sub(rf"\g<1>{HIDDEN}", text))
 
 
 def blanked_doc(value: Any) -> Any:
-    """A document without possible secrets: each text is blanked before escaping, and everything under the name of a secret."""
+    """A document with possible secrets hidden: in every text (before JSON escapes it), and everything under the name of a secret."""
     if isinstance(value, Mapping):
         return {blanked(str(key)): HIDDEN if _is_secret(str(key), one) else blanked_doc(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -56,7 +56,7 @@ def blanked_doc(value: Any) -> Any:
 
 
 def blanked_line(line: str) -> str:
-    """A log line without possible secrets: by its parts if it is JSON, else as text."""
+    """A log line with possible secrets hidden: in its parts if it is JSON, else in the whole text."""
     try:
         parsed = json.loads(line)
     except ValueError:
@@ -124,7 +124,7 @@ def megabytes(size_b: float) -> str:
 
 
 def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
-    """The parts of the machine file that this process knows; they have no keys or passwords, except in URLs."""
+    """The parts of the machine file that this process knows; they contain no keys or passwords, except in URLs."""
     return {
         "machine": sources.reader.machine,
         "database": sources.reader.store.url,

@@ -1,4 +1,4 @@
-"""The screens of a measurement: a new one (recipe, dry run, checklist, start; only the start moves the machine), and the running one."""
+"""Two screens: a new measurement (recipe, dry run, checklist, start; only the start moves the machine), and the running measurement."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Rate = Annotated[int, Query(ge=1, le=1000)]
 
 
 def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
-    """Add the screen to the application."""
+    """Add the screen of a new measurement to the application. ``plans``: recipes that can be rehearsed."""
 
     @app.get("/new", include_in_schema=False)
     @needs(Permission.READ)
@@ -68,7 +68,7 @@ SCRIPT_KEYS = (
 
 
 def add_live_page(app: FastAPI, context: PageContext, jobs: Callable[[], Sequence[JobState]] = tuple) -> None:
-    """Add the screen to the application. ``jobs``: jobs since the start of the service, newest first, for the outcome of the last one."""
+    """Add the screen of the running measurement. ``jobs``: jobs since the start of the service, newest first; it shows the last outcome."""
 
     @app.get("/live", include_in_schema=False)
     @needs(Permission.READ)

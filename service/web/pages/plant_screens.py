@@ -52,7 +52,7 @@ class FleetLine:
 
     @property
     def share(self) -> float | None:
-        """The worst figure divided by its limit; None without one."""
+        """The worst figure divided by its limit; None if no figure has a limit."""
         one = self.worst
         return None if one is None or not one.limit else one.value / one.limit
 
@@ -156,7 +156,7 @@ class DeviceLine:
 
 @dataclass(frozen=True, slots=True)
 class DeviceScreen:
-    """Devices and the incidents of their connections, from ``campaigns`` campaigns."""
+    """Devices, and the incidents of their connections in the latest campaigns; ``campaigns``: number of those."""
 
     lines: Sequence[DeviceLine]
     incidents: Sequence[Trouble]
@@ -199,7 +199,7 @@ BUNDLE_ACTION = "support bundle"
 
 
 def add_plant_screens(app: FastAPI, context: PageContext, sources: Sources) -> None:
-    """Add the screens."""
+    """Add the screens of machines, devices, settings and diagnostics to the application."""
     _add_fleet(app, context, sources)
     _add_devices(app, context, sources)
     _add_settings(app, context, sources)

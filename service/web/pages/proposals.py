@@ -27,7 +27,7 @@ SIGNS = {"kept": "ok", "approved": "ok", "pushed": "ok", "refused": "bad", "roll
 
 @dataclass(frozen=True, slots=True)
 class ProposalScreen:
-    """One proposal with its changes. ``facts``: key of the catalogue and value; ``rows``: cells under ``headings``."""
+    """One proposal with its changes. ``facts``: pairs of text key and value; ``rows``: cells under ``headings``."""
 
     found: ProposalDetail
     facts: Sequence[tuple[str, str]]
@@ -104,12 +104,12 @@ OUTCOMES = ("kept", "rolled back", "refused", "failed", "stopped", "open", "inte
 
 
 def outcome_texts(group: str) -> dict[str, str]:
-    """Texts of the outcomes in the reader's language, from a group of the catalogue."""
+    """Texts of the outcomes in the reader's language; ``group``: their group in the catalogue of texts."""
     return {outcome: current().state(group, outcome) for outcome in OUTCOMES}
 
 
 def add_table_screen(app: FastAPI, context: PageContext) -> None:
-    """Add the screen to the application."""
+    """Add the screen of the table in force and its history to the application."""
 
     @app.get("/table", include_in_schema=False)
     @needs(Permission.READ)

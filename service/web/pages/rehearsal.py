@@ -76,7 +76,7 @@ class Rehearsals:
     rules: RulesSummary | None = None
 
     def choices(self) -> tuple[str, ...]:
-        """Names without rates: startable recipes first, then the full campaign.
+        """Names that can be rehearsed, without sampling rates: startable recipes first, then the full campaign.
 
         Campaigns of recipe files are left out: only programs can start them, and the command line shows their dry runs.
         """
@@ -84,7 +84,7 @@ class Rehearsals:
         return tuple(dict.fromkeys([*named, *((CAMPAIGN,) if self.machine is not None else ())]))
 
     def run(self, recipe: str, rate_hz: int, unit: Unit = MM) -> Rehearsed | None:
-        """Dry run of a recipe at a rate of the ball-bar, with a picture in ``unit``; None for an unknown machine or recipe."""
+        """Dry run of a recipe at a sampling rate of the ball-bar, with a picture in ``unit``; None for an unknown machine or recipe."""
         given = self.machine
         if given is None or recipe not in self.choices() or (recipe not in RECIPES and recipe != CAMPAIGN):
             return None

@@ -26,7 +26,7 @@ Plane = Literal["XY", "XZ", "YZ"]
 
 
 def add_result_pages(app: FastAPI, context: PageContext) -> None:
-    """Add the screens to the application."""
+    """Add the screens of volume map, what-if, budget and comparison of runs to the application."""
     _add_volume(app, context)
     _add_whatif(app, context)
     _add_budget(app, context)

@@ -86,7 +86,7 @@ def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], ma
 
 
 def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, float]:
-    """Rms of a linear combination, and its standard uncertainty."""
+    """Rms of a motion's effect over the nodes, and its standard uncertainty; an upper bound of it if the rms is not significant."""
     values, vectors = np.linalg.eigh(mean_square)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     vector, spread = root @ coefficients, root @ covariance @ root.T

@@ -33,7 +33,7 @@ _DARK = re.compile(r"@media screen and \(prefers-color-scheme:dark\)\{:root\{([^
 
 
 def themed(rules: str) -> str:
-    """CSS rules of `abbe.service.rendering.palette.style_rules` for figures of a page whose ``html`` has the chosen theme."""
+    """Adapt `abbe.service.rendering.palette.style_rules` to pages with a choice of theme: ``data-theme`` of ``html`` sets the colours."""
     found = _DARK.search(rules)
     if found is None:
         raise ValueError("the palette lacks the expected dark colours")
@@ -53,7 +53,7 @@ PLOT_STYLE = themed(style_rules())
 
 
 def add_pages(app: FastAPI, context: PageContext) -> None:
-    """Add the screens to the application."""
+    """Add the screens of runs, results, proposals, trends, timetable and audit to the application."""
 
     @app.get("/plots.css", include_in_schema=False)
     @needs(Permission.READ)

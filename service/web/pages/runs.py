@@ -110,7 +110,7 @@ Translate = Callable[..., str]
 
 @dataclass(frozen=True, slots=True)
 class ComparedLine:
-    """A figure in the reader's unit: value and U of each run, difference of last and first; ``differs``: yes, no, cannot tell."""
+    """A figure in the reader's unit: value and U of each run, last minus first; ``differs``: yes, no, cannot tell."""
 
     symbol: str
     name: str

@@ -56,7 +56,7 @@ class ForecastLine:
 
 @dataclass(frozen=True, slots=True)
 class WhatIfScreen:
-    """Selection and forecast. ``means``: linear errors over the volume; ``trouble``: why there is no forecast."""
+    """Selection and forecast. ``means``: mean linear errors over the volume; ``trouble``: why there is no forecast."""
 
     number: int
     campaign: str
@@ -97,7 +97,7 @@ def whatif_screen(store: Store, record: SolutionRecord, take: Sequence[str], eve
 
 
 def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = False) -> list[Forecast]:
-    """Figures of the volume and of the builtin check, before and after."""
+    """Figures of the volume and of the builtin check, before and after the errors in ``take`` (or all) are corrected."""
     known = stored.known
     centre, radius = hemisphere(known.machine, CHECK_PLACE, CHECK_SHARE)
     linear = {name: stored.means[name][0] for name in (t.removeprefix(MEAN) for t in take if t.startswith(MEAN))}
@@ -107,7 +107,7 @@ def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = Fal
 
 
 def _means(stored: StoredField, take: Sequence[str], translate: Translate) -> list[EffectChoice]:
-    """Linear errors over the volume with their values, which runs show even if they cannot separate the motions.
+    """Mean linear errors over the volume with their values; runs show them even if they cannot separate the motions.
 
     µm/m is a ratio with the same value in µin/in, so it is not converted.
     """
