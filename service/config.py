@@ -77,7 +77,7 @@ def load_machine(path: Path | str) -> LoadedMachine:
 
 
 def _check_exclusive(path: Path, values: Mapping[str, Any]) -> None:
-    """Refuse an entry that mixes the keys of its two forms, even where a value equals its default: nobody can know which was meant."""
+    """Refuse a list entry with keys of both its forms, even if a value equals its default: nobody can know which form was meant."""
     for name, (one, other) in EXCLUSIVE_KEYS.items():
         for number, entry in enumerate(values.get(name, ()), start=1):
             found, more = [key for key in one if key in entry], [key for key in other if key in entry]

@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 PIECE = 1 << 20
-"""Bytes read at once: reading the limit at once would allocate a buffer of that size for the smallest file."""
+"""Bytes per read: a single read of the whole limit would allocate that much memory even for the smallest file."""
 _KINDS = (
     (stat.S_ISFIFO, "a pipe"),
     (stat.S_ISCHR, "a device"),

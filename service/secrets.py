@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 _PASSWORD = re.compile(r"(?<=://)([^:/@\s]*):[^/\s]+(?=@)")
-"""Up to the last @ before the path: a password may contain one that is not escaped."""
+"""User and password in a URL, up to the last @ before the path: a password may contain an @ that is not escaped."""
 _OBEYED = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 """Control characters (escape sequences begin with one), marks that change the writing direction, and lone surrogates."""
 

@@ -61,9 +61,9 @@ log = structlog.get_logger("abbe.serve")
 JOURNAL_S = 0.25
 """Longest time to read the push journal before a forced end, s."""
 OpenPushReader = Callable[[], str]
-"""Return the open push as a sentence; empty: none."""
+"""Returns a sentence about the push that is still open; empty: none is."""
 STOP_S = 4.5
-"""Time after the stop signal, s, at which the process is cut off: it must end within 5 s. The store survives that."""
+"""Time from the stop signal until the process is ended by force, s: it must end within 5 s. The store survives that."""
 LEAVE_S = 0.3
 """Longest wait, s, for a thread that still computes after everything has closed."""
 WORK_END_S = 2.5

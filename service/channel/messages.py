@@ -152,7 +152,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """The web process accepts connections."""
+    """Report that the web process accepts connections."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["up"]
@@ -161,7 +161,7 @@ class Serving:
 
 @dataclass(frozen=True, slots=True)
 class WebHeartbeat:
-    """The event loop of the web process runs."""
+    """Sign of life: the event loop of the web process is running."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["alive"]
@@ -280,7 +280,7 @@ def _checked(adapter: TypeAdapter[T], body: bytes) -> T:
 
 _LENGTH = struct.Struct(">I")
 FULL_B = 2 * LARGEST_B
-"""Bytes that may wait for the reader. Beyond them the sender skips updates, since newer ones follow."""
+"""Largest number of bytes that may wait for the reader; beyond it the sender skips updates, since newer ones follow."""
 
 
 class Wire:

@@ -12,14 +12,14 @@ from collections.abc import Sequence
 
 BAD_INPUT = 2
 UNWRITTEN = frozenset((errno.EPIPE, errno.EBADF, errno.ENOSPC, errno.EFBIG, errno.EDQUOT))
-"""Errors of writing to stdout: reader gone, closed, disk full, and so on."""
+"""``errno`` values of a failed write to stdout: reader gone, stdout closed, disk full, and so on."""
 INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its code: 0 done, 1 negative answer, 2 bad input or a fault, 130 Ctrl-C.
 
-    ``arguments``: replaces the command line's, for tests.
+    ``arguments``: used instead of those of the command line, by tests.
     """
     # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; every error of service, device or command line becomes one line on stderr.
 
-    ``arguments``: replaces the command line's.
+    ``arguments``: used instead of those of the command line.
     """
     import typer
 
@@ -68,7 +68,7 @@ class _Closed(io.TextIOBase):
     """Replaces a stdout that was closed before the program began (``>&-``): writing to it raises."""
 
     def write(self, text: str, /) -> int:
-        """Refuse."""
+        """Raise OSError: stdout is closed."""
         raise OSError(errno.EBADF, "it is closed")
 
 
@@ -129,7 +129,7 @@ PLAIN = {
 
 
 def _degrade() -> None:
-    """Make stdout and stderr replace characters that their encoding lacks by plain letters, or by ``?``."""
+    """Make stdout and stderr write a plain substitute, or ``?``, for each character that their encoding lacks."""
     codecs.register_error(PLAIN_ERRORS, _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

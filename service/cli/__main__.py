@@ -1,4 +1,4 @@
-"""``abbe`` as a module, for child processes."""
+"""Run the command ``abbe`` as ``python -m abbe.service.cli``, as child processes do."""
 
 from abbe.service.cli import main
 

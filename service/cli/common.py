@@ -96,7 +96,7 @@ def reader(store: Store, machine: str = "", control: str = "") -> Reader:
 
 
 def warn_of_readers(url: str) -> None:
-    """Warn on stderr if others than its owner may read a database file: it contains password hashes."""
+    """Warn on stderr if anyone but its owner may read a database file, which contains password hashes."""
     from abbe.service.storage.engine import database_readable_by_others
 
     if (warning := database_readable_by_others(url)) and sys.stderr is not None:

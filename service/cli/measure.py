@@ -121,9 +121,9 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
 
 
 def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
-    """Refuse a plan that the machine file lacks devices for; warn of an expired certificate and of a timetable that cannot be kept.
+    """Warn of an expired certificate and of a timetable that cannot be kept; refuse a plan whose devices are not in the machine file.
 
-    If a controller is configured, `abbe.service.campaigns.measure` refuses such a plan, after an interrupted push was rolled back.
+    With a controller, `abbe.service.campaigns.measure` refuses such a measurement instead, after rolling back an interrupted push.
     """
     from abbe.service.campaigns.plausibility import certificates, check_configured, needed_by, unattended
     from abbe.service.clock import SystemClock
@@ -138,7 +138,7 @@ def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleOptions:
-    """Statements of the person at the console: resume a campaign, nothing was touched, the unknown table in force is right."""
+    """What the person stated by options: ``resume`` a campaign; the set-up is ``untouched``; the unknown table in force is right."""
 
     resume: bool
     untouched: bool
@@ -230,7 +230,7 @@ def correct(
 
 
 async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[Run]:
-    """Return the runs of a verification with the present table: of a campaign in the store, or measured now if none is named."""
+    """Return the runs of a verification with the present table: those of the named campaign, or, without a name, runs measured now."""
     from abbe.service.campaigns.measure import measure as work_measure
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposals import load_runs
@@ -266,9 +266,9 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
 
 
 def warn_of_open_push(url: str, site: Site) -> None:
-    """Warn on stderr of unfinished pushes, as the push journals show them: nothing connects to the control.
+    """Warn on stderr of unfinished pushes, which the push journals show: nothing connects to the control.
 
-    Pushes into this control count, and pushes into another address that may be the same control (`open_pushes`).
+    This includes pushes into another address that may be the same control (`open_pushes`).
     """
     from abbe.service.cli.common import open_store
     from abbe.service.errors import StoreError
@@ -322,7 +322,7 @@ HAIR = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What to do instead of measuring: a dry run, with every position or a picture, or an NC program in a dialect."""
+    """What to do instead of measuring: a dry run, optionally with all positions or a picture, or an NC program in the dialect ``nc``."""
 
     dry_run: bool
     path: bool
@@ -336,7 +336,7 @@ class Rehearsal:
         Raises
         ------
         ConfigError
-            Options that do not go together, or an output file that would overwrite an input.
+            Two options do not go together, or an output file would overwrite an input.
         """
         from abbe.service.errors import ConfigError
         from abbe.service.rendering.document_page import form_of

@@ -56,7 +56,7 @@ def plan(
 
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
-    """Refuse, before half a minute of planning, a target that cannot be written, is an input of this command, or is used twice."""
+    """Refuse an output file that cannot be written, is also an input, or is named twice; call it before the half minute of planning."""
     from abbe.service.errors import ConfigError
 
     taken = [p.resolve() for p in sources if p is not None]

@@ -27,7 +27,7 @@ WIDTH = 120
 
 HEADINGS = ("where", "quantity", "printed", "computed", "off by", "within", "status", "note")
 DROPPED = (("within", 112), ("off by", 100), ("note", 76), ("where", 72))
-"""Columns to drop first, each with the width below which it is dropped: a status must stay in one piece."""
+"""Columns that a narrow table lacks, each with the width below which it is dropped: a status must stay in one piece."""
 
 NAME = 12
 """Minimum width of the column of names, the only one that may wrap."""
@@ -37,7 +37,7 @@ PARTS: dict[Source, tuple[str, str]] = {
     "math.md": ("Stated by math.md, the specification of Abbe's formulas", "numbers of math.md"),
     "own check": ("Own checks: numbers that are put in must come back", "own checks (no printed numbers)"),
 }
-"""For each source, the title of its table (empty: the paper's title) and the name of its entries in the counts."""
+"""For each source of numbers, the title of its table (empty: the paper's title) and what the counts call its numbers."""
 
 LEGEND = (
     "reproduced: computed from independent inputs, and equal to the last printed digit; consistent: off by no more than rounded inputs"
@@ -46,7 +46,7 @@ LEGEND = (
 
 
 class PaperName(StrEnum):
-    """The four papers."""
+    """Names of the four papers, as ``--paper`` takes them."""
 
     pahk = "pahk"
     kwon = "kwon"
@@ -194,7 +194,7 @@ def _vector_notes(c: Checks) -> list[str]:
 
 
 def _vector_verdict(checked: list[Checks], missing: list[str]) -> str:
-    """Return the verdict: how much was there, how much of that was computed, and whether it holds."""
+    """Return one line: how many files were usable, how many of their numbers were compared, and whether all agree."""
     from abbe.service.reference.vector_results import READERS
 
     bad = sum(1 for c in checked if c.error)

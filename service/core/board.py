@@ -52,7 +52,7 @@ class Board:
             self.job = replace(self.job, **{field.name: getattr(progress, field.name) for field in fields(Progress)})
 
     def job_ended(self, doc: Doc | None) -> None:
-        """Note how the check ended. A check that was stopped or failed proves nothing about devices other than the one that caused it."""
+        """Note how the check ended. A stopped or failed check changes the state of no device but the one that caused its end."""
         self.changes += 1
         self.job = None
         cause = doc["cause"] if doc is not None else None
@@ -68,7 +68,7 @@ class Board:
         return replace(device, state="fault", at_utc=self._clock.utc(), text=cause["what"])
 
     def changed(self) -> None:
-        """Note another change, such as in what needs a person."""
+        """Note any other change, such as a new text for a person."""
         self.changes += 1
 
     def broker(self, connected: bool) -> None:
@@ -87,23 +87,23 @@ LOOK_S = 5.0
 
 
 class BoardWatch:
-    """Updates the board, and reports the change."""
+    """Passes the events of checks on to the board, and calls ``changed``."""
 
     def __init__(self, board: Board, changed: Callable[[], None]) -> None:
         self._board, self._changed = board, changed
 
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
-        """A check begins."""
+        """Tell the board that a check begins."""
         self._board.job_started(schedule, at_utc)
         self._changed()
 
     def job_progress(self, progress: Progress) -> None:
-        """The check got further."""
+        """Tell the board how far the check is."""
         self._board.job_progress(progress)
         self._changed()
 
     def job_ended(self, doc: Doc | None) -> None:
-        """The check ended."""
+        """Tell the board how the check ended."""
         self._board.job_ended(doc)
         self._changed()
 
@@ -116,14 +116,14 @@ class StatePublisher:
         self._clock = clock
 
     def job_started(self, schedule: Schedule, at_utc: datetime) -> None:
-        """A check begins."""
+        """Publish that the machine is being measured."""
         self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
 
     def job_progress(self, progress: Progress) -> None:
         """Do nothing: the state is retained, so every change is a write in the broker. Progress is for the page."""
 
     def job_ended(self, doc: Doc | None) -> None:
-        """The check ended."""
+        """Publish that the service is online and idle."""
         self._publisher.set_state("online", self._clock.utc())
 
 
@@ -151,7 +151,7 @@ class VerifiedWatch:
 
 
 AGAIN = timedelta(minutes=1)
-"""Shortest time between two evaluations of the timetable, unless a slot has come due."""
+"""Time after which the timetable is evaluated again; sooner only if a slot has come due."""
 
 
 class SnapshotSource:

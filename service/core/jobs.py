@@ -90,7 +90,7 @@ class _Entry:
 
 
 class JobRegistry:
-    """Runs jobs, and keeps the latest `MOST_JOBS` of them by number.
+    """Runs jobs, and remembers the latest `MOST_JOBS` of them by number.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class JobRegistry:
         self._keys: OrderedDict[tuple[str, str], tuple[str, str]] = OrderedDict()
         self._now: _Entry | None = None
         self.claim: MachineClaim | None = None
-        """The claim on the machine for jobs by hand; None: no jobs are taken (``--once``, or not yet started)."""
+        """Claim on the machine for jobs that people start; None: no such jobs are accepted (``--once``, or not yet started)."""
         self.full = FullCampaigns()
         """The full campaigns; by default there are none."""
         self._tasks: asyncio.TaskGroup | None = None

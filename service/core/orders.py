@@ -41,9 +41,9 @@ ROLLBACK: Final = "rollback"
 PUSH: Final = "push"
 NO_PAUSE = "a table is being changed: stop the rollback, or let it finish"
 OrderedRollback = Callable[[RollbackOrder], Awaitable[JobOutcome]]
-"""``await rollback(order)``: restores the previous table; returns the outcome as far as it learned it."""
+"""``await rollback(order)``: restores the previous table; returns the outcome as far as it is known."""
 Push = Callable[[PushOrder], Awaitable[JobOutcome]]
-"""``await push(order)``: pushes the approved proposal; returns the outcome as far as it learned it."""
+"""``await push(order)``: pushes the approved proposal; returns the outcome as far as it is known."""
 BY_ITSELF = "this service pushes approved proposals by itself ([alarm] push), or has no controller"
 
 
@@ -63,7 +63,7 @@ MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
 
 @dataclass(frozen=True, slots=True)
 class OrderActions:
-    """The possible orders: a rollback, a push of an approved proposal. None: not possible here."""
+    """What carries out the orders: a rollback, a push of an approved proposal; None: this order is not possible here."""
 
     ordered_rollback: OrderedRollback | None = None
     push: Push | None = None
@@ -127,12 +127,12 @@ class _OrderJob(Job[JobOutcome]):
 
 
 Look = Callable[[], JobOutcome | None]
-"""Return the state of an order's push by the journal; None: nothing was written."""
+"""Returns the outcome of an order as the push journal shows it; None: the order wrote nothing."""
 RetryingLook = Callable[[Look], Awaitable[JobOutcome | None]]
 
 
 class _TableOrderJob(_OrderJob):
-    """An order for the tables; its outcome is read from the push journal. ``retrying``: reads until the database answers."""
+    """An order for the tables; its outcome is read from the push journal. ``retrying(look)``: looks until the database answers."""
 
     def __init__(self, kind: JobKind, recipe: str, trail: _AuditTrail, act: Action, look: Look, retrying: RetryingLook) -> None:
         super().__init__(kind, recipe, trail, act)
@@ -301,5 +301,5 @@ def person(who: str) -> str:
 
 
 def may_measure(store: Store, who: str) -> bool:
-    """Return whether a user may measure, as `may`."""
+    """Return whether a user has the right to measure; ``who`` as in `may`."""
     return may(store, who, Permission.MEASURE)

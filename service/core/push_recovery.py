@@ -37,7 +37,7 @@ Recover = Callable[[], Awaitable[str | None]]
 
 
 IsOpen = Callable[[], Awaitable[bool]]
-"""Return whether the machine's last push is open by its journal: also one under way now, or one that needs a person."""
+"""Returns whether the machine's last push is open by its journal, which includes a push under way and one that needs a person."""
 
 
 class PushRecovery:
@@ -46,7 +46,7 @@ class PushRecovery:
     Parameters
     ----------
     recover : callable
-        One try.
+        ``await recover()`` makes one try.
     is_open : callable
         Whether a push is open; called again and again once everything was closed.
     claim : MachineClaim

@@ -34,7 +34,7 @@ class ServiceSetup:
     doc : dict
         The machine object that the store keeps.
     devices : mapping of str to str
-        Role and URL.
+        URL of each device by its role.
     schedules : tuple of Schedule
         The timetable.
     store_url : str
@@ -44,7 +44,7 @@ class ServiceSetup:
     topics : Topics
         Topics of the published messages.
     web : Web
-        The machine file's section, with absolute paths of its files.
+        The section ``[web]`` of the machine file, with absolute paths.
     check : callable
         Given the store, returns ``check(recipe, progress, control)``.
     maintenance : tuple of Window
@@ -52,11 +52,11 @@ class ServiceSetup:
     ready : callable
         Given the clock, returns the check of preconditions.
     opcua : OpcUa or None
-        The OPC UA server's section, checked.
+        The section ``[opcua]`` of the machine file, checked.
     recipes : tuple of str
         Recipes that a person may start at any time, besides those of the timetable.
     recover : callable, optional
-        Given the store, returns the recovery of what an earlier end left open.
+        Given the store, returns the recovery of what an earlier process left open.
     rules : Rules
         Limits, certificates and temperatures that reports add to the data.
     duties : callable, optional

@@ -44,7 +44,7 @@ from abbe.service.domain.progress import RecordedPath
 from abbe.service.errors import AbbeError, ChannelBroken
 
 FRAME_S = 0.05
-"""Time between two messages, s: 20 Hz, about 50 samples each at 1 kHz."""
+"""Time between two messages with samples, s: 20 messages a second, each with about 50 samples at 1 kHz."""
 NO_PATH = LivePath("path", RecordedPath())
 
 
@@ -97,7 +97,7 @@ OOM_SCORE_ADJ = 900
 
 
 def limit_memory(pid: int, memory_mb: int) -> None:
-    """Limit the memory that a child process can allocate.
+    """Limit the memory that a child process can allocate, and have the kernel kill the child before the core if memory runs out.
 
     ``memory_mb``: writable private memory, MiB; beyond it allocations fail.
     """
@@ -118,9 +118,9 @@ log = structlog.get_logger("abbe.web")
 PERIOD_S, SHORTEST_S = 1.0, 0.2
 """Longest and shortest time between two messages to the page, s."""
 PAUSE_S, LONGEST_PAUSE_S, GOOD_LIFE_S = 0.1, 30.0, 30.0
-"""First and longest pause before a restart, which doubles each time; lifetime of a process after which it is the first again, s."""
+"""First and longest pause before a restart, s: it doubles with each restart, and begins anew after a process has lived this long, s."""
 START_S, HANG_S = 60.0, 20.0
-"""Longest time until the process serves, and longest silence, s; then the core ends it."""
+"""Longest time until a web process serves, and its longest silence afterwards, s; beyond these the core ends it."""
 GOODBYE_S = 1.2
 PASSED_ON = frozenset({"ABBE_AUDIT_FOLDER"})
 WITHHELD = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"})
@@ -231,7 +231,7 @@ class WebProcess:
         return child
 
     async def _end(self, child: asyncio.subprocess.Process) -> None:
-        """Wait for the process to end, since its channel has closed; kill it after `GOODBYE_S`: nothing in it can be lost."""
+        """Wait for the process to end, since its channel has closed; kill it after `GOODBYE_S`, since nothing in it can be lost."""
         if self._up:
             with suppress(TimeoutError):
                 async with asyncio.timeout(GOODBYE_S):

@@ -40,13 +40,13 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 MOST = 5000
-"""Number of ball-bar readings in the search: one every 2 to 6 mm of path, which takes a quarter of the time for all readings."""
+"""Number of ball-bar readings in the search: one every 2 to 6 mm of path. All readings would take four times as long."""
 CAMPAIGN, ANEW = "discover", "anew"
 
 
 @dataclass
 class HiddenDemo:
-    """Results of the demonstration, in the order of the job.
+    """Results of the demonstration, in the order in which they arise.
 
     ``refused``: why a table was not written; ``truth``: the simulator's sealed truth, read at the end.
     """
@@ -103,7 +103,7 @@ async def run_hidden_demo(
 
 
 def few(runs: list[Run]) -> list[Run]:
-    """Thin the runs to about `MOST` ball-bar readings."""
+    """Thin the runs to about `MOST` ball-bar readings in all."""
     return picked(runs, MOST)
 
 
@@ -150,7 +150,7 @@ FORMAT = "abbe-hidden-demo/1"
 
 
 def summary_lines(result: HiddenDemo) -> list[str]:
-    """Return the results line by line, in the order of the job."""
+    """Return the results line by line, in the order in which they arose."""
     finding = result.finding
     _, word, text = verdict_of(finding)
     lines = [f"measured: {len(finding.runs)} runs, {sum(r.readings for r in finding.runs.values())} readings"]

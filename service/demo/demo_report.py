@@ -41,7 +41,7 @@ TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
 
 
 def demo_json(result: DemoResult) -> dict[str, Any]:
-    """Return the JSON output of `abbe demo --json`: sealed-truth figures, the bound of nine tables, measured figures with uncertainty."""
+    """Return the JSON output of `abbe demo --json`: figures of the sealed truth, the best that nine tables can do, measured figures."""
     before, after = result.truth_before, result.truth_after
     out: dict[str, Any] = {"format": "abbe-demo/1", "seed": result.seed, "speed": result.speed}
     out |= {key: {"before": before[key], "after": after[key]} for key in TRUTH_KEYS}

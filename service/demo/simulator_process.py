@@ -94,7 +94,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
-    """Read the true errors of the simulated machine, without or with a table (``bank``). For demonstrations only.
+    """Read the true errors of the simulated machine, corrected by the table in the file ``bank`` if given. For demonstrations only.
 
     Raises
     ------

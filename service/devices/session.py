@@ -31,11 +31,11 @@ from abbe.service.domain.machine import address_of
 from abbe.service.errors import AbbeError, ConfigError, DevicesNotReady, MachineInUse, UnsafeToMove
 
 ENVIRONMENT = "ABBE_LOCK_FOLDER"
-"""Environment variable with another folder, for computers or containers where the default ones do not work."""
+"""Environment variable that names another folder for the locks, where the default ones do not work (containers)."""
 INSTALLED = Path("/run/abbe")
-"""Made at boot by deploy/abbe-tmpfiles.conf, for a group. If it exists, it is the only choice; an account without access gets an error."""
+"""Lock folder for one group, made at boot by deploy/abbe-tmpfiles.conf. Where it exists, an account without access gets an error."""
 WITHOUT_INSTALLATION = Path("/tmp/abbe-machines")  # noqa: S108 - the same for all accounts, whatever TMPDIR says
-"""Open to every account. A service with a private ``/tmp`` needs `INSTALLED`."""
+"""Lock folder for every account, used if `INSTALLED` does not exist. A service with a private ``/tmp`` needs `INSTALLED`."""
 SHARED = 0o1777
 """Mode of a folder in which every account may create files and remove only its own."""
 TRIES = 100
@@ -205,7 +205,7 @@ def latest_status(controller: Controller) -> ControllerStatus | None:
 
 
 def notes_since(controller: Controller, ctrl_us: int) -> list[list[float]]:
-    """Return pairs [controller us, host s] since a controller time: at most 500, from each interval the one with the least delay."""
+    """Return pairs [controller us, host s] since a controller time: of more than 500, the one with the least delay of each 500th part."""
     if not isinstance(controller, _Noted):
         return []
     pairs = [(float(c), h) for c, h in controller.clock_notes if c >= ctrl_us]
@@ -227,7 +227,7 @@ D = TypeVar("D", Controller, BallBar, DisplacementMeter, Fixture)
 class Session:
     """Open devices; the `need` methods refuse a test whose device is missing.
 
-    ``attended``: a person can answer questions at the console. ``recovered``: opening finished an interrupted push.
+    ``attended``: a person can answer questions at the console. ``recovered``: an interrupted push was finished while opening.
     """
 
     controller: Controller

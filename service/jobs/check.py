@@ -45,7 +45,7 @@ async def run_check(
     Raises
     ------
     AbbeError, DriverError
-        One cause, one remedy; the current run is closed as failed and the axes are stopped.
+        The check failed; the error names one cause and one remedy. The current run is closed as failed, and the axes are stopped.
     """
     clock = clock or SystemClock()
     started, start_s = clock.utc(), clock.monotonic_s()
@@ -63,7 +63,7 @@ async def run_check(
 
 
 def judged(config: MachineFile, runs: list[Run], campaign: str, started: datetime, duration_s: float) -> CheckResult:
-    """Judge the runs of a check's recipe.
+    """Judge the measured runs of a check against the limits, with their uncertainty.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _name(key: str) -> str:
 
 
 def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:
-    """Return a sentence for each instrument of these figures whose certificate had ended: its figures cannot be judged."""
+    """Return a sentence for each instrument behind these figures whose certificate had ended by ``started``."""
     roles = {MEASURED_WITH[name] for name in names if name in MEASURED_WITH}
     ended = ended_certificates(site_of(config), started.astimezone(UTC).date(), roles)
     return [f"the certificate of the {INSTRUMENTS[role]} ended on {day}" for role, day in ended.items()]

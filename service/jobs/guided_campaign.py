@@ -125,7 +125,7 @@ async def _check_table_acts(session: Session) -> None:
 
 
 class _PromptedPerson:
-    """Forwards the fixture's prompts, with the spindle's position; a stop ends the wait."""
+    """Shows the fixture's prompts on the page, with the spindle's position, and waits for a person; a stop ends the wait."""
 
     def __init__(self, control: Control) -> None:
         self._control = control
@@ -139,5 +139,5 @@ class _PromptedPerson:
 
 
 def named_now(context: InvestigationContext, recipe: str) -> InvestigationContext:
-    """Return the context with its plan named as campaigns of this recipe are: recipe, machine, and time."""
+    """Return the context with a plan whose name consists of recipe, machine and present time."""
     return replace(context, plan=replace(context.plan, name=f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"))

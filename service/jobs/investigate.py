@@ -46,9 +46,9 @@ from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import TRIES, Alarm, next_step
 
 BESIDE = 0.5
-"""Largest share of the tables' promised gain that may need another remedy; above it that remedy comes first."""
+"""Largest ratio of the unexplained readings to the gain that tables promise; above it, a remedy other than tables comes first."""
 REFUSALS = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
-"""Answers, not faults: they become the alarm's text, and another try would give the same."""
+"""Errors that are answers, not faults: they become the alarm's text, and another try would give the same."""
 
 Note = Callable[[AlarmKind, Doc], Awaitable[Alarm]]
 """Writes a line of the alarm; returns the alarm including it."""
@@ -172,7 +172,7 @@ async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> 
 async def make_proposal(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
     """Solve a measured campaign and store the result as a proposal, based on the controller's table in force.
 
-    ``agree`` and ``by``, and the errors besides a device's, are those of `proposals.make`.
+    ``agree`` and ``by`` are those of `proposals.make`; so are the errors, besides those of devices.
     """
     site, store = context.site, context.store
     with lock_machine(site.urls.cnc):

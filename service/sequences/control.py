@@ -49,7 +49,7 @@ AT_WORK = frozenset({"door"})
 PAUSED = frozenset({"door", "mode", "drives", "program", "spindle", "temperature", "beam"})
 """Conditions that a person may cause during a pause; checked again before the measurement resumes."""
 CAN_CLEAR = frozenset({"door", "beam", "temperature"})
-"""Conditions that may suspend a run instead of ending it. E-stop and alarm never do."""
+"""Conditions that may only suspend a run; all others, such as e-stop and alarm, end it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def beam_trouble(reading: LaserReading) -> BeamLost | None:
 
 
 def air_trouble(reading: LaserReading, window_c: tuple[float, float] | None) -> TemperatureOutside | None:
-    """Return the interlock of an air temperature outside the window (degrees C); None: inside, or not watched."""
+    """Return the interlock for air outside the temperature window (degrees C); None if it is inside or not watched."""
     if window_c is None or window_c[0] <= reading.air_temp_c <= window_c[1]:
         return None
     low, high = window_c
@@ -208,7 +208,7 @@ class Control:
     # ---- requests of a person -------------------------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Pause at the next safe place: between points at once; a path under recording is stopped and measured again later."""
+        """Pause at the next safe place: between points at once; a recorded path is stopped, and its rest or all of it measured later."""
         if not (self._stop or self._abort or self._pause or self.no_pause_reason):
             self._pause = True
             self._to(State.PAUSING)

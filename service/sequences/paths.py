@@ -20,14 +20,14 @@ from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
 
 STOP_S = 10.0
-"""Outer bound only. The driver's own limits govern: seconds for each write, five until the axes stand still."""
+"""Longest time for a stop, s. The driver gives up earlier: after seconds for each write, and five until the axes stand still."""
 Spare = Callable[[], Awaitable[bool]]
 UNDELIVERED = "the stop could not be delivered: press e-stop"
 
 
 @asynccontextmanager
 async def motion_interlock(controller: Motion, spare: Spare | None = None) -> AsyncIterator[None]:
-    """Stop the axes when an error or a cancellation ends this block. The error leaves with a warning if the stop failed.
+    """Stop the axes when an error or a cancellation ends this block. If the stop fails, the error gets a warning.
 
     ``spare`` returns whether another program controls the machine and nothing of ours can move: then no stop is sent.
     """
@@ -83,7 +83,7 @@ STALL_S = 10.0
 STAND_S = 5.0
 BAD_IN_A_ROW = 25
 OUT_S = 0.03
-"""Tolerated time out of range: long enough for one or two disturbed samples, short enough to stop in time."""
+"""Time for which the bar may be out of range, s: long enough for one or two disturbed samples, short enough to stop in time."""
 
 
 def bar_trouble(status: int) -> BarOutOfRange:
@@ -99,7 +99,7 @@ async def record_path(
 ) -> dict[str, int]:
     """Run a path while the ball-bar streams; return its start and end in controller time (us).
 
-    Updates ``way`` with the progress; for the rest of an interrupted path, ``remainder`` holds the readings that must repeat.
+    Updates ``way`` with the progress; for the rest of an interrupted path, ``remainder`` holds earlier readings that the bar must repeat.
 
     Raises
     ------
@@ -173,7 +173,7 @@ async def feed_hold(controller: Motion) -> None:
 
 
 class Pump:
-    """Passes samples to the recorder until the path has ended and one sample arrives without the sync level."""
+    """Passes samples to the recorder until the path has ended and a batch ends with a sample taken after the path (sync level low)."""
 
     def __init__(self, recorder: Recorder, rate_hz: int, way: PathProgress | None = None, stretch: StretchComparison | None = None) -> None:
         self._recorder = recorder

@@ -43,11 +43,11 @@ from abbe.service.sequences.steps import (
 LEAD_S, LEAD_MM = 0.5, 5.0
 """Minimum time and length of the lead before readings count: the axes reach constant feed and take up their lost motion."""
 SAME_MM = 0.0015
-"""Allowed difference of the stretch's median: minutes of drift, but not a displaced cup."""
+"""Allowed median change of the readings on the stretch: minutes of drift, but not a displaced cup."""
 STEADY_MM = 0.1
 """Allowed change of the lag behind constant feed, either way."""
 BEHIND_S, BEHIND_MM = 0.15, 0.5
-"""Largest lag of a machine at constant feed behind its command, from acceleration and position control: seconds of feed plus a constant."""
+"""Largest lag behind the command at constant feed, from acceleration and position control: the way of so many seconds, plus mm."""
 AROUND_MM = 100.0
 
 
@@ -149,7 +149,7 @@ def rest_of_path(step: RecordPath, so_far: ReadProgress) -> tuple[RecordPath, in
 
 
 def _before(arc: F1, at_mm: float) -> int:
-    """Return the number of the last point at or before a length; -1 if there is none."""
+    """Return the number of the last point at or before this length of the path; -1 if there is none."""
     return int(np.searchsorted(arc, at_mm + 1e-9, side="right")) - 1
 
 
@@ -165,7 +165,7 @@ class StretchComparison:
         # The start of each path is known to half a sample period.
         self._allowed_mm = SAME_MM + abs(float(slope)) * remainder.feed_mm_s / rate_hz
         self.off_mm: float | None = None
-        """Difference of the stretch's readings, mm, once it is read."""
+        """Median of new minus earlier readings on the stretch, mm; None until the stretch is read."""
 
     def from_box(self, boot_id: int) -> None:
         """Raise RunInterrupted if the box was restarted: its earlier readings must not be joined to new ones."""
@@ -271,7 +271,7 @@ def rest_of(
     Parameters
     ----------
     hand : int, optional
-        Last manual step done; None: none.
+        Number of the last manual step that was done; None: none was.
     records : tuple of dict
         Laser records of complete points since this mounting's zero, oldest first; none for a ball-bar.
     before : tuple of float, optional
@@ -295,7 +295,7 @@ def rest_of(
 
 
 def _along_path(test: TestPlan, first: int, start: Point | None, so_far: ReadProgress) -> Rest | None:
-    """Return the rest that begins on the path, or None."""
+    """Return the rest of a test that resumes in the middle of its path; None if it cannot."""
     steps = _by_itself(test.steps[first:])
     k = next((k for k, step in enumerate(steps) if isinstance(step, RecordPath)), None)
     path = None if k is None else steps[k]
@@ -308,13 +308,13 @@ def _along_path(test: TestPlan, first: int, start: Point | None, so_far: ReadPro
 
 
 def _to_beginning(trail: tuple[Point, ...], steps: tuple[Step, ...]) -> ResumeTrail:
-    """Return along the trail to the start of the first remaining step or, if that is a straight move, to its end."""
+    """Return the way along the trail to the start of the first remaining step or, if that step is a straight move, to its end."""
     to = 0 if isinstance(steps[0], FollowPath | RecordPath) else min(1, len(trail) - 1)
     return ResumeTrail(trail, to, to, _feed(steps))
 
 
 def _by_itself(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Return the steps before the first manual one, which changes the set-up and so the way."""
+    """Return the steps before the first manual one: the way back does not lead past a change of the set-up."""
     cut = next((k for k, step in enumerate(steps) if isinstance(step, BY_HAND)), len(steps))
     return steps[:cut]
 
@@ -331,7 +331,7 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
 
 
 def _all_axes_from(trail: tuple[Point, ...]) -> int:
-    """Return the number of the point from which every moving axis makes its last motion to the trail's end."""
+    """Return the number of the latest point after which every axis that moves on the trail moves at least once more."""
     moved = np.abs(np.diff(np.array(trail), axis=0)) > 0.0
     return min((int(np.flatnonzero(moved[:, a])[-1]) for a in range(3) if moved[:, a].any()), default=len(trail) - 1)
 
@@ -355,7 +355,7 @@ def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]
 
 
 def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
-    """Return a test that itself mounts its set-up for the n-th time; ``first`` is the test that mounted it the first time."""
+    """Return a test that itself mounts its set-up, as mounting ``number``; ``first``: the test that first mounted this set-up."""
     named = anew(test, number)
     if test.mounts:
         return replace(named, steps=(Unmount(), *test.steps))
@@ -414,7 +414,7 @@ def _feed(steps: tuple[Step, ...]) -> float:
 def _nearest(trail: np.ndarray, here: np.ndarray, to: int, *, latest: bool) -> tuple[int, float]:
     """Return the number of the nearest segment's first point, and the distance from the segment, mm.
 
-    Where the trail passes the place more than once (a circle with feed-in), take the passage nearest to ``to`` along the trail.
+    Of several passages (a circle with feed-in) take the last one if ``latest``, else the one nearest to ``to`` along the trail.
     """
     if len(trail) == 1:
         return 0, float(np.linalg.norm(here - trail[0]))

@@ -78,7 +78,7 @@ async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, he
 SAME_PLACE_MM = 1e-3
 MM_PER_COUNT = 1e-7
 BY_MOVES = 12
-"""A return of at most this many points uses single moves, a longer one a path."""
+"""Largest number of points of a way back that is driven in single moves; a longer one runs as a path."""
 
 Tick = Callable[[float, float], None]
 """Called after each step with the planned machine seconds done so far in the test, and the wall seconds this step waited for a person."""
@@ -106,7 +106,7 @@ class Runner:
         self.touched = False
         """Whether a person may have touched the set-up in the pause that ended the run."""
         self.hand: int | None = None
-        """Number of the last manual step done; ``asked``: of one requested and not yet done."""
+        """Number of the last manual step that was done; ``asked``: number of the step that was requested and is not yet done."""
         self.asked: int | None = None
         self.mounted_us: int | None = None
         self.gained = False

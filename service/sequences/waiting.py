@@ -126,7 +126,7 @@ class Visits:
         self.touched = False
 
     async def look(self) -> None:
-        """Check once."""
+        """Note if the door is open, the mode is not remote, or the controller does not answer."""
         try:
             self.touched = self.touched or person_may_be_inside(await self._controller.status())
         except DriverError:

@@ -34,7 +34,7 @@ LASER_UNKNOWN_S = 2.5
 """Longest silence of the laser: on a serial line one lost reply costs a second, and only a reading depends on it."""
 RETRY_S = 0.02
 LATE_S = 0.1
-"""A later wake-up means that this computer stalled: the watcher asks once more before it calls the status unknown."""
+"""A wake-up that is later than this, s, means that this computer stalled: the watcher asks once more before it calls the status unknown."""
 NOTHING: frozenset[str] = frozenset()
 END_S = 5.0
 """Longest wait for the watchers' current poll when the test has ended."""
@@ -181,8 +181,8 @@ async def watched(session: Session, control: Control, watching: Watching) -> Asy
 
 
 class Beside:
-    """Tasks beside a block; their first failure cancels the block. Unlike a TaskGroup it never takes an outside cancellation for its own:
-    both may come while the axes are being stopped."""
+    """Runs tasks beside a block of code; their first failure cancels the block. Unlike a TaskGroup it never takes an outside cancellation
+    for its own: both may come while the axes are being stopped."""
 
     def __init__(self, block: asyncio.Task[Any]) -> None:
         self._block, self._open, self._cancelled = block, True, False
@@ -190,7 +190,7 @@ class Beside:
         self.errors: list[BaseException] = []
 
     def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a task."""
+        """Start a task beside the block."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._done)

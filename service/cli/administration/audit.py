@@ -79,7 +79,7 @@ def _always(_: Given) -> bool:
 
 
 def _moves(given: Given) -> bool:
-    """Return whether `abbe measure` moves the machine: not for a dry run or an NC program."""
+    """Return whether `abbe measure` moves the machine: a dry run, its picture or positions, and an NC program do not."""
     return not (given.get("dry_run") or given.get("nc") or given.get("path") or given.get("picture"))
 
 
@@ -148,11 +148,11 @@ CHANGES: dict[str, Callable[[Given], bool]] = {
     "user token new": _always,
     "user token revoke": _always,
 }
-"""Commands that change a database, a machine, or who is trusted, if the function returns True for their arguments."""
+"""Commands that may change a database, a machine, or who is trusted; each function tells from the arguments whether this call does."""
 
 
 def is_recorded(command: str, given: Given) -> bool:
-    """Return whether a call of a command is recorded."""
+    """Return whether a command called with these arguments is recorded."""
     if command in READS or command in RECORDS_ITSELF:
         return False
     return CHANGES.get(command, _always)(given)
@@ -170,7 +170,7 @@ def commands(app: typer.Typer, before: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def record_all(app: typer.Typer) -> None:
-    """Wrap every command with the recorder."""
+    """Wrap every command so that its calls are recorded in the audit."""
     for command, one in commands(app):
         one.callback = _recorded(command, one.callback)
 
@@ -199,7 +199,7 @@ def _recorded(command: str, work: Any) -> Any:
 
 
 def outcome_of(error: BaseException) -> str:
-    """Return how a command ended: ``done``, ``no`` (exit code 1), an error's code, ``interrupted``."""
+    """Return how a command ended: ``done``, ``no`` (exit code 1), ``exit N``, ``interrupted``, or the error's code or class."""
     code = getattr(error, "exit_code", None) if isinstance(error, typer.Exit) else getattr(error, "code", None)
     if isinstance(error, typer.Exit | SystemExit):
         return {0: "done", None: "done", 1: "no"}.get(code, f"exit {code}")
@@ -214,7 +214,7 @@ def _check_recordable(command: str, given: Mapping[str, Any]) -> None:
     Raises
     ------
     AbbeError
-        The machine file or the database is refused, or the audit cannot be written.
+        The machine file or the database cannot be used, or the audit cannot be written.
     """
     from abbe.service.audit.book import HEADS, KEY, AuditBook, files_base, files_ready
     from abbe.service.cli.common import database_url, open_store

@@ -78,7 +78,7 @@ def restore(
 
 
 def _places(places: list[Path], store: str | None, last: str) -> tuple[BackupSource, Path]:
-    """Return database and folder that the arguments name."""
+    """Return the database and the backup folder that the arguments name; ``last``: the folder's name in the error text."""
     from abbe.service.backup.backup import BackupSource
     from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine

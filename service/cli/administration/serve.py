@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 LONGEST_NAME = 180
-"""Longest name, characters, of a recipe that a person may start: messages between core and page hold 200, and a rate is appended."""
+"""Longest name, in characters, of a recipe that a person may start: messages to the page hold 200, and the rate is appended to it."""
 
 
 def serve(
@@ -166,7 +166,7 @@ def _opcua(loaded: LoadedMachine) -> OpcUa | None:
 def duties_on(
     alarm: AlarmSection, site: Site, plan: CampaignPlan, rate_hz: int = 100, live: LiveFeed | None = None
 ) -> Callable[[Store], Duties]:
-    """Return what the service does about alarms, given its store.
+    """Return a function that takes the service's store and returns what the service does about alarms.
 
     ``plan``: the full campaign; ``rate_hz``: ball-bar rate of verifications; ``live``: gets the samples of the campaign's paths.
     """
@@ -190,7 +190,7 @@ def duties_on(
 
 
 def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
-    """Return the orders for tables, given the service's store. People can order a push only if the service does not push by itself."""
+    """Return a function from the service's store to the orders for tables; it offers a push only if the service never pushes by itself."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved
     from abbe.service.compensation.rollback import ordered_rollback
@@ -209,7 +209,7 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
 
 
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[Store], MeasureCampaign]:
-    """Return how to run a full campaign that a person starts, given the service's store."""
+    """Return a function from the service's store to the job of a full campaign that a person starts; ``folder``: of recipe files."""
     from abbe.service.clock import SystemClock
     from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext
@@ -228,7 +228,7 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
 
 def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
-    """Return the full campaigns that fit this machine: the built-in one, and the machine file's for alarms."""
+    """Return those full campaigns that fit this machine: the built-in one, and ``named``, which the machine file names for alarms."""
     from abbe.service.sequences.check import dry_run_campaign, paced
     from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, campaign_source
 

@@ -97,7 +97,7 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Dis
 
 
 def _check_live(campaign: str, machine: Path | None) -> None:
-    """Refuse --live without a machine, or for a folder: before anything is read."""
+    """Refuse --live, before anything is read, without a machine file or for a campaign in a folder."""
     from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
 
@@ -110,7 +110,7 @@ def _check_live(campaign: str, machine: Path | None) -> None:
 def _run_live(
     store: Store, machine: Path, at: tuple[DiscoveryJob, DiscoveryJournal, Finding], *, accept_table: bool = False
 ) -> tuple[DiscoveryJob, DiscoveryJournal, Finding]:
-    """Measure the proposed test and search again, until no test is proposed or a person must act; measure nothing twice."""
+    """Measure the proposed test and search again, until no test is proposed, a person must act, or `ROUNDS` rounds are done."""
     from dataclasses import replace
     from datetime import timedelta
 
@@ -149,7 +149,7 @@ def _run_live(
 
 
 def _measured(store: Store, site: Site, campaign: Campaign, addition: Addition, *, accept_table: bool) -> float:
-    """Run the rest of an added measurement on the machine; a stop reports what is kept. Return the seconds to wait, or 0."""
+    """Measure the runs of an addition that are still missing. Return the seconds to wait if it is too early to measure, else 0."""
     from abbe.service.cli.measure import ready_session
     from abbe.service.cli.running import display, run_job
     from abbe.service.discovery.discover_live import measure_added

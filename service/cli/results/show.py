@@ -124,7 +124,7 @@ def show(
 
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
-    """Account for all ball-bar samples of a run: stored, flagged, or missing in a gap."""
+    """Return rows that say how many ball-bar samples of a run are valid, flagged, or missing, and list each gap."""
     from abbe.drivers.api import BAR_REASONS
     from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 

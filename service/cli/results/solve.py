@@ -28,7 +28,7 @@ STAGES = 10
 
 
 SIDE_BY_SIDE = 3
-"""Runs next to each other in a table: more do not fit in 100 columns."""
+"""Largest number of runs side by side in a table: more do not fit in 100 columns."""
 
 
 class ModelName(StrEnum):
@@ -110,7 +110,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 
 @dataclass(frozen=True)
 class _SolveRequest:
-    """The requested options."""
+    """Options of a call of `abbe solve`."""
 
     model: ModelName | None
     tables: bool
@@ -122,7 +122,7 @@ class _SolveRequest:
 
 @contextmanager
 def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
-    """Yield the store and its campaign of that name; a name that is neither a folder nor in the store is one line of error."""
+    """Yield the store and its campaign of that name. The error for an unknown name says that it is not a folder either."""
     from abbe.service.campaign_data.campaign_folder import from_store
     from abbe.service.errors import StoreError
 
@@ -299,7 +299,7 @@ def _helix_row(estimate: Any) -> list[str]:
 
 
 def _step_rows(figures: dict[str, float]) -> list[list[str]]:
-    """Return the rows of the step-diagonal figures; keys end in their unit, ``u_`` + key is the standard uncertainty."""
+    """Return table rows of the step-diagonal figures. Each key ends in its unit; ``u_`` + key holds its standard uncertainty."""
     rows = []
     for key in (k for k in figures if not k.startswith("u_")):
         name, _, unit = key.rpartition("_")

@@ -67,7 +67,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the best tables that a control can hold, and show what each kind of table would leave."""
+    """Write the best tables that a control can hold, and show the error that each kind of table would leave."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import (
         TableSeal,
@@ -170,7 +170,7 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 
 
 def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none: bool) -> bool:
-    """Return whether a solution's runs are known to be measured without a correction; refuse it if a correction was in force."""
+    """Return whether a solution's runs are known to be measured without a correction; refuse a solution measured with one."""
     from abbe.service.compensation.comp_export import solution_document
     from abbe.service.tables.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
 
@@ -211,7 +211,7 @@ def _holds(limits: Any) -> str:
 
 
 def _tables(found: Compensation) -> list[dict[str, Any]]:
-    """Return one line per table: name, points, range, smallest and largest value as a correction."""
+    """Return one row per table: its name, number of points, range of positions, smallest and largest correction."""
     rows = []
     for t in found.tables:
         ways = [("", t.forward_mm)] if not t.directional else [(", moving in +", t.forward_mm), (", moving in −", t.backward_mm)]

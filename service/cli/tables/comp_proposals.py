@@ -74,7 +74,7 @@ def show_proposals(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show proposals: their promise with uncertainty, their state, the reasons against them."""
+    """Show proposals: the improvement they promise with its uncertainty, their state, the reasons against them."""
     from abbe.service.queries import tables
     from abbe.service.queries.reader import json_value
 

@@ -165,7 +165,7 @@ def commission(
 ) -> None:
     """Send requests that the controller must refuse; then write a small known step for each axis and measure it with the ball-bar.
 
-    This proves the controller's level for pushes, and sign, axis and unit of its tables. Exit code 1: something was not proved.
+    This proves which pushes the controller is safe for (its level), and sign, axis and unit of its tables. Exit code 1: not all is proved.
     """
     from abbe.service.cli.running import display, rollback_when_safe, run_job
     from abbe.service.compensation.commission import commission as work_commission

@@ -30,7 +30,7 @@ from abbe.service.sequences.steps import (
 )
 
 LASER_DWELL_S = 0.7
-"""After settling: 14 output samples of the laser, so that a few may be lost at either end of a standstill."""
+"""Dwell for a laser reading, after settling: 14 output samples, so that a few may be lost at either end of the standstill."""
 BAR_DWELL_S = 0.3
 PATH_REST_S = 2.0
 """Standstill before and after a recorded path: it shows the listener where the path begins and ends."""
@@ -90,7 +90,7 @@ Block = Comment | Halt | Go | Arc | Dwell | Smooth
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """An NC program: name, comments of its head, and blocks."""
+    """An NC program: its name, the comments at its head, and its blocks."""
 
     name: str
     head: tuple[str, ...]
@@ -130,7 +130,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
 
 
 def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """Yield the blocks of a test. The cup is placed at the centre; the bar does not fit in there and is hung in beside the path's start."""
+    """Yield the blocks of a test. The cup is placed at the centre; the bar, too long for there, is hung in beside the path's start."""
     here: Point | None = None
     steps = test.steps
     first = next((k for k, s in enumerate(steps) if isinstance(s, RecordPath | ReadBar)), 0)

@@ -15,7 +15,7 @@ from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Hal
 from abbe.service.sequences.steps import CampaignPlan, Point
 
 USUAL_MEMORY_KIB: Mapping[str, float] = {"fanuc": 256.0, "iso": 256.0}
-"""Assumed program memory of a control without its own disk, where the machine file gives none."""
+"""Program memory by dialect, for controls without a disk of their own, if the machine file gives none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class NcSettings:
 
 
 LAST_NUMBER = 999
-"""Block numbers restart after N9990: old controllers take four digits."""
+"""Number of blocks after which the block numbers restart (N10 to N9990): old controllers take four digits."""
 PLANE_CODES = {"XY": "G17", "ZX": "G18", "YZ": "G19"}
 
 
@@ -75,7 +75,7 @@ DIALECTS = {"siemens": SIEMENS, "fanuc": FANUC, "linuxcnc": LINUXCNC, "iso": ISO
 
 
 def gcode(made: Program, dialect: Dialect, number: int = 1) -> str:
-    """Return the program text."""
+    """Return a program as G-code text; ``number``: the program's number (Fanuc)."""
     writer = _Writer(dialect)
     lines = [line.format(number=number, name=plain(made.name, dialect)[:30]) for line in dialect.start]
     body = [_comment(dialect, f"{dialect.title} program written by Abbe"), *(_comment(dialect, text) for text in made.head)]
@@ -146,7 +146,7 @@ TOLERANCE_MM = 0.001
 
 
 def heidenhain(made: Program, tool: int | None = None) -> str:
-    """Return the program text; blocks are numbered from 0, as on the controller.
+    """Return a program in Heidenhain conversational; blocks are numbered from 0, as on the controller.
 
     ``tool``: row of the tool table for the holder in the spindle. TOOL CALL sets the tool axis, normal to the plane of the arcs, and the
     length. Only the operator knows the row, and tool 0 would empty the spindle; without a row the program says where to write TOOL CALL and
@@ -199,7 +199,7 @@ NAMES = (*DIALECTS, "heidenhain")
 
 @dataclass(frozen=True, slots=True)
 class NcProgram:
-    """Program text, run time, and a warning for the operator about its size."""
+    """Program text, run time, ``size`` and run time in words, and a warning if the text exceeds the controller's memory (else empty)."""
 
     text: str
     runtime: Runtime
@@ -250,7 +250,7 @@ class Runtime:
 
 
 def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
-    """Return the time of all blocks: each line or arc from standstill to standstill; a sequence without stops counts as one."""
+    """Return the time of all blocks: each line or arc runs from standstill to standstill; moves that pass corners count as one."""
     moving, resting, here = 0.0, 0.0, None
     smooth, run_mm, run_feed = False, 0.0, 0.0
     for block in blocks:

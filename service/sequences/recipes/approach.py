@@ -50,7 +50,7 @@ Coordinate = Annotated[float, Limits(ge=-1e5, le=1e5)]
 Share = Annotated[float, Limits(ge=0.0, le=1.0)]
 Settle = Annotated[float, Limits(ge=0.0, le=60.0)]
 AxisIndex = Annotated[int, BeforeValidator(_axis)]
-"""0, 1 or 2; in a file its letter."""
+"""Number of an axis, 0 to 2; a file gives the axis letter instead."""
 Rate = Annotated[int, Limits(ge=1, le=1000), AfterValidator(_rate)]
 Flat = Annotated[str, one_of("XY", "YZ", "ZX")]
 IN_FILE = "in_file"
@@ -96,12 +96,12 @@ def file_table(recipe: TestRecipe) -> dict[str, Any]:
 Array = NDArray[np.float64]
 RAPID_MM_MIN = 6000.0
 BAR_APPROACH_MM = 0.5
-"""Approach with the bar hung in: far more than any lost motion, and within the bar's stroke of 1 mm either way."""
+"""Length of the approach with the bar hung in: far more than any lost motion, and within the bar's stroke of 1 mm either way."""
 LINK_CHORD_MM = 2.0
-"""Chord of the way on the sphere between two paths: at a radius of 50 mm it runs 10 um inside the sphere."""
+"""Chord length of the way on the sphere between two paths: at a radius of 50 mm a chord runs 10 um inside the sphere."""
 SAME_PLACE_MM = 0.01
 NEAR_POLE_MM = 2.0
-"""A path that starts this near the pole is approached straight from the centre: the way up is the same."""
+"""A path that starts this near the pole needs no way along the sphere: the machine moves from the centre up to the pole."""
 LOW_SHARE = 0.4
 """Lowest allowed depth below the cup's centre, as a share of the bar: deeper, the spindle hits the cup's support (the partial arc of 220
 degrees of ISO 230-4 with its feed-in stays above)."""

@@ -1,7 +1,8 @@
 """Built-in campaigns, scaled to any machine's strokes, and the sources of a campaign's plan. Nothing here reaches a device.
 
 The identification campaign lets the joint solution determine every error that nine tables can correct: helices about five centres,
-each axis on two opposite edges, step diagonals in two step orders (rank 67 of 67 for translations and the angles that one tool shows).
+each axis on two opposite edges, step diagonals in two step orders. They determine all 67 parameters of the translations and of those
+angles that one tool shows.
 The verification uses positions that the identification does not use. The campaign of the discovery demonstration separates most candidate
 effects in one session.
 """
@@ -76,9 +77,9 @@ STEPS, LINE_N = 12, 13
 JUDGED = "pnp"
 BACK = "check-back"
 CHORD_MM = 0.5
-"""The position of a sample on its path is known to half a sampling period, 0.3 mm at 50 Hz and 2000 mm/min. With the usual
-chord and area law the chords run up to 10 um inside the sphere: misplaced readings scatter there, and a clean machine seems disturbed.
-Even chords of this length run at most 0.24 um inside at a radius of 120 mm."""
+"""Even chord of helices in a discovery: at a radius of 120 mm it runs at most 0.24 um inside the sphere, the usual uneven chords up to
+10 um. Where a sample lies on its path is known to half a sampling period (0.3 mm at 50 Hz and 2000 mm/min), so on the usual chords readings
+scatter, and a clean machine seems disturbed."""
 ROUND: tuple[Literal[1, -1], ...] = (1, -1)
 
 
@@ -106,7 +107,7 @@ def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "dis
 
 
 def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew") -> CampaignPlan:
-    """Return the verification with a second helix: the same path slowly back, with the bar left in. The difference shows what changes then.
+    """Return the verification with a second helix: the same path slowly back, with the bar left in, to show effects of feed and direction.
 
     One helix alone cannot tell a constantly warm bar from a longer one.
     """
@@ -118,7 +119,7 @@ def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew")
 
 
 def _lines(machine: Machine, when: str) -> list[Recipe]:
-    """Return one line per axis: its length shows growth during the session, independent of squareness."""
+    """Return one laser line along each axis: its length shows growth during the session, whatever the squareness is."""
     return [
         Linear(f"{when}-line{AXES[a]}", f"{when}{AXES[a]}", "identify", a, at_share=(0.5, 0.5), positions=LINE_N)
         for a in range(len(machine.stroke_mm))
@@ -144,7 +145,7 @@ def _label(name: str, feed: float, way: int) -> str:
 
 
 IDENTIFICATION = "identification"
-"""The full campaign: not a check, and only with a person who mounts its set-ups."""
+"""Name of the built-in full campaign: it is no check, and it needs a person who mounts its set-ups."""
 USUAL_HZ = 100
 RATES_HZ = (50, 100, 200, 250, 500, 1000)
 """Offered rates of the ball-bar; any other divisor of 1000 works, too."""

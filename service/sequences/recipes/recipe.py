@@ -66,9 +66,9 @@ from abbe.service.sequences.steps import (
 )
 
 MIN_TURNS = 3.0
-"""Below, a hemisphere hardly tells cup offset, scale and squareness apart (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
+"""With fewer, a hemisphere hardly tells cup offset, scale and squareness apart (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
 PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
-"""Partial arc of ISO 230-4, and its feed-in and feed-out."""
+"""Angles of the partial arc of ISO 230-4, and of its feed-in or feed-out."""
 Turns = Annotated[float, Limits(ge=3.0, le=50.0)]
 Lead = Annotated[float, Limits(ge=0.0, le=90.0)]
 Arc = Annotated[float, Limits(ge=0.0, le=360.0)]
@@ -97,9 +97,9 @@ class Helix(CupTest):
     """Hemispherical helix of the ball-bar test: continuous at constant feed, from pole to equator or (direction -1) back.
 
     ``chord_mm`` is the wanted mean spacing of the path's points; a long path gets longer chords to fit into the controller's memory. The
-    polyline of n points then runs chord^2 / (8 radius) inside the sphere, and with the area law radius / (4 n) near the pole: 1.3 and 23 um
-    for a radius of 750 mm. Columns and solvers use the commanded position on the polyline, not on the sphere: this costs accuracy only if
-    the position of a sample on the path is uncertain by a part of a chord. ``even``: almost equal spacing along the same curve.
+    polyline of n points then runs chord^2 / (8 radius) inside the sphere (1.3 um for a radius of 750 mm), and with ``law`` "area"
+    radius / (4 n) near the pole (23 um). Columns and solvers use the commanded position on the polyline, not on the sphere: this costs
+    accuracy only if the position of a sample is uncertain by a part of a chord. ``even``: almost equal spacing along the same curve.
     ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles tangent to the path's ends, driven continuously with it, so that the
     recorded part is at constant feed; ``feed_in_deg`` comes first in either direction.
     """
@@ -157,7 +157,7 @@ class HelixPoints(CupTest):
 
     Between two positions the machine moves along the sphere, so that the bar stays within its stroke, stops half a millimetre before the
     next one against the motion of each axis, and moves there straight: every axis arrives in its direction of travel between positions.
-    There it takes the mean of ``samples`` readings after ``settle_s``.
+    The reading is the mean of ``samples`` samples of the bar, taken after ``settle_s``.
     """
 
     _: KW_ONLY
@@ -378,7 +378,7 @@ class Linear(BeamTest):
     """Single-axis positioning by laser (ISO 230-2), with this number of ``positions`` out and back.
 
     ``at_share``: relative positions in the strokes of the two other axes, in the order X, Y, Z. ``offset_share``: largest pseudo-random
-    shift of a position, as a share of the interval, to reveal periodic errors (ISO 230-2); ``seed``: of the shifts.
+    shift of a position, as a share of the interval, to reveal periodic errors (ISO 230-2); ``seed``: of the random numbers.
     """
 
     axis: AxisIndex

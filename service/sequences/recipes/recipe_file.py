@@ -109,7 +109,7 @@ AnyTest = Annotated[
 
 
 class RecipeFile(BaseModel):
-    """A whole recipe file."""
+    """Content of a recipe file; ``test``: its tests in the order of measuring."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -158,7 +158,7 @@ def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
 
 
 def _check_keys(content: dict[str, Any], source: str) -> None:
-    """Refuse keys that a test of its kind cannot have in a file, and set the default role."""
+    """Refuse each test with a key that its kind of test does not have, and set the default role."""
     tests = content.get("test")
     for k, table in enumerate(tests if isinstance(tests, list) else []):
         kind = KINDS.get(str(table.get("kind"))) if isinstance(table, dict) else None
