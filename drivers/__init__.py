@@ -1,1 +1,1 @@
-"""Drivers: async communication with instruments and controllers; they know bytes, not physics or jobs."""
+"""Drivers: async communication with instruments and controllers; they know bytes, but neither physics nor measuring jobs."""

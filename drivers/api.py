@@ -1,7 +1,7 @@
 """Capabilities of devices as small Protocols, and the plain values they return.
 
 Lengths keep the unit of the wire (mm for commands, nm or 0.1 nm counts for raw readings), so that nothing is lost before storage; the
-service turns raw counts into arrays in one place. Times ``host_s`` are monotonic host seconds at the last byte.
+service turns raw counts into arrays in one place. ``host_s`` is the monotonic time of the host, s, when the last byte arrived.
 
 A run stores the status word of a reading as the instrument sent it (docs/protocols); outside the drivers only functions of this file, such
 as `bar_is_valid`, interpret its bits.
@@ -43,9 +43,9 @@ class BarSample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BarBatch:
-    """Samples that arrived together. ``missing``: number of samples lost just before this batch, found by the sequence numbers.
+    """Samples that arrived together. ``missing``: number of samples lost just before this batch, by their sequence numbers.
 
-    ``boot_id``: of the box that sent them. ``overran``: bytes were lost before these samples because this computer did not keep up.
+    ``boot_id``: of the box that sent them. ``overran``: whether bytes were lost before them because this computer did not keep up.
     """
 
     host_s: float

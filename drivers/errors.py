@@ -1,4 +1,4 @@
-"""Errors of devices and links: each names device, operation, what happened, and a remedy. Also clean-up that no cancellation stops."""
+"""Errors of devices and links: each names device, operation, what happened, and a remedy. Also runs clean-up despite cancellation."""
 
 from __future__ import annotations
 

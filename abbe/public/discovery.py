@@ -32,10 +32,10 @@ class DiscoveryAnswer:
     effects : dict
         Signed strength with standard uncertainty by label, e.g. ``"backlash:X"``.
     gap : dict
-        By role of runs (``"identify"``, ``"holdout"``), in µm: rms of measured minus simulated readings without the effects
-        (``before_um``) and with them (``after_um``), and the noise that no model removes (``floor_um``).
+        For each role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated readings, with a simulation without the
+        effects (``before_um``) and with them (``after_um``), and the noise that no model removes (``floor_um``).
     next_measurement : dict or None
-        The most informative next measurement: what it ``adds``, which suspects it ``separates``, ``minutes``, and ``why``.
+        The most informative next measurement: what it ``adds``, which effects it ``separates``, how many ``minutes`` it takes, and ``why``.
     """
 
     verdict: str

@@ -8,7 +8,7 @@ from typing import NamedTuple
 class Estimate(NamedTuple):
     """A value and its standard uncertainty (GUM, k = 1), both in ``unit``.
 
-    ``status``: "observed", "weak" or "not observable". A value that is not observable is valid only together with the other values.
+    ``status``: "observed", "weak" or "not observable". A value that is not observable means nothing without the other values.
     """
 
     value: float

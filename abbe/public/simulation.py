@@ -34,10 +34,10 @@ SETUP_S = 300.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedInstruments:
-    """Standard deviations of the random values in a simulated campaign, and the rate of the bar's readings.
+    """Standard deviations (``*_mm``) of the random errors in a simulated campaign, and the rate of the bar's readings.
 
     ``bar_noise_mm``, ``laser_noise_mm``: of one reading; ``cup_mm``: of each component of a cup's position; ``bar_length_mm``: of the bar's
-    calibrated length, whose error is the same for all radii. ``readings_per_s``: at most the recipe's rate is used.
+    calibrated length, whose error is the same for all radii. ``readings_per_s``: readings of the bar, limited to the recipe's rate.
     """
 
     bar_noise_mm: float = 3e-4
@@ -107,7 +107,7 @@ def simulate(
 
 @dataclass(frozen=True)
 class _SimulatedMachine:
-    """One random sample of machine and instruments: one bar length, and one position for each cup."""
+    """A machine with known errors, and random errors of its instruments: one for the bar length, and one for each cup's position."""
 
     machine: Machine
     errors: ErrorMotions

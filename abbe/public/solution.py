@@ -74,7 +74,7 @@ class Solution:
 
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
-        """Estimates by name: mean scales (``"EXX"``, µm/m) and squareness (``"C0Y"``, µrad), lost motion, cups, bars and mirrors."""
+        """Estimates by name: mean scales (``"EXX"``, µm/m) and squareness (``"C0Y"``, µrad), lost motion, then cups, bars, mirrors."""
         status = {m.name: m.status for m in self._found.observability.motions}
         return {
             row.name: Estimate(row.value, row.u, row.unit, status.get(row.name, "observed"))
@@ -150,7 +150,7 @@ class Solution:
 def solve(
     campaign: Campaign, *, model: Literal["rigid6", "rigid21", "auto"] | None = None, progress: ProgressText | None = None
 ) -> Solution:
-    """Solve the runs of a campaign with the role ``identify``, after checking each for consistency.
+    """Estimate the error motions from the runs with the role ``identify``, after checking each run for consistency.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ _RESTORE = "set unit, range and zero of the box back, then measure this test aga
 
 
 class Box:
-    """Identity and settings of the box, which must not change. Accepts only the box ``serial_no``, or if None the first that answers."""
+    """Watches that identity and settings of a box stay the same. ``serial_no``: the only accepted box; None: the first that answers."""
 
     def __init__(self, name: str, talk: Conversation, serial_no: int | None) -> None:
         self.boot_id: int | None = None
@@ -74,11 +74,11 @@ class Box:
         return info
 
     async def peek(self) -> int:
-        """Read the boot id without accepting it; failed communication raises as in `accept`."""
+        """Read the boot id without accepting it; failed communication raises the errors named in `accept`."""
         return (await self._talk.identify()).boot_id
 
     async def check_boot(self) -> None:
-        """Read identity and settings again; raises as `accept`, and ``Rebooted`` if the box restarted."""
+        """Read identity and settings again; raises the errors of `accept`, and ``Rebooted`` if the box restarted."""
         known = self.boot_id
         info = await self.accept()
         if known not in (None, info.boot_id):
@@ -108,14 +108,14 @@ class Box:
             raise Refused(self._name, "check", detail, "set a larger range at the box")
 
     async def restore(self) -> None:
-        """Restore unit, range and zero of the first identification; raises as `accept`, and ``Refused``."""
+        """Restore unit, range and zero of the first identification; raises the errors of `accept`, and ``Refused``."""
         first = self._first
         if first is not None:
             await self._talk.command(frames.CONFIGURE, lambda tag: frames.configure_command(tag, first.unit, first.range_nm, first.zero_nm))
         await self.accept()
 
     def error_of(self, end: SegmentEnd) -> DriverError:
-        """Return the error of a stream that cannot continue."""
+        """Return the driver error that tells why a stream cannot continue."""
         if isinstance(end, OtherSettings):
             return SettingsChanged(self._name, "stream", str(end), _RESTORE)
         if isinstance(end, OtherPace):
@@ -123,7 +123,7 @@ class Box:
         return self.rebooted(str(end))
 
     def rebooted(self, detail: str) -> Rebooted:
-        """Return the error of a box that restarted."""
+        """Return the error for a box that restarted."""
         return Rebooted(self._name, "stream", detail, "the box restarted: connect to it again, then measure this test again")
 
 
@@ -131,7 +131,8 @@ class SerialBallBar:
     """A telescoping ball-bar on a serial line or a serial device server (docs/protocols/ballbar.md).
 
     The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else that of the
-    first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer between reading and framing, s at 1000 Hz.
+    first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer between reading and framing, in s of a 1000 Hz
+    stream.
     """
 
     def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:
@@ -348,7 +349,7 @@ class SerialBallBar:
             raise waited
 
     async def _delivered(self) -> bool:
-        """Wait until the tap has all received samples, as it has already after a reply to STOP."""
+        """Wait until the tap has all received samples; at once if STOP was answered. Return False if it takes too long."""
         return self._framing is None or self._stream is None or self._stream.tap is None or await self._framing.drained(_DRAIN_S)
 
     async def close(self) -> None:
@@ -383,7 +384,7 @@ class SerialBallBar:
 
     @property
     def backlog(self) -> float:
-        """Fill of the ring between reading and storing, 0 to 1."""
+        """How full the ring buffer between reading and storing is, 0 to 1."""
         return 0.0 if self._framing is None else self._framing.ring.fill
 
     async def _batches(self, stream: Stream, timeout_s: float) -> AsyncIterator[BarBatch]:

@@ -1,4 +1,4 @@
-"""Encode and decode ball-bar frames (docs/protocols/ballbar.md), frame received bytes in a thread, and match requests with replies.
+"""Encode and decode ball-bar frames (docs/protocols/ballbar.md), split received bytes into frames in a thread, match replies to requests.
 
 Decoding is pure and total: any bytes give frames or counted bad bytes, never an exception. Replies are matched by tag, so that a late reply
 never passes for that of another request.
@@ -78,7 +78,7 @@ class BoxSettings:
 
 @dataclass(frozen=True, slots=True)
 class Bad:
-    """``n_bytes`` bytes that are not a frame; ``reason`` is ``"check sum"`` if they contained a false frame, else ``"garbage"``."""
+    """``n_bytes`` bytes without a usable frame; ``reason``: ``"check sum"`` (wrong), ``"unknown type"`` (of a frame) or ``"garbage"``."""
 
     reason: str
     n_bytes: int
@@ -135,7 +135,7 @@ def reading_text(settings: BoxSettings) -> str:
 class FrameDecoder:
     """Turns a byte stream, in pieces of any size, into frames.
 
-    Noise costs no good frame: the bytes of a false frame are searched again for a true one.
+    Noise costs no good frame: if a check sum is wrong, the same bytes are searched again for a true frame.
     """
 
     def __init__(self) -> None:
@@ -152,7 +152,7 @@ class FrameDecoder:
         Returns
         -------
         list of BarSample, Info, Ack, BoxSettings or Bad
-            In order of arrival. Every byte ends in exactly one of them or in ``pending``.
+            In order of arrival. Every byte belongs to exactly one of them, or is counted in ``pending``.
         """
         data = self._rest + chunk if self._rest else chunk
         out: list[Frame] = []
@@ -188,7 +188,7 @@ class FrameDecoder:
 
 
 def _samples(data: bytes, at: int, out: list[Frame]) -> int:
-    """Append the consecutive whole SAMPLE frames from ``at`` on to ``out`` and return their end: the fast path of a good line."""
+    """Append the SAMPLE frames that follow each other from ``at`` on to ``out``; return where they end. Fast path for a good line."""
     view = memoryview(data)
     whole = at + (len(data) - at) // _SAMPLE_BYTES * _SAMPLE_BYTES
     for head, seq, device_us, reading_nm, status, crc in _WHOLE_SAMPLE.iter_unpack(view[at:whole]):
@@ -342,7 +342,7 @@ class Conversation:
     send : callable
         Opens the line if necessary, and sends the bytes.
     counters : BarCounters
-        Counters of the line. Bytes without a valid frame mean a wrong baud rate; no bytes mean a silent box.
+        Counters of the line: they tell a wrong baud rate (bytes without a valid frame) from a silent box (no bytes).
     answer_s : callable
         Returns the longest wait for a reply, s.
     backlog : callable

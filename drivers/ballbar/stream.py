@@ -1,4 +1,4 @@
-"""Order of samples, and the stream that delivers them.
+"""Check the order of samples, and deliver them as a stream.
 
 Sequence numbers and device time distinguish gaps, duplicates, late samples and restarts (`SequenceTracker`). A `Stream` passes samples from
 the framing thread to the tap, which records them, and to a consumer in the event loop.
@@ -36,14 +36,14 @@ class SampleRun:
 
 @dataclass(frozen=True, slots=True)
 class Reads:
-    """Known settings of the box: their number (bits 8 to 15 of every status) and the stroke to either side."""
+    """Known settings of the box: their change number (in bits 8 to 15 of every status) and the stroke to either side."""
 
     number: int
     range_nm: int
 
 
 class SegmentEnd(Exception):  # noqa: N818 - an event, not a mistake
-    """Samples before and after this must not be joined; ``runs`` are the good ones before it."""
+    """Samples before and after this event must not be joined; ``runs`` are the good samples before it."""
 
     runs: list[SampleRun]
 
@@ -85,12 +85,12 @@ class SequenceTracker:
 
     @property
     def too_lossy(self) -> bool:
-        """Whether more than 0.1 % of the samples are lost; a shorter run counts as ``_LOSS_FLOOR`` samples long."""
+        """Whether more than 0.1 % of the samples so far, or of ``_LOSS_FLOOR`` samples if there are fewer, are lost."""
         return self.lost > _MAX_LOSS * max(self.lost + self.accepted, _LOSS_FLOOR)
 
     @property
     def was_lossy(self) -> bool:
-        """Whether the run has lost more than 0.1 % so far."""
+        """Whether more than 0.1 % of the samples so far are lost, however few there are."""
         return self.lost > _MAX_LOSS * (self.lost + self.accepted)
 
     def accept(self, samples: list[BarSample]) -> list[SampleRun]:
@@ -101,7 +101,7 @@ class SequenceTracker:
         SequenceRestart
             The stream began anew: samples before and after must not be joined.
         OtherPace
-            Sequence number and device clock disagree in two consecutive samples.
+            Two consecutive samples have an impossible clock or reading.
         OtherSettings
             The box's settings changed since the stream began.
         """
@@ -129,7 +129,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def _plain(self, samples: Sequence[BarSample], at: int) -> int:
-        """Return the end of the samples from ``at`` on that pass all simple checks: the fast path of a good line."""
+        """Return the index of the first sample from ``at`` on that fails a simple check. Fast path for a good line."""
         if self._candidate is not None or self._last_us < 0:
             return at
         expected, last_us, last_nm = self._next, self._last_us, self._last_nm
@@ -173,7 +173,7 @@ class SequenceTracker:
         self._stray_before = False
 
     def _misfit(self, sample: BarSample, ahead: int) -> tuple[type[SegmentEnd], str]:
-        """Return why this sample cannot be the one ``ahead`` numbers on; an empty reason if it can."""
+        """Return why this sample cannot follow after ``ahead`` missing ones, as error class and reason; the reason is empty if it can."""
         reason = self._clock_misfit(sample.device_us - self._last_us, ahead + 1)
         _, _, limit_nm, _, mask, number = self._plain_limits
         if not reason and sample.status & mask != number:
@@ -288,7 +288,7 @@ class Stream:
                 self._take(self._host_s, self.tracker.rest(), overran=False)
 
     def verdict(self, bad_bytes: int) -> DriverError | None:
-        """Judge the line of a stream that ended in order: `LossyLine` invalidates the stream, `BadFrame` is only a note."""
+        """Judge the line after a stream that ended normally: `LossyLine` invalidates the stream, `BadFrame` is a note, None is good."""
         tracker = self.tracker
         if tracker.was_lossy:
             return self.lossy()
@@ -303,7 +303,7 @@ class Stream:
         )
 
     def lossy(self) -> LossyLine:
-        """Return the error of a run that has lost too much."""
+        """Return the error for a stream that has lost too many samples."""
         lost, total = self.tracker.lost, self.tracker.lost + self.tracker.accepted
         detail = f"{lost} of {total} samples were lost on the line ({lost / total:.2%}; 0.1 % is the most that a run may lose)"
         return LossyLine(
@@ -338,7 +338,7 @@ class Stream:
         self._wake()
 
     def mark(self, fill: float) -> None:
-        """Warn the tap that the ring buffer has reached this fill (0 to 1), and fail from 80 % on; called in the reading thread."""
+        """Warn the tap that the ring buffer has reached this fill (0 to 1); from 80 % on, fail the stream. Called in the reading thread."""
         text = f"the ring between reading and storing is {fill:.0%} full"
         if self.tap is not None:
             self.tap.warn(text)

@@ -77,7 +77,7 @@ class ControllerSession:
         self._connection = self.link.connections
 
     async def status(self) -> ControllerStatus:
-        """Read the controller's status; see `block`."""
+        """Read the controller's status; raises the errors of `block`."""
         return (await self.block()).status
 
     async def block(self) -> reg.StatusBlock:
@@ -172,7 +172,7 @@ class Banks(ControllerSession):
             await self.link.write(base + first + at, words[at : at + _WINDOW], ModbusOperation.NUMBERED)
 
     async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
-        """Read a bank from register ``first`` (even) on: ``n_bytes``, or to the end of the image by its header.
+        """Read ``n_bytes`` of a bank from register ``first`` (even) on; None: up to the end of the image, as its header states it.
 
         Raises
         ------
@@ -195,7 +195,7 @@ class Banks(ControllerSession):
     async def lease(self, owner: int, lease_ms: int, *, anyway: bool = False) -> None:
         """Take (or extend) the lease for changing banks for ``lease_ms`` ms; ``owner`` is any u32 but 0.
 
-        If the status shows another owner, nothing is sent; with ``anyway`` it is sent, to test whether the controller refuses.
+        If the status shows another owner, no command is sent, unless ``anyway`` is set to test whether the controller refuses.
 
         Raises
         ------
@@ -237,9 +237,9 @@ class Banks(ControllerSession):
             raise DeviceFault(self.name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
 
     async def _bank_command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
-        """Send a command and determine its outcome.
+        """Send a command to the banks and determine its outcome.
 
-        If two programs use the same command number, the controller executes only the first command, but both programs see its acknowledge.
+        If two programs use the same command number, the controller executes only the first command, but both see the acknowledge.
         The owner of the lease shows whose command it was. A skipped command is sent again under another number, except ACTIVATE, where the
         caller decides.
         """
@@ -308,7 +308,7 @@ class Banks(ControllerSession):
 
 
 def _passed_over(command: int, result: int, counts: dict[str, int], fields: dict[str, int]) -> bool:
-    """Whether an acknowledge belongs to another program's command: it contradicts the owner of the lease."""
+    """Whether an acknowledge is for another program's command: it contradicts the lease's owner or, for SEAL, the bank's state."""
     owner, holder = fields["owner"], counts["LEASE_OWNER"]
     if result == _LEASED:
         return holder == owner or (command == reg.LEASE and holder == 0)

@@ -241,7 +241,7 @@ class ModbusController(Banks):
 
 
 def _with_notes(error: DriverError, former: BaseException) -> DriverError:
-    """Copy the notes of an earlier error, such as a failed feed hold."""
+    """Copy the notes of an earlier error, such as one on a failed feed hold, to this error and return it."""
     for note in getattr(former, "__notes__", ()):
         error.add_note(note)
     return error

@@ -1,4 +1,4 @@
-"""Register map of the CNC controller (docs/protocols/cnc.md) as data, and its pure codec."""
+"""Register map of the CNC controller (docs/protocols/cnc.md) as data, and pure functions that encode and decode it."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ ALARM = {1: "e-stop", 2: "stroke limit", 3: "path ran empty"}
 
 
 class Bit(IntFlag):
-    """STATUS_BITS of the controller."""
+    """Bits of the controller's register STATUS_BITS."""
 
     ESTOP = 1 << 0
     DOOR_OPEN = 1 << 1
@@ -137,7 +137,7 @@ _MUST_BE_SET = {
 
 
 def fingerprint(counts: Mapping[str, int]) -> str:
-    """Describe the register map from the decoded identity block; another text means another map."""
+    """Describe the register map by the decoded identity block; two maps that differ give different texts."""
     return (
         f"map {counts['MAP_VER']}, {counts['N_AXES']} axes, table unit {counts['TABLE_LSB_NM']} nm, "
         f"bank of {counts['BANK_SIZE']} registers, FIFO of {counts['FIFO_SIZE']} points"
@@ -174,7 +174,7 @@ class StatusBlock:
 
 
 def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
-    """Decode registers 16..63 of one request, which arrived at ``host_s`` (monotonic, last byte)."""
+    """Decode registers 16..63, read in one request; ``host_s``: monotonic time at which the reply was complete."""
     counts = STATUS.counts(words)
     x, y, z = (STATUS.physical(name, counts[name]) for name in ("POSITION_X", "POSITION_Y", "POSITION_Z"))
     status = ControllerStatus(
@@ -201,12 +201,12 @@ def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
 
 
 def bank_state(number: int) -> BankState:
-    """Convert BANK_STATE_0 or BANK_STATE_1."""
+    """Convert the content of register BANK_STATE_0 or BANK_STATE_1."""
     return BANK_STATES.get(number, BankState.UNKNOWN)
 
 
 def decode_comp_status(words: Sequence[int], *, boot_id: int, gen: int) -> CompStatus:
-    """Decode registers 208..223 of one request, with the boot id and generation read around it."""
+    """Decode registers 208..223, read in one request; boot id and generation were read before and after it."""
     counts = COMP_STATUS.counts(words)
     return CompStatus(
         boot_id=boot_id,
@@ -235,7 +235,7 @@ def encode_motion(number: int, command: int, target: tuple[int, int, int] = (0, 
 
 
 def encode_fifo(number: int, points: Sequence[tuple[int, int, int]]) -> tuple[int, ...]:
-    """Build registers 96.. of one FIFO chunk; 1..19 points in counts."""
+    """Build registers 96 and following for 1..19 path points in counts."""
     if not 1 <= len(points) <= MAX_CHUNK:
         raise ValueError(f"a chunk has 1..{MAX_CHUNK} points, not {len(points)}")
     flat = [value for point in points for value in point]

@@ -50,7 +50,7 @@ RESULT_TEXT = {1: "bad argument", 2: "refused: beam blocked"}
 
 
 def decode_reading(words: Sequence[int], host_s: float) -> LaserReading:
-    """Decode registers 10..27 of one request, which arrived at ``host_s`` (monotonic, last byte)."""
+    """Decode registers 10..27, read in one request; ``host_s``: monotonic time at which the reply was complete."""
     counts = READING.counts(words)
     return LaserReading(
         host_s=host_s,
@@ -144,7 +144,7 @@ class ModbusLaser:
         await self._command(ENVIRONMENT, int(on), "switch environmental compensation")
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
-        """Wait for an output sample newer than ``after_count`` (a ``sample_count``; None: any) and than the last command, and return it.
+        """Wait for an output sample after the last command and after sample number ``after_count`` (None: any), and return it.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Incidents of a link as a readable list: one entry for the detection and one for the outcome, regardless of the number of errors.
+"""Incidents of a link as a readable list. An incident has two entries, detection and outcome, however many errors it consists of.
 
 Also the wait before the next attempt at a lost link (`Backoff`).
 """
@@ -23,7 +23,7 @@ class Incident:
 
     ``kind``: ``detected`` or ``outcome``; ``code``, ``device``, ``run``, ``text``: of the first error; ``host_s``: monotonic host
     seconds; ``state`` of an outcome: ``recovered`` (the device answers again), ``accepted`` (identified anew), ``closed``; ``times`` of an
-    outcome: number of errors.
+    outcome: number of errors in the incident.
     """
 
     kind: str
@@ -57,9 +57,9 @@ class Incidents:
         return self._open
 
     def note(self, error: DriverError, *, latched: bool = False) -> None:
-        """Note an error, also one that a retry overcame. Only the first of an incident makes an entry.
+        """Note an error, even if a retry overcame it. Only the first error of an incident makes an entry.
 
-        ``latched``: a good reply does not end the incident (another device, a restart); the device must be identified anew.
+        ``latched``: a good reply does not end the incident, because the device is another one or restarted: it must be identified anew.
         """
         if error.run == NO_RUN:
             error.run = self.run
@@ -70,16 +70,16 @@ class Incidents:
             self._add("detected", error)
 
     def good(self) -> None:
-        """End an incident that is not latched, after a good reply."""
+        """Note a good reply: it ends an incident that is not latched."""
         if not self._latched:
             self._end("recovered")
 
     def accepted(self) -> None:
-        """End any incident, after a new identification of the device."""
+        """Note that the device was identified anew: this ends any incident."""
         self._end("accepted")
 
     def closed(self) -> None:
-        """End any incident when the link closes."""
+        """Note that the link closed: this ends any incident."""
         self._end("closed")
 
     def _end(self, state: str) -> None:

@@ -1,6 +1,6 @@
 """One Modbus connection, TCP or RTU: open it, send one request at a time, close it. The only file that uses pymodbus.
 
-This file adds to pymodbus (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
+What this file adds to pymodbus (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
 (`tcp_mismatch`, `rtu_mismatch`) before pymodbus gets it, closing of the old socket before a new one opens, and detection of unsolicited
 bytes.
 """
@@ -97,7 +97,7 @@ _SHORTEST_GAP_S = 0.00175  # 3.5 characters; above 19200 Bd the standard fixes i
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One request; ``values`` only for a write."""
+    """One Modbus request; ``values``: registers to write, empty for a read."""
 
     function: int
     address: int
@@ -220,13 +220,13 @@ class ModbusWire:
             self._deadline.reschedule(asyncio.get_running_loop().time())
 
     async def gap(self) -> None:
-        """On RTU, wait until 3.5 characters have passed since the last byte. A second reply that comes meanwhile counts as strays."""
+        """On RTU, wait until 3.5 characters have passed since the last byte. Bytes that come meanwhile count as strays."""
         if self.rtu:
             gap_s = max(_SHORTEST_GAP_S, 3.5 * _BITS_PER_BYTE / self._baud)
             await asyncio.sleep(max(0.0, self.heard_at + gap_s - asyncio.get_running_loop().time()))
 
     def forget(self) -> None:
-        """Reset the count of strays."""
+        """Reset the count of unsolicited bytes (``strays``)."""
         self.strays = 0
 
     @property

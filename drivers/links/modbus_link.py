@@ -20,7 +20,7 @@ from abbe.drivers.links.words import CANARY_WORDS, RegisterBlock
 
 
 class ModbusOperation(Enum):
-    """Effect of a request on the device, which determines whether it may be repeated."""
+    """Effect of a request on the device; it determines whether the request may be repeated."""
 
     READ = "read"
     """Changes nothing."""
@@ -108,8 +108,8 @@ _CONNECT = 3
 class Canary:
     """Registers with known content, which verify that replies come from this device and match their requests.
 
-    ``words``: content from ``address`` on; ``readable``: registers that one request may read from there, because replies of different
-    length cannot be confused.
+    ``words``: content from ``address`` on; ``readable``: most registers that one request may read from there. The number read varies,
+    because replies of different length cannot be confused.
     """
 
     address: int = 0
@@ -121,8 +121,8 @@ class ModbusLine:
     """A Modbus wire that is verified after every disturbance.
 
     After a missing or wrong reply on RTU, the line waits for silence of a whole reply timeout and reads the canary before the next request.
-    It also reads the canary after every reply: if that reply was a stale one, the true one arrives now and does not match. Without a canary
-    a disturbed RTU line gets only the silence. ``timeout_s``: longest wait for one reply, s.
+    It also reads the canary after every reply: if that reply was stale, the true one arrives in place of the canary and does not match.
+    Without a canary, an RTU line only waits for silence. ``timeout_s``: longest wait for one reply, s.
     """
 
     def __init__(self, wire: ModbusWire, timeout_s: float, canary: Canary | None) -> None:
@@ -139,7 +139,7 @@ class ModbusLine:
         """Number of unsolicited bytes: noise, late replies, or a second master."""
 
     async def open(self) -> None:
-        """Open a new connection; raises as ``ModbusWire.open``."""
+        """Open a new connection; raises the errors of ``ModbusWire.open``."""
         self._known = None
         await self._wire.open(self._timeout_s if self._wire.rtu else _CONNECT * self._timeout_s)
 
@@ -160,9 +160,9 @@ class ModbusLine:
             await self._quarantine()
 
     def varied(self, request: Request, lead: int) -> tuple[Request, int]:
-        """Return the request in its current variant, and the number of extra registers before the requested ones.
+        """Return the variant of the request to send now, and the number of extra registers it reads before the requested ones.
 
-        With a canary, functions 3 and 4 alternate, with up to ``lead`` extra registers, so that a reply to an earlier read is recognised.
+        With a canary, reads alternate between functions 3 and 4 and have 0 to ``lead`` extra registers, so that a late reply is recognised.
         """
         if self._canary is None or request.function == WRITE:
             return request, 0
@@ -214,14 +214,14 @@ class ModbusLine:
             await asyncio.sleep(left_s)
 
     async def _proven(self, canary: Canary, proof: int) -> bool:
-        """Read the canary and compare it with two equal reads of this connection; the identification checks its content."""
+        """Whether the canary reads as in the first two reads of this connection, which were equal; identification checks its content."""
         words = await self._read_canary(canary, proof)
         if words and self._known is None:
             self._known = words if await self._read_canary(canary, proof + 1) == words else None
         return bool(words) and words == self._known and not self._wire.strays
 
     async def _read_canary(self, canary: Canary, proof: int) -> tuple[int, ...]:
-        """Read the canary registers, in another variant each time; empty without a valid reply."""
+        """Read the canary by a request that differs each time in function or length; empty without a valid reply."""
         longer = (self._turn // 2 + proof) % (canary.readable - len(canary.words) + 1)
         try:
             answer = await self._asked(Request(self._function(), canary.address, len(canary.words) + longer))
@@ -248,8 +248,8 @@ class ModbusLink:
     timeout_s : float
         Longest wait for one reply; a TCP connection may take three times as long.
     canary : Canary, optional
-        For devices that have one and answer function 4 like function 3 (docs/protocols). Without it a disturbed RTU line gets silence but
-        no verification, and there is no heartbeat.
+        For devices that have one and answer function 4 like function 3 (docs/protocols). Without it, a disturbed RTU line is not verified,
+        and there is no heartbeat.
     heartbeat_s : float, optional
         Read the canary after this idle time. This detects a vanished peer within ``heartbeat_s + timeout_s``, and reconnects a lost one.
     """
@@ -324,8 +324,8 @@ class ModbusLink:
     async def read(self, address: int, count: int, *, lead: int = 0) -> tuple[int, ...]:
         """Read ``count`` (1..125) registers with one request, with one retry over a new or verified line.
 
-        ``lead``: registers before ``address`` that may be read, too. On RTU a varying number of them is: together with alternating
-        functions 3 and 4 this makes a reply to an earlier read recognisable.
+        ``lead``: registers before ``address`` that may be read, too. On RTU, the link reads a varying number of them and alternates
+        functions 3 and 4, so that it recognises a reply to an earlier read.
 
         Raises
         ------

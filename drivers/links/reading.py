@@ -1,7 +1,7 @@
 """A thread that only reads bytes from a descriptor into a bounded ring, so that no busy loop, disk or solver lets the kernel's small buffer
 overflow.
 
-Bytes that do not fit into the ring are counted and reported as a loss; the marks warn before that.
+Bytes that do not fit into the ring are counted and reported as lost; ``Ring.on_mark`` warns before that.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ReadPiece:
 
 
 class Ring:
-    """A FIFO of at most ``capacity`` bytes; safe between one thread that puts and one that takes."""
+    """A thread-safe FIFO of at most ``capacity`` bytes, for one thread that puts and one that takes."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -71,7 +71,7 @@ class Ring:
             self.on_mark(mark)
 
     def take(self, timeout_s: float) -> list[ReadPiece] | None:
-        """Wait for the oldest pieces, about 64 KiB, and return them: an empty list after ``timeout_s``, None after the end."""
+        """Wait for bytes and return the oldest pieces, about 64 KiB at most; an empty list after ``timeout_s``, None after the end."""
         with self._news:
             if not self._pieces:
                 self._idle = True  # the taker returns only after processing what it took before
@@ -176,7 +176,7 @@ class ReadingThread:
                 return True, None
 
     def _read_rest(self) -> None:
-        """Read the rest from the kernel when the line closes: it may be the end of a run."""
+        """Read what the kernel still holds when the line closes: it may be the end of a run."""
         left = self._ring.capacity
         with suppress(OSError):
             while left > 0 and (data := os.read(self._descriptor, _READ_BYTES)):

@@ -32,7 +32,7 @@ PARITIES = ("none", "even", "odd")
 
 @dataclass(frozen=True, slots=True)
 class SerialUrl:
-    """A serial port by its device path, 8 data bits, 1 stop bit; ``baud`` in bit/s; ``parity`` none, even or odd.
+    """A serial port, by its device path: 8 data bits, 1 stop bit; ``baud`` in bit/s; ``parity``: none, even or odd.
 
     ``serial_no``: serial number of the only accepted device; None: any.
     """
@@ -148,7 +148,7 @@ _ROLES: Mapping[str, tuple[type[DeviceUrl], ...]] = {
 
 
 def is_url_of(role: str, text: str) -> bool:
-    """Whether a URL leads to a device of this role: ballbar, laser, cnc or fixture. Raises as `parse_url`.
+    """Whether a URL leads to a device of this role: ballbar, laser, cnc or fixture. Raises the errors of `parse_url`.
 
     An installed driver checks URLs of its own scheme when it opens the device.
     """

@@ -102,7 +102,7 @@ _LONGEST_US = 100 * 365 * 86400 * 10**6
 
 
 def _order(known: int, found: int) -> str:
-    """Return the order that turns the known value into the found one, or an empty string."""
+    """Return the byte order (``"CDAB"``, ...) in which the known value reads as the found one; empty if there is none."""
     data = known.to_bytes(4, "big")
     return next((name for name, places in _ORDERS.items() if bytes(data[i] for i in places) == found.to_bytes(4, "big")), "")
 
@@ -129,7 +129,7 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
 
 
 def check_clock(device: str, device_us: int) -> None:
-    """Raise WrongDevice for a device time since power-on of more than 100 years: its four registers must be in the wrong order."""
+    """Raise WrongDevice if the device's clock shows more than 100 years since power-on: its four registers must be in the wrong order."""
     if device_us > _LONGEST_US:
         detail = f"its clock reads {device_us:#018x} us since it was switched on: the registers of 64-bit values are swapped"
         raise WrongDevice(device, "identify", detail, _SET_ORDER)
@@ -139,7 +139,7 @@ _POLL_S = 0.005
 
 
 def next_number(acknowledged: int) -> int:
-    """Return the only number that the device will execute next (mod 65536)."""
+    """Return the only command number that the device will accept next (mod 65536)."""
     return (acknowledged + 1) & 0xFFFF
 
 
@@ -157,7 +157,7 @@ async def run_numbered(
     Parameters
     ----------
     number : int
-        The number in the command, ``next_number(last acknowledged)``.
+        Number of the command: `next_number` of the last acknowledged one.
     write, read_ack : callable
         ``write`` sends the command (called exactly once); ``read_ack`` returns (acknowledged number, result code).
     settle_s : float
