@@ -144,7 +144,7 @@ def read_backup(folder: Path) -> Backup:
 def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, list[str]]:
     """Number of records in the audit of a copied database, and all faults of the audit.
 
-    ``heads``: file of the audit's heads; ``key``: file of its key. Without a key the audit cannot be checked: no faults are returned.
+    ``heads``: file with one sealed digest per record; ``key``: file of the audit's key, without which no faults can be found.
 
     Raises
     ------
@@ -304,7 +304,7 @@ def _segments(folder: Path, source: BackupSource) -> int:
 
 
 def _audit(part: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
-    """Copy the audit's files. Heads are copied after the database, so that none is missing; those of later records are dropped."""
+    """Copy the audit's files: heads (a sealed digest per record) after the database, so that none is missing, but none of later records."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():

@@ -50,8 +50,8 @@ class SearchStart:
 class Judgement:
     """Verdict of the judging runs, to which nothing was fitted.
 
-    ``proved``: whether they confirm the named effects, None if they cannot judge; ``closed``: closed share of their ``gap``; ``against``:
-    why the effects are not confirmed.
+    ``proved``: whether they confirm the named effects, None if they cannot judge; ``closed``: share of their ``gap`` that the
+    effects close; ``against``: why the effects are not confirmed.
     """
 
     rule: str

@@ -112,7 +112,7 @@ class FoundThinning(FileObject):
 class DiscoveryFile(FileObject):
     """Effects that a campaign's simulation lacks, and the predictions of sealed runs, mm.
 
-    ``effects``: names that the answer stands for. ``suspects``: names that fit the fitted runs but that the judging runs do not confirm;
+    ``effects``: named effects that are claimed. ``suspects``: names that fit the fitted runs but that the judging runs do not confirm;
     then the verdict is "unknown". ``proved``: whether the judging runs confirm the effects; ``proof``: by which rule, or why they cannot
     judge.
     """

@@ -20,7 +20,7 @@ MATRIX = "base64 of float64, little endian, lower triangle by rows"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PackedReadings:
-    """Residuals or predictions of one run, mm; float32 keeps 7 digits, a nanometre of 10 mm."""
+    """Residuals or predictions of one run, mm; float32 keeps 7 digits: one nanometre in 10 mm."""
 
     n: int
     data: str
@@ -117,8 +117,8 @@ class EffectSize:
     """An effect with its size and its catalogue entry; findings and model books share it.
 
     ``coefficients``, ``covariance``: of the effect's linear columns, in their units. ``forms``: names of the extra shape terms that it
-    needed. ``needed``: rms of the judging runs without this effect divided by that with it, None if no run judges. ``evidence``: gain in
-    log evidence (natural logarithm), less the price of an additional effect.
+    needed. ``needed``: rms of the judging runs without this effect, divided by their rms with it; None if no run judges. ``evidence``:
+    gain in log evidence (natural logarithm), less the price of an additional effect.
     """
 
     label: str
@@ -194,8 +194,8 @@ class ChangeRival:
 class MotionChange:
     """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
 
-    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: in how many of the two halves
-    of the runs a separate search finds it.
+    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: in how many halves of the
+    runs (0 to 2) a separate search finds it.
     """
 
     motion: str
@@ -239,7 +239,7 @@ class Finding:
     effects : confirmed or unjudged. suspects : names that fit the fitted runs but are not confirmed by the judging runs; then the verdict
         is "unknown".
     proved, proof : whether runs that were never fitted confirm the names, and by which rule.
-    location : location of the gap of the present model.
+    location : where the gap of the present model shows (tests, axes, places, times).
     rejected : labels that were tried, and the reason against each.
     confounded_with : rivals of the named effects whose evidence is too close to exclude them. beside : unnamed structures beside them.
     agreement : how runs that were never fitted agree with their prediction, if nothing is missing.

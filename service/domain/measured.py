@@ -158,7 +158,7 @@ class RunEnd:
 
     ``path_start_us``, ``path_end_us``: controller time of start and end of the path; ``good_us``: controller time until which an
     interrupted path ran at constant feed; ``box_boot_id``: boot id of the ball-bar's box; ``clock_pairs``: controller time (µs) and arrival
-    (host s) of statuses; ``mounted_us``: controller time of mounting cup or laser after the start document was written.
+    (host s) of status messages; ``mounted_us``: controller time at which cup or laser was mounted, if after the start document.
     """
 
     path_start_us: int | None = None

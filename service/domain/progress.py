@@ -44,7 +44,7 @@ def ignore_progress(_: Progress) -> None:
 class RunningCheck(Progress):
     """The running check and its progress. ``prompt``: number of the request to a person, 0 for none; ``ask``: its text.
 
-    ``state`` is that of its job.
+    ``state`` is the state of its job.
     """
 
     schedule: Word

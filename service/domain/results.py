@@ -65,7 +65,7 @@ class ModelRecord(DocumentRow):
 
 @dataclass(frozen=True, slots=True)
 class NewVersion:
-    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: no version yet."""
+    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: there is none yet."""
 
     machine: str
     after: int | None

@@ -146,7 +146,7 @@ def _numbers(values: Any) -> NDArray[Any]:
 class Setup:
     """Mounting of an instrument.
 
-    ``t_set_s``: time of mounting on the campaign's clock; ``tool_mm``: None for the machine's own; ``axis``: letter of the axis of a helix
+    ``t_set_s``: time of mounting on the campaign's clock; ``tool_mm`` None: the machine's tool; ``axis``: letter of the axis of a helix
     or of a positioning test; ``document``: all keys as stored, also those without a field, for digests and listings.
     """
 
@@ -165,7 +165,7 @@ class Setup:
 class BarSetup(Setup):
     """Mounting of a ball-bar: the cup's centre, the bar, and the path about it.
 
-    ``turns``: of a helix; ``plane``, ``span_deg``: of a circle.
+    ``turns``: number of turns of a helix; ``plane``, ``span_deg``: plane and covered angle of a circle.
     """
 
     centre_mm: F1
@@ -195,8 +195,8 @@ class BarSetup(Setup):
 class LaserSetup(Setup):
     """Mounting of a laser along one line.
 
-    ``diagonal``: letters of the body diagonal; ``face``: plane of a face diagonal; ``order``: of the axes of a step diagonal, empty for a
-    plain one, None if not stated; ``increment_mm``: of a step, by axis; ``overrun_mm``: beyond both ends before turning.
+    ``diagonal``: letters of the body diagonal; ``face``: plane of a face diagonal; ``order``: in which a step diagonal moves its axes,
+    empty for a plain one, None if not stated; ``increment_mm``: of a step, by axis; ``overrun_mm``: travel past both ends to turn.
     """
 
     start_mm: F1 | None
@@ -242,7 +242,7 @@ class LaserSetup(Setup):
 
     @property
     def span_mm(self) -> F1:
-        """From start to end, mm, shape (3,); raises like `ends_mm`."""
+        """Vector from start to end, mm, shape (3,); raises like `ends_mm`."""
         start, end = self.ends_mm
         return end - start
 
@@ -336,7 +336,7 @@ class RunState:
         return cls(status=str(doc.get("status", "complete")), covered=_number(doc.get("covered")))
 
     def to_document(self) -> Doc:
-        """The key ``state``."""
+        """The value of the key ``state`` in a run's document."""
         return {"status": self.status} | ({} if self.covered is None else {"covered": self.covered})
 
 

@@ -68,7 +68,7 @@ class OutboxRecord(Row):
 
 @dataclass(frozen=True, slots=True)
 class ReplyRecord:
-    """The answer to the request of an idempotency key; ``status`` None: the request is still in progress."""
+    """The answer to the request that came with an idempotency key; ``status`` None: the request is still in progress."""
 
     digest: str
     status: int | None

@@ -147,7 +147,7 @@ def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
 
 
 def run_summary(record: RunRecord, machine: str) -> RunSummary:
-    """Return the summary of a complete record."""
+    """Return the summary of a full record of a run."""
     row = {one.name: getattr(record, one.name) for one in fields(record)}
     state = record.visible_status
     return of_row(RunSummary, row, machine=machine, run_id=record.label, status=state, reason=_reason(state, record.reason, record.end_doc))

@@ -38,7 +38,7 @@ class SolutionDetail(SolutionSummary):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoverySummary(StoredResult):
-    """A search for effects that a campaign's model lacks. ``state``, ``why``: the latest state; empty: none yet."""
+    """A search for effects that a campaign's model lacks. ``state``, ``why``: the latest state and its reason; empty before the first."""
 
     state: str
     why: str
@@ -120,7 +120,7 @@ def solution(reader: Reader, number: int) -> SolutionDetail:
 def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) -> VolumeMap:
     """Return the volume map of a solution, rounded to 0.001 µm, which is far below every U.
 
-    ``motions``: the map shows their joint effect; empty: that of all motions. ``nodes``: per axis.
+    ``motions``: the map shows their joint effect, or that of all motions if empty. ``nodes``: number per axis.
     """
     reader.row("solutions", number, "solution")
     with as_stored():

@@ -22,7 +22,7 @@ OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedRms:
-    """Predicted rms over the volume before and after, and standard uncertainty of the improvement, µm."""
+    """Predicted rms over the volume without and with the new tables, and standard uncertainty of the improvement, µm."""
 
     before: float
     after: float
@@ -31,7 +31,7 @@ class PredictedRms:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProposalSummary(StoredResult):
-    """Proposed tables. ``state`` changed: the stored row was altered, so its content is unknown. ``by``: account of the proposer."""
+    """Proposed tables. ``state`` ``changed``: the stored row was altered, so its content is unknown. ``by``: account of the proposer."""
 
     solution: int
     state: ProposalState
@@ -134,7 +134,7 @@ def proposal(reader: Reader, number: int) -> ProposalDetail:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurveDifference:
-    """One of the nine tables, before and after. ``u_um``: standard uncertainty of the new entries."""
+    """One of the nine tables, old and new. ``u_um``: standard uncertainty of the new entries."""
 
     table: str
     moved: str

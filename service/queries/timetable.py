@@ -28,7 +28,7 @@ class NextDue:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScheduleState(Schedule):
-    """One line of the timetable. ``next_due_utc`` None: the expression never matches again; ``latest``: slots, newest first."""
+    """One line of the timetable. ``next_due_utc`` None: the cron expression never matches again; ``latest``: slots, newest first."""
 
     rule_text: str
     next_due_utc: datetime | None

@@ -37,7 +37,7 @@ SHUTDOWN_RECORD_S = 1.0
 class Job(ABC, Generic[T]):
     """Work that has the machine to itself, and its records.
 
-    ``T``: what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``: of `JobState`.
+    ``T``: what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``: as in `JobState`.
     """
 
     kind: JobKind = "check"
@@ -175,7 +175,7 @@ def failure(error: Exception) -> JobOutcome:
 
 @dataclass(frozen=True, slots=True)
 class CheckJobs:
-    """Makes the check of a slot.
+    """Makes the check of a slot as a job.
 
     Parameters
     ----------

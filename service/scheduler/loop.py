@@ -208,7 +208,7 @@ class Scheduler:
             await self._raise_alarm(*outcomes.caught_up(schedule.name, ours, by))
 
     async def _take(self, schedule: Schedule, slot: datetime) -> None:
-        """Handle a claimed slot: it is too late, or it waits. At most one slot of a schedule waits."""
+        """Let a claimed slot wait, or record it as missed if it is too late. At most one slot of a schedule waits."""
         late = self._clock.utc() - slot
         if schedule.catch_up == "skip" and late > timedelta(seconds=schedule.grace_s):
             await self._end(schedule, slot, outcomes.found_late(schedule, slot, late))

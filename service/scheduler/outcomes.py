@@ -59,7 +59,7 @@ def not_ready(text: str) -> Hindrance:
 
 
 class SlotOutcome(NamedTuple):
-    """State for the ledger, code of the alarm, sentence for both."""
+    """Outcome of a slot: state for the ledger, code of the alarm, and a sentence for both."""
 
     state: str
     code: str

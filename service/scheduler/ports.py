@@ -73,7 +73,7 @@ class SlotLedger(Protocol):
         ...
 
     async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
-        """Record the outcome of a claimed slot: state (30 characters) and its sentence."""
+        """Record the outcome of a claimed slot: state (at most 30 characters) and its sentence."""
         ...
 
     async def last_claimed(self, schedule: str) -> datetime | None:
@@ -85,7 +85,7 @@ class Readiness(Protocol):
     """Checks whether the machine meets a schedule's preconditions."""
 
     async def lack(self, schedule: Schedule) -> str:
-        """Return the unmet precondition as one sentence, or nothing."""
+        """Return the unmet precondition as one sentence, or an empty text."""
         ...
 
     async def watch(self) -> None:

@@ -76,7 +76,7 @@ class Ready:
         self._position: tuple[float, ...] | None = None
 
     async def lack(self, schedule: Schedule) -> str:
-        """Return the unmet precondition as one sentence, or nothing. The devices are read only if a precondition needs them."""
+        """Return the unmet precondition as one sentence, or an empty text. The devices are read only if a precondition needs them."""
         needs = schedule.needs
         if needs == Needs():
             return ""

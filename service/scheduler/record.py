@@ -78,7 +78,7 @@ def alarm(doc: Doc) -> Doc:
 def cause_of(cause: Exception) -> Doc:
     """Return code, one line of cause, remedy and device of an error.
 
-    The first known member represents a group of errors: if several devices fail together, the first failure matters.
+    Of a group of errors, the first one of a driver or of Abbe counts: if several devices fail together, the first failure matters.
     """
     known = _first(cause)
     if isinstance(known, DriverError):

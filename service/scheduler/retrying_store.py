@@ -73,7 +73,7 @@ class StoreLedger(RetryingStore):
         return [OpenSlot(datetime.fromisoformat(one.slot_utc), one.state == RUNNING) for one in found]
 
     async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
-        """Record the outcome of a claimed slot: state (30 characters) and its sentence."""
+        """Record the outcome of a claimed slot: state (at most 30 characters) and its sentence."""
         await self._write(self._store.slots.finish, self._key(schedule), slot_utc, state[:30], reason)
 
     async def last_claimed(self, schedule: str) -> datetime | None:

@@ -108,7 +108,7 @@ def _fixed_times(cron: str, zone: ZoneInfo, after: datetime) -> Iterator[datetim
 
 
 def _by_the_clock(cron: str, zone: ZoneInfo, after: datetime) -> Iterator[datetime]:
-    """Between two clock changes, wall time is UTC plus a constant: cronsim counts there, and restarts at each change."""
+    """Yield UTC instants: cronsim counts in wall time between two clock changes, and restarts at each change."""
     while True:
         offset = after.astimezone(zone).utcoffset() or timedelta(0)
         change: datetime | None = None

@@ -58,7 +58,7 @@ class FiredRule:
 
     @property
     def text(self) -> str:
-        """The reasons as one sentence."""
+        """The signals as one sentence."""
         return "; ".join(s.text for s in self.signals) or f"no signal, verdict {self.verdict}"
 
 

@@ -67,7 +67,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
-    """Reference for a jump: value and standard uncertainty, by default the mean of earlier checks while they are few; else None."""
+    """Reference for a jump (value, standard uncertainty): that of ``terms.compare``, or the mean of few earlier checks, or None."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
         return kept

@@ -109,7 +109,7 @@ def incomparable_reason(first: LoadedRun, other: LoadedRun) -> str:
 
 
 def _kind(one: LoadedRun, key: str) -> str:
-    """Text of a set-up's field; the axis of a helix is also derived from its path."""
+    """Return a set-up's field as text; the axis of a helix, if not stated, is derived from its path."""
     if key == "axis" and one.run.test == "ballbar_helix":
         axis = helix_axis(one.run.setup.axis, one.data.axes_mm)
         return "" if axis is None else AXES[axis]
@@ -121,7 +121,7 @@ def _feed(mm_min: float) -> str:
 
 
 def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -> list[str]:
-    """Remarks about a comparison: other places, tables in force, directions or feeds. ``feed`` formats mm/min with its unit."""
+    """Tell how places, tables in force, directions and feeds differ from those of the first run. ``feed`` formats mm/min with its unit."""
     out = []
     first = loaded[0]
     for other in loaded[1:]:
@@ -151,8 +151,8 @@ def _same(a: Any, b: Any) -> bool:
 def curve(one: LoadedRun) -> ComparedCurve:
     """Deviation along a run, prepared for a comparison.
 
-    Ball-bar: centre and length of the bar fitted away; u from noise (second differences) and from remounting the bar. Laser: mean of all
-    readings of a position; u from the scatter between out and back about its mean (the mean is lost motion) and from the wavelength.
+    Ball-bar: a fit removes centre and length of the bar; u from noise (second differences) and from remounting the bar. Laser: mean of all
+    readings of a position; u from the scatter of half the difference out minus back (its mean is lost motion) and from the wavelength.
     """
     return _bar(one) if one.data.kind == "bar" else _laser(one)
 

@@ -110,7 +110,7 @@ def _axis(run: Run) -> str:
 
 
 def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTest | None:
-    """Test from readings by position, side and cycle; None if they are not a bidirectional test, with the reason in ``refused``."""
+    """Sort readings by position, side and cycle into a test; None if it is not bidirectional, with the reason added to ``refused``."""
     runs = tuple(r.run_id for r in group)
     try:
         readings = _approaches(name, group)

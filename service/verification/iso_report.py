@@ -206,7 +206,7 @@ def _pair(out: Evaluated, group: str, forward: CircleTest, backward: CircleTest)
 
 
 def _u(one: OnePath) -> float:
-    """Standard uncertainty of one reading of the shape, mm."""
+    """Standard uncertainty of one reading of a circle's shape, from noise and repeatability, mm."""
     return float(np.hypot(one.noise_mm, U_REPEAT_MM))
 
 

@@ -95,7 +95,7 @@ class VerifiedBy:
         return {"state": self.state, "why": self.why, "number": self.number, "utc": utc, "table_crc": self.table_crc, "text": self.text}
 
     def verdict(self, verdict: str) -> str:
-        """Text for the last verdict: the verdict itself if it holds, else the state of the machine."""
+        """Return the verdict of the last check if it holds; otherwise the verification state (`state`)."""
         return verdict if self.holds else self.state
 
 
@@ -196,7 +196,7 @@ def measured(record: VerificationRecord) -> bool:
 
 
 def of_push_taken_back(record: VerificationRecord) -> bool:
-    """Whether a verification belongs to a push that was not kept, so that its table is not in force."""
+    """Whether a verification belongs to a push that was not kept: the verified table is then not in force."""
     return bool(record.doc.get("push")) and record.verdict != "pass"
 
 
@@ -210,7 +210,7 @@ def _measured_with(store: Store, record: VerificationRecord, crc: int | None, si
 
 
 def began(store: Store, record: VerificationRecord) -> datetime:
-    """Start of a check's campaign, which is later than an acceptance given with the command; without a campaign: start of the check."""
+    """Start of a check's campaign, after any table was accepted by the same command; without a campaign: start of the check."""
     if record.campaign_id is None:
         return started(record)
     return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)

@@ -1,4 +1,4 @@
-"""Verification: figures of runs that identification did not use, compared before and after a push, and with limits."""
+"""Verification: figures of runs that identification did not use, compared before and after a push, and against limits."""
 
 from __future__ import annotations
 

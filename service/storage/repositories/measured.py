@@ -39,7 +39,7 @@ class Machines(Repository):
     """Descriptions of machines."""
 
     def add(self, name: str, doc: Doc) -> int:
-        """Store a description (``machine`` of the exchange format) once: the same name and description give the same id."""
+        """Store a description (``machine`` of the exchange format) and return its id. One that is stored already keeps its id."""
         return self._db.commit(lambda connection: machine_id_of(connection, name, doc, self._db.now()))
 
     def get(self, machine_id: int) -> MachineRecord:

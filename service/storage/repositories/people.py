@@ -60,7 +60,7 @@ class People(Repository):
         self._db.commit(work)
 
     def add_session(self, user_id: int, digest: str, instead_of: str = "") -> int:
-        """Begin a session and end that of digest ``instead_of``; delete rows older than a month."""
+        """Begin a session and end the one of digest ``instead_of`` (empty: none); delete rows older than a month."""
 
         def work(connection: Connection) -> int:
             now = self._db.now()

@@ -243,7 +243,7 @@ class Proposals(Repository):
     """Proposals, approvals, rejections."""
 
     def add(self, machine: str, solution_id: int, doc: Doc, digest: str) -> int:
-        """Store a proposal for a machine (by name) from a solution; return its id. ``digest``: SHA-256 of ``doc``, without NaN in it."""
+        """Store a proposal for a machine (by name) from a solution; return its id. ``doc`` holds no NaN; ``digest``: its SHA-256."""
         return self._add(proposals, machine=machine, solution_id=solution_id, doc=doc, digest=digest, created_utc=self._db.now())
 
     def get(self, proposal_id: int) -> ProposalRecord:
@@ -347,7 +347,7 @@ def chain_of(begun: Sequence[tuple[str, str, str]], machine: str, control: str) 
     begun : sequence of tuple
         First entries of pushes, newest first: journal, machine name, control (empty: unknown).
     machine, control : str
-        Without a control the machine's name decides: it is the journal in which that name was last used.
+        An empty ``control`` means unknown: then it is the journal in which this machine name was last used.
     """
     if not control:
         return next((chain for chain, name, _ in begun if name == machine), machine)

@@ -122,9 +122,9 @@ class Alarms(Repository):
         Parameters
         ----------
         alarm : int or None
-            None: the next alarm of this machine. 0 collects entries that belong to no alarm.
+            None: begin the machine's next alarm. 0 collects entries that belong to no alarm.
         seq : int
-            Number of the last entry that the caller has read, plus one: so a decision on stale data is refused.
+            Number of the last entry that the caller has read, plus one, so that a decision on stale data is refused.
         messages : sequence of (topic, document)
             Each document gets the number of the alarm.
 

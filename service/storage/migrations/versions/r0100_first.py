@@ -1,7 +1,7 @@
-"""The first schema: the tables of the program as they are, until the first release.
+"""The first schema: until the first release, the tables that the program has at present.
 
 Databases from before the first release are not migrated (decision 0033). Once there is a second revision, this one has to state its own
-tables; a test reminds of it.
+tables; a test checks this.
 """
 
 from __future__ import annotations
