@@ -21,10 +21,10 @@ END_S = 10.0
 """Longest wait at the end for a pending write of the database."""
 BATCH = 200
 TOGETHER_S = 0.25
-"""Longest wait of a record for a joint transaction. The segment keeps it safe; one transaction per record (100 per second) would cost more
-than the rest of the capture."""
+"""Longest time that a record waits for others to share its transaction. The segment keeps it safe meanwhile; one transaction per record
+(100 per second) would cost more than the rest of the capture."""
 TOGETHER_BYTES = 1 << 16
-"""A batch of this size never waits: on a disk that runs full the database must still get all records, and the reserve is small."""
+"""Queued records of this size do not wait: while a disk runs full, the database must still get all of them, and the reserve is small."""
 
 
 def chunk_of(record: Record) -> ChunkRecord:
@@ -82,7 +82,7 @@ class Ingest:
         return len(self._places)
 
     def finish(self, timeout_s: float) -> bool:
-        """Wait until the database has everything; False if it did not take all in time (the segment keeps it)."""
+        """Wait until the database has everything; False if it did not take everything in time. The segment still has it."""
         with self._news:
             self._hurry = True
             self._news.notify_all()

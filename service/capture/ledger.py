@@ -1,6 +1,7 @@
 """Accounts for every sequence number of a run: stored as valid, stored with a flag, or in an explicit gap. Pure bookkeeping.
 
-`Drafter` turns batches into chunks and gaps; `streams_doc` and `joined` make the account of a whole run.
+`Drafter` turns batches into chunks and gaps; `streams_doc` and `joined` list which chunks belong to which stream. A stream is one series of
+ball-bar samples, numbered from 0; a run has several if the ball-bar was started again.
 """
 
 from __future__ import annotations
@@ -98,12 +99,12 @@ class Ledger:
         return found
 
     def ends(self) -> dict[int, int]:
-        """Return the number after the highest known one of each stream."""
+        """Return the sequence number after the highest known one, by stream."""
         streams = sorted({*self._stored, *(gap.stream for gap in self.gaps)})
         return {stream: max((last + 1 for _, last in self._covered(stream)), default=0) for stream in streams}
 
     def duplicates(self) -> int:
-        """Return the number of entries in excess of one per sequence number."""
+        """Return how many entries are superfluous because another one covers the same sequence number."""
         count = 0
         for stream in sorted({*self._stored, *(gap.stream for gap in self.gaps)}):
             at = 0
@@ -135,7 +136,7 @@ BOX = "lost in the ball-bar's box (buffer overrun)"
 SLOW = "this computer did not keep up: the driver's buffer was full"
 
 Item = tuple[int, BarBatch] | tuple[str, dict[str, Any]]
-"""A batch with its stream, or a record with its channel."""
+"""A batch of the ball-bar after the number of its stream, or another record after the name of its channel."""
 
 
 @dataclass(slots=True)
@@ -343,7 +344,7 @@ def streams_from_end_doc(end_doc: dict[str, Any] | None) -> dict[int, int] | Non
 
 
 def settle(store: Store, run_id: int, scanned: Scan) -> Ledger:
-    """Return the ledger of a run whose good records are all in the database; store damaged ranges there as gaps.
+    """Return the ledger of a run whose good records are all in the database, and store its damaged ranges there as gaps.
 
     Raises
     ------

@@ -28,7 +28,7 @@ from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.storage.store import Store
 
 GROUP_S = 0.01
-"""Longest wait of a sample after its arrival, so that a group shares one sync. Earlier waits (for framing or a slow sync) count."""
+"""Longest time from a sample's arrival that it waits for others to share one sync. Time lost earlier, as by a slow sync, counts."""
 MAX_PENDING = 8192
 HANG_S = 30.0
 
@@ -100,7 +100,7 @@ class CaptureLog:
             self._news.wait_for(lambda: self._stored >= goal or not self._thread.is_alive())
 
     def disk_full(self) -> None:
-        """Report a full database disk: end the run while the segment still has space."""
+        """Take note that the database's disk is full: the run ends while the segment still has space."""
         with self._news:
             self._full = True
             self._news.notify_all()
@@ -264,7 +264,7 @@ class _Tap:
 class CaptureRecorder:
     """Records one run. Open it with `recording`.
 
-    ``behind``: the segment has records that the database lacks; after the end it must stay, and the run open, for the next start.
+    ``behind``: whether the segment has records that the database lacks. If so at the end, it stays, and the next start recovers the run.
     """
 
     def __init__(self, log: CaptureLog, ingest: Ingest, keep: bool, io: FileIO, *, temporary: bool = False) -> None:
@@ -277,7 +277,7 @@ class CaptureRecorder:
         """The live view; set before a stream begins."""
 
     def tap(self) -> _Tap:
-        """Return the tap that takes every sample of a new stream."""
+        """Return the receiver of every sample of a new stream."""
         self._streams += 1
         return _Tap(self.log, self._streams - 1, self.look)
 
@@ -342,7 +342,7 @@ class CaptureRecorder:
                 self.log.segment.path.parent.rmdir()
 
     def release(self) -> None:
-        """Let this process recover the segment like any other; the run is closed, or stays open for the recovery."""
+        """Stop protecting the segment from recovery by this process: its run is closed, or the recovery shall close it."""
         _active.discard(_key(self.log.segment.path))
 
 
@@ -383,7 +383,7 @@ async def recording(
     Parameters
     ----------
     clock : Clock
-        For the UTC offset beside every chunk; no sample time depends on it.
+        For the UTC offset that is stored with every chunk; no sample time depends on it.
     about : dict, optional
         Description of the run, for the segment's first record.
     published : callable, optional

@@ -40,7 +40,7 @@ from abbe.service.storage.store import Store
 
 
 def put_away(path: Path, scanned: Scan, *, keep: bool) -> None:
-    """Delete a recovered segment (or ``keep`` it), but never unreadable parts. Never raises: the next start tries again."""
+    """Delete a recovered segment unless ``keep``; unreadable parts always stay on the disk. Never raises: the next start tries again."""
     with suppress(OSError):
         if scanned.damaged or (scanned.tail_bytes and not _copied(path, scanned.good_bytes)):
             set_aside(path, DAMAGED_SUFFIX)
@@ -118,7 +118,7 @@ def _try_lock(handle: int) -> bool:
 __all__ = ["DAMAGED", "RecoveredRun", "ledger_of", "read_segment", "recover_segments"]
 
 MOST_RUNS = 2**31
-"""No database has a row with such a number, but a damaged segment may name it."""
+"""Limit of run numbers. No database has a run with this number, but a damaged segment may name one."""
 
 
 @dataclass(frozen=True, slots=True)

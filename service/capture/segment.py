@@ -246,7 +246,7 @@ class Record:
     stream : int
         Number of the stream in the run; sequence numbers begin anew in each stream.
     boot_id : int
-        Of the device, 0 if it has none.
+        Boot id of the device, 0 if it has none.
     first_seq, count : int
         First sequence number and number of samples.
     flags : int
@@ -352,7 +352,7 @@ class Scan:
     tail_bytes : int
         Number of these later bytes.
     broken_links : list of int
-        Records whose hash does not match the previous record: a record was removed, inserted or changed.
+        Indices of records whose ``previous`` is not the hash of the record before: one was removed, inserted or changed.
     head : bytes
         SHA-256 of the last good record.
     """

@@ -17,13 +17,13 @@ from abbe.service.storage.store import Store
 MIB = 1 << 20
 SUFFIX = ".seg"
 ORPHAN = ".orphan"
-"""Set aside: a segment without a run in this database, or of a closed run that lacks some of its records."""
+"""Suffix of a segment set aside because this database has no run for it, or a closed run without some of its records."""
 CONFLICT = ".conflict"
-"""Set aside: a segment that contradicts the database or cannot be read."""
+"""Suffix of a segment set aside because it contradicts the database or cannot be read."""
 DAMAGED_SUFFIX = ".damaged"
-"""Set aside: a segment with damage between good records; its readable records are in the database."""
+"""Suffix of a segment set aside because of damage between good records; its readable records are in the database."""
 TAIL = ".tail"
-"""A copy of the tail that was cut off a segment."""
+"""Suffix of a copy of the tail that was cut off a segment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +51,9 @@ def segment_folder(database_url: str, settings: CaptureSettings, database_id: st
     Parameters
     ----------
     database_url : str
-        As the store was opened; for SQLite the file after following links counts.
+        Address with which the store was opened; symbolic links to an SQLite file are followed.
     database_id : str
-        Own name of a database on a server (`Store.database_id`), which may have several addresses.
+        Identity of a database on a server (`Store.database_id`), because the same database may have several addresses.
 
     Raises
     ------

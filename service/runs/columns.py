@@ -126,7 +126,7 @@ def load_run(store: Store, id_or_label: int | str) -> Run:
 
 
 def whole_run(store: Store, record: RunRecord) -> Run:
-    """Return a run with its pieces; raises like `load_run`."""
+    """Return a run joined with its pieces, the interrupted runs whose path it resumed; raises like `load_run`."""
     run = single_run(record, store.chunks.of_run(record.id))
     pieces = record.start.pieces
     if not pieces:
@@ -152,7 +152,7 @@ def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> 
 
 
 def path_progress(store: Store, run: int) -> ReadProgress | None:
-    """Return the progress of a path after its last interrupted run and the earlier pieces; None if it has to start again."""
+    """Return how far a path was read by its last interrupted run ``run`` and the pieces before it; None if it has to start again."""
     record = store.runs.find(run)
     if record.reason.startswith(StretchDiffers.code):
         return None  # either of the two readings of the stretch may be wrong
@@ -206,7 +206,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
 
 
 def _check_documents(record: RunRecord) -> None:
-    """Raise KeyError where a default would change the readings: clock, machine, rate of a path, start of a path that has an end."""
+    """Raise KeyError if an entry is missing without which readings would differ: set-up, machine, clock, rate or start of a path."""
     for key in ("machine", "setup", "ctrl0_us", *(("rate_hz",) if record.start_doc.get("path") else ())):
         record.start_doc[key]
     if record.end.path_end_us and record.end.path_start_us is None:

@@ -70,7 +70,7 @@ def read_errors(path: Path) -> KnownErrors:
 
 
 def _further(part: BaseModel) -> dict[str, Any]:
-    """Return the keys of a part outside the format."""
+    """Return the keys of ``part`` that the format does not define."""
     return part.model_extra or {}
 
 
@@ -143,7 +143,7 @@ def _covered(names: tuple[str, ...], motions: ErrorMotions) -> str:
 
 
 def _runs(key: str, indices: list[int]) -> list[str]:
-    """``EXX.1``, or ``EXX.1 to EXX.50`` for consecutive parameters."""
+    """Return names of parameters as text: ``EXX.1``, or ``EXX.1 to EXX.50`` for consecutive ones."""
     ends: list[list[int]] = []
     for k in indices:
         if ends and k == ends[-1][-1] + 1:

@@ -21,7 +21,7 @@ BEYOND_MM = 5.0
 NEAR_MM = 0.05
 """Positions closer than this are the same place."""
 FEWEST = 3
-"""Places approached from both sides that are needed to estimate their difference."""
+"""Number of places approached from both sides that are needed to estimate how readings from the two sides differ."""
 
 
 def with_reversals(run: Run, q_mm: F2) -> tuple[F2, np.ndarray[tuple[int], np.dtype[np.intp]]]:
@@ -87,7 +87,7 @@ TESTS: dict[str, Test] = {"ballbar_helix": "helix", "ballbar_circle": "circle", 
 
 
 def run_data(run: Run, *, blocks: int = BLOCKS) -> RunData:
-    """Return the valid readings of a run as arrays; long ball-bar runs are block-averaged, without single outliers, which are counted.
+    """Return the valid readings of a run as arrays. Long ball-bar runs are averaged in blocks; single outliers are left out and counted.
 
     Raises
     ------

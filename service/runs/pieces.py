@@ -21,7 +21,7 @@ class ReadProgress:
     """Progress of a path: its pieces, the last one up to the end of its constant feed, and the readings of the last piece.
 
     ``counted_from_mm``: start of the counted part of the last piece; ``arc_mm`` and ``deviation_mm``, shape (n,): position along the whole
-    path and reading; ``boot_id``: of the box.
+    path and reading, mm; ``boot_id``: of the ball-bar's box.
     """
 
     pieces: tuple[RunPiece, ...]

@@ -180,7 +180,7 @@ class _Block:
 
 
 def _number(cell: str) -> float:
-    """A number of a CSV cell, else NaN; ``float`` alone would also accept ``1_00`` and non-ASCII digits."""
+    """Return the number in a CSV cell, or NaN; ``float`` alone would also accept ``1_00`` and non-ASCII digits."""
     if not cell.isascii() or "_" in cell:
         return math.nan
     try:

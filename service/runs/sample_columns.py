@@ -1,12 +1,12 @@
 """Turn samples into columns: every reading of ball-bar or laser gets the commanded position at which it was taken.
 
 For a ball-bar in motion, the controller's "path running" output (the sync line) is wired to the bar's box, which samples it together with
-the reading. The first sample with this input set was taken within one period after the path began; the arrival of a single sample at the
-computer places no reading.
+the reading. The first sample with this input set was taken within one period after the path began. No reading is placed by the arrival time
+of its sample.
 
-The two edges of the sync line tie the box's clock to the controller's (`run_clock`). The device stamps and arrival times of both streams
-are an independent check by way of this computer's clock, and a disagreement is reported. If they give the ratio of the two clock rates with
-less uncertainty than the edges, it is taken from them.
+The two edges of the sync line tie the box's clock to the controller's (`run_clock`). The device stamps and arrival times of both devices'
+messages are an independent check by way of this computer's clock, and a disagreement is reported. If they give the ratio of the two clock
+rates with less uncertainty than the edges, it is taken from them.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunCl
 
 
 def _fits(chunks: Sequence[ChunkRecord], end: RunEnd, period_s: float) -> tuple[ClockFit, ClockFit] | str:
-    """Fit the box's and the controller's clock to this computer's; a text if a clock jumped, empty with too few pairs."""
+    """Fit the box's and the controller's clock to this computer's. Return a text instead if one jumped, an empty one for too few pairs."""
     box = np.array([(c.last_device_us * 1e-6, c.last_host_s) for c in chunks], dtype=np.float64).reshape(-1, 2)
     cnc = np.array(end.clock_pairs, dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
     for name, pairs in (("ball-bar's box", box), ("controller", cnc)):
