@@ -24,12 +24,12 @@ class Machine:
     pivots_mm : array, shape (3, 3)
         Pivot of the X, Y, Z carriage: table frame for a work-side carriage, relative to the spindle reference for a tool-side one.
     tool_mm : array, shape (3,)
-        From the spindle reference to the functional point.
+        Vector from the spindle reference to the functional point.
 
     Raises
     ------
     ValueError
-        The chain is wrong, an array has another shape or a number that is not finite, or a stroke is empty.
+        The chain is invalid, an array has another shape or holds a number that is not finite, or a stroke is empty.
     """
 
     chain: str
@@ -78,7 +78,7 @@ def split_chain(chain: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 def lever_masks(chain: str) -> F3:
-    """Return which commanded travels belong to the lever arm of each carriage, 0 or 1, shape (3 carriages, 3 axes).
+    """Return a mask, shape (3 carriages, 3 axes): 1 where the commanded travel of an axis is part of the lever arm of a carriage, else 0.
 
     Rule G (docs/explanation/conventions.md) counts, on the tool side, the travels of the carriages nearer the tool, and on the work side
     all travels except those of carriages nearer the workpiece.

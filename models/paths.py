@@ -1,7 +1,7 @@
 """Commanded positions of the tests, shared by sequences and solvers.
 
-Laser: body diagonals in sequential or plain steps (Wang), face diagonals (ISO 230-6) and single-axis lines (ISO 230-2). Ball-bar, on a
-sphere about the cup: circles and arcs (ISO 230-4), hemispherical helices (Yang and Kim), and the links between them.
+Lasers follow body diagonals in sequential or plain steps (Wang), face diagonals (ISO 230-6) and single-axis lines (ISO 230-2). Ball-bars
+stay on a sphere about the cup: circles and arcs (ISO 230-4), hemispherical helices (Yang and Kim), and the links between them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def diagonal_ends(box_mm: F2, diagonal: str) -> tuple[F1, F1]:
 def step_diagonal(start_mm: F1, end_mm: F1, steps: int, order: str = "XYZ", *, back: bool = True) -> F2:
     """Return the positions of Wang's sequential step-diagonal test: the axes move one at a time in ``order``, ``steps`` times.
 
-    With ``back``, the same positions follow in reverse order; the turning point then stands there twice. The paper's order is X, Y, Z.
+    With ``back``, the same positions follow in reverse order, so the turning point occurs twice. The paper's order is X, Y, Z.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def step_diagonal(start_mm: F1, end_mm: F1, steps: int, order: str = "XYZ", *, b
 
 
 def straight_line(start_mm: F1, end_mm: F1, n: int, *, back: bool = True) -> F2:
-    """Return ``n`` equidistant positions on a line and, with ``back``, the same in reverse order (turning point twice; ISO 230-2).
+    """Return ``n`` equidistant positions on a line (ISO 230-2) and, with ``back``, the same in reverse order, turning point twice.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def cycles_of(out_mm: F2, cycles: int, overrun_mm: float = 0.0) -> tuple[F2, F1]
     cycles : int
     overrun_mm : float
         How far the machine goes beyond both ends before it turns, so that it approaches every target from the right side. These turning
-        points are positions of the result too. Without an overrun the machine turns at the end positions, which then stand there twice.
+        points are part of the result. Without an overrun the machine turns at the end positions, each of which then occurs twice in a row.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def circle_points(centre_mm: F1, radius_mm: float, plane: Plane, angles_rad: F1)
 
 
 def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
-    """Return points of the great circle that passes ``at_mm`` in the direction ``along``, at given angles from there (negative before it).
+    """Return points of the great circle that passes ``at_mm`` in the direction ``along``, at given angles from it (negative: before it).
 
     Such an arc leads into a path, or out of it, without a corner. It stays on the sphere, so that a mounted bar keeps its length.
 
@@ -228,7 +228,7 @@ def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
     centre_mm, at_mm : array, shape (3,)
         Centre of the sphere; a point on it.
     along : array, shape (3,)
-        Direction of motion there; only its component tangential to the sphere counts.
+        Direction of motion at ``at_mm``; only its component tangential to the sphere counts.
     angles_rad : array, shape (n,)
 
     Returns
@@ -348,7 +348,7 @@ def even_helix_points(centre_mm: F1, radius_mm: float, *, turns: float, n: int, 
     """Return points of the same curve as `helix_points`, but at distances that grow from 0.8 to 1.2 of their mean.
 
     By the area law alone, points lie several times farther apart at the pole than elsewhere. Exactly equal distances at a constant feed
-    would give one fixed sampling frequency, like a vibration.
+    would sample at one fixed frequency, at which a vibration can look like a slow error.
 
     Parameters, result and errors are those of `helix_points` for the full hemisphere.
     """

@@ -43,7 +43,7 @@ def t_above(t: ArrayLike, dof: ArrayLike) -> F1:
 
 
 def chi2_quantile(p: ArrayLike, dof: ArrayLike) -> F1:
-    """Return the quantile of chi-square."""
+    """Return the value below which chi-square lies with probability ``p``."""
     return np.asarray(2.0 * scipy.special.gammaincinv(0.5 * np.asarray(dof, dtype=float), p))
 
 

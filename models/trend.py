@@ -20,14 +20,14 @@ CUSUM_K = 0.5
 CUSUM_H = 5.0
 """Decision limit of the CUSUM: one false alarm in 465 checks on average (`average_run_length`)."""
 CUSUM_MOST = 2 * CUSUM_H
-"""Cap on the sums, so that the alarm ends about ten checks after a drift was cured."""
+"""Cap on the CUSUM, so that its alarm ends about ten checks after a drift was cured."""
 EWMA_WEIGHT = 0.2
 EWMA_L = 2.962
 """Width of the EWMA's limits, in its standard deviations: one false alarm in 500 checks on average (Lucas and Saccucci 1990)."""
 MIN_CHECKS = 8
-"""Number of checks needed for a statement about drift."""
+"""Number of checks needed to judge whether a series drifts."""
 MIN_FIT = 6
-"""Number of checks needed for a statement about the limit."""
+"""Number of checks needed to forecast when the limit is reached."""
 SIGNIFICANCE = 0.01
 """Significance level that a slope needs before `forecast` extrapolates it."""
 Z_MAX = 8.0
@@ -35,7 +35,7 @@ MOST_CHECKS = 400
 """How many of the latest checks a forecast uses; older ones say little about the days ahead."""
 MOST_KNOTS = 200
 FARTHEST = 20.0
-"""Longest forecast, in lengths of the series."""
+"""Longest forecast, as a multiple of the time that the series covers."""
 JUMP_SIGMAS = 5.0
 JUMP_SHARE = 0.25
 """Smallest jump that counts: in standard uncertainties, and as a share of the limit."""
@@ -138,7 +138,7 @@ def cusum(z: F1, k: float = CUSUM_K) -> tuple[F1, F1]:
 def average_run_length(shift: float = 0.0, k: float = CUSUM_K, h: float = CUSUM_H, states: int = 400) -> float:
     """Return the mean number of checks until a two-sided CUSUM alarms if the mean is off by ``shift`` standard deviations.
 
-    A Markov chain with ``states`` states (Brook and Evans 1972).
+    The method is a Markov chain with ``states`` states (Brook and Evans 1972).
     """
     one = [_one_sided(sign * shift, k, h, states) for sign in (1, -1)]
     return 1.0 / sum(1.0 / length for length in one)
@@ -201,14 +201,14 @@ def mean_of(values: F1, u: F1) -> tuple[float, float]:
 def jumps(change: float, u_change: float, limit: float) -> bool:
     """Tell whether a figure grew by more than its uncertainty explains.
 
-    For series of fewer than `MIN_CHECKS` checks, whose spread is unknown. Unlike the charts, this test takes the stated uncertainties
+    It serves series of fewer than `MIN_CHECKS` checks, whose spread is unknown. Unlike the charts, this test takes the stated uncertainties
     at face value; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for contributions missing in them.
     """
     return change > JUMP_SIGMAS * u_change and change > JUMP_SHARE * limit
 
 
 def _since(side: F1, found: int) -> int:
-    """Return the index after the last zero of a CUSUM: there the change most probably began."""
+    """Return the index after the last zero of a CUSUM up to index ``found``: there the change most probably began."""
     zero = np.flatnonzero(side[: found + 1] == 0)
     return int(zero[-1]) + 1 if len(zero) else 0
 
@@ -262,7 +262,7 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
 
 @dataclass(frozen=True)
 class _Sums:
-    """Weighted sums for fits of a level and a ramp that starts at one of several days (``knots``); figures count from the limit."""
+    """Weighted sums for fits of a level plus a ramp that starts at one of several days (``knots``), to figures minus their limit."""
 
     knots: F1
     w: float

@@ -16,7 +16,7 @@ U_REPEAT_MM = 1e-4
 
 @dataclass(frozen=True)
 class VerificationFigure:
-    """A figure and its standard uncertainty, and the curve behind it: deviation over position along the test (helix: index), all mm."""
+    """A figure, its standard uncertainty, and its curve, mm: deviation over the position on the diagonal or the index on the helix."""
 
     value_mm: float
     u_mm: float
@@ -27,7 +27,7 @@ class VerificationFigure:
 def diagonal_figure(run: RunData) -> VerificationFigure:
     """Return the range of the mean deviation (out and back) along a body diagonal, with its uncertainty (ISO 230-6 style).
 
-    Half the difference out - back is lost motion; its scatter gives the noise. The wavelength adds an uncertainty proportional to the
+    Half of (out - back) is lost motion; its scatter gives the noise. The wavelength adds an uncertainty proportional to the
     length. Readings are paired by their position on the line, so a missing reading removes only its own pair.
     """
     assert run.beam is not None
@@ -47,7 +47,7 @@ def diagonal_figure(run: RunData) -> VerificationFigure:
 
 
 def helix_figure(run: RunData) -> VerificationFigure:
-    """Return the rms of the ball-bar deviation after a fit of cup offset and bar length, with its uncertainty; abscissa: path index.
+    """Return the rms of the ball-bar deviation after a fit of cup offset and bar length, with its uncertainty and residual curve.
 
     The fit removes the mounting and leaves the machine's error about this centre. The uncertainty combines the noise of the block means
     (from second differences) and `U_REPEAT_MM`.

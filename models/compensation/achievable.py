@@ -199,7 +199,7 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
 
 
 def _field(solution: JointSolution) -> F2:
-    """Return the deviation over the volume per unit of every coefficient and of the six rigid motions, shape (3 points, terms + 6)."""
+    """Return the deviation over the volume per unit of every coefficient and of the six rigid motions, shape (3 x points, terms + 6)."""
     grid = volume_grid(solution.machine.stroke_mm, max(NODES, max(t.order for t in solution.terms) + 2))
     full = design(solution.machine, solution.terms, grid).reshape(3 * len(grid), -1)
     return np.concatenate([full, rigid_design(grid).reshape(-1, 6)], axis=1)
@@ -365,7 +365,7 @@ def grid_row(
 
 @dataclass(frozen=True, eq=False)
 class _ResidualJudge:
-    """Judges all kinds of table by the same pairs, sources of uncertainty and unit."""
+    """Judge of all kinds of table, by the same pairs, sources of uncertainty and unit."""
 
     solution: JointSolution
     pairs: Pairs
@@ -381,7 +381,7 @@ class _ResidualJudge:
         return Achievable(kind, entries, predict_distances(self.solution, stored, pairs=self.pairs, sources=self.sources), rounding)
 
     def one_axis(self, counts: tuple[int, int, int]) -> list[Achievable]:
-        """Judge positioning tables, these with squareness parameters, and all nine tables."""
+        """Judge positioning tables alone, positioning tables with squareness parameters, and all nine tables."""
         nine = nine_tables(self.solution, counts, sources=self.sources)
         square = squareness_tables(self.solution, counts, sources=self.sources)
         positioning = positioning_only(nine)
@@ -398,7 +398,7 @@ class _ResidualJudge:
         ]
 
     def single_motions(self, counts: tuple[int, int, int], observable: frozenset[str] | None) -> list[Achievable]:
-        """Judge tables of single error motions."""
+        """Judge tables of the motions that are observable by themselves, and tables of the fewest motions that are right for this tool."""
         observable_names = individually_observable(self.solution) if observable is None else observable
         out = []
         for kind, motions, any_tool in (

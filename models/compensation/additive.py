@@ -61,7 +61,7 @@ def additive(field: Field, stroke_mm: F2, grids_mm: tuple[F1, F1, F1], *, nodes:
     nodes : int
         Nodes per axis of the volume.
     order : int
-        Highest Legendre order of the addition to the main effects for the diagonals.
+        Highest Legendre order of the functions that are added to the main effects to fit the diagonals too.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def _mean_over_others(field: Field, stroke_mm: F2, axis: int, positions_mm: F1, 
 
 
 def _towards_diagonals(field: Field, stroke_mm: F2, nodes: int, order: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Return the additions to the main effects for the diagonals, as Legendre coefficients per axis, shape (3 axes, order, 3, m)."""
+    """Return the functions added to the main effects to fit the diagonals too: Legendre coefficients, shape (3 axes, order, 3, m)."""
     volume = volume_grid(stroke_mm, max(nodes, order + 2))  # fewer nodes would not determine the polynomials
     lines = np.concatenate([np.linspace(*diagonal_ends(stroke_mm, d), DIAGONAL_POINTS) for d in DIAGONALS])
     points = np.concatenate([volume, lines])
@@ -122,7 +122,7 @@ SCALE_NOTE = "at the machine's temperature while it was measured"
 """Note beside every printed scale error: Abbe does not correct it to 20 degree C."""
 
 SQUARENESS_SLOPES = (("C0Y", 0, 1, -1.0), ("B0Z", 0, 2, 1.0), ("A0Z", 1, 2, -1.0))
-"""Name, its two axes, and the sign of the sum of their slopes (docs/explanation/conventions.md)."""
+"""Squareness, its two axes, and the sign that turns the sum of their slopes into it (docs/explanation/conventions.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +156,6 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
 
 
 def mean_parameter(sources: ErrorSources, name: str, gradient: F1, u_common: float = 0.0) -> MeanParameter:
-    """Return the parameter ``gradient @ coefficients`` with its uncertainty from all sources, ``u_common`` included."""
+    """Return the parameter ``gradient @ coefficients`` with its uncertainty from all sources and from ``u_common``, in quadrature."""
     u = float(np.sqrt(variances(sources, gradient[None])[0]))
     return MeanParameter(name, float(gradient @ sources.coefficients), float(np.hypot(u, u_common)))

@@ -1,6 +1,6 @@
 """Errors of distances between two points of a part: the machine's errors as its user sees them, which a rigid motion does not change.
 
-They judge a compensation table by the errors without and with it.
+Comparing these errors without and with a compensation table judges the table.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """3-D grid of corrections with trilinear interpolation: unlike one-axis tables, it also corrects the effect of angles at a lever.
 
-The corrections do not contain the best-fit rigid motion over the grid, which changes no distance between two points of a part. A constant
-keeps the reference node in place, because a controller's reference point must not move.
+The corrections do not contain the best-fit rigid motion over the grid, which changes no distance between two points of a part. An added
+constant keeps the reference node in place, because a controller's reference point must not move.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def fit_operator(nodes_mm: F1) -> F2:
 
 
 SMALL_CORRECTIONS = 1e-2
-"""Weight of small corrections against correct distances; it matters only if the mask has a few nodes."""
+"""Weight of keeping corrections small against making distances correct; it matters only if the mask has few nodes."""
 
 
 def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.bool_]) -> tuple[F4, NDArray[np.bool_]]:
@@ -173,7 +173,7 @@ class GridTable:
 
     @property
     def largest_step_mm(self) -> float:
-        """Largest change of the correction of any axis from one node to the next; controllers limit it, and it marks surfaces."""
+        """Largest change of the correction of any axis from one node to the next; controllers limit it, as steps mark surfaces."""
         return max(float(np.abs(np.diff(self.correction_mm, axis=a)).max()) for a in range(3))
 
 
@@ -185,7 +185,7 @@ def nodes_mm(position_mm: tuple[F1, F1, F1]) -> F2:
 def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitted: bool = True) -> F3:
     """Return the node values of the best trilinear field per unit of each coefficient of the solution, shape (nodes, 3, terms).
 
-    ``fitted``: by a least-squares fit over the volume of the grid; otherwise the deviation at the nodes themselves. A term is at most
+    ``fitted``: fit by least squares over the volume of the grid; otherwise take the deviation at the nodes themselves. A term is at most
     linear in the other two axes (rule G), where trilinear interpolation is exact, so the fit along its own axis is the fit over the volume
     (tests/models/compensation/test_tables_grid.py).
     """
@@ -224,7 +224,7 @@ def grid_table(
     reference : (int, int, int)
         Index of the node that stays in place.
     fitted : bool
-        Fit the interpolant to the field instead of sampling the field at the nodes; this leaves about 0.6 of the rms between the nodes.
+        Fit the interpolant to the field instead of sampling the field at the nodes; this leaves about 0.6 of the rms error between nodes.
     sources : ErrorSources, optional
         Sources of uncertainty for ``u_mm``; default: ``error_sources(solution)``.
 

@@ -36,7 +36,7 @@ def step_tables(base: NineTables, axis: int, step_mm: float, low_mm: float, high
     step_mm : float
         Added correction.
     low_mm, high_mm : float
-        Range with the whole step. The step rises over the grid interval below the range and goes on above it.
+        Range in which the correction has the whole step. It rises over the grid interval below the range and stays constant above it.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
 
 SHOWN = 3
 OBSERVED_MM = 0.003
-"""Smallest change, mm, at the position of the largest change; with less, drift within the tolerance could hide a reversed sign."""
+"""An axis whose tables change no reading by this much, mm, is not observed: drift within the tolerance could hide a reversed sign."""
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ def model_uncertainty_mm(solution: JointSolution, *, nodes: int = 9, sources: Er
 
 
 WITHIN_MM = 5e-4
-"""Largest difference of a smooth table from its polynomial; other tables hold pitch errors or values entered by hand."""
+"""Largest difference, mm, between a smooth table and its polynomial; tables that differ more hold pitch errors or manual entries."""
 ORDERS = range(2, 13)
 
 

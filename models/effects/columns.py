@@ -17,10 +17,10 @@ from abbe.models.functions.legendre import legendre_values
 from abbe.models.machine import AXES
 
 UM, PPM = 1e-3, 1e-6
-"""mm per micrometre; one part per million. Columns are mm per UNIT of strength, so that coefficients have the unit shown to people."""
+"""A micrometre in mm; one part per million. Columns are mm per UNIT of strength, so that coefficients have the unit shown to people."""
 AXIS_KEYS = ("X", "Y", "Z")
 LATERAL_KEYS = ("EYX", "EZX", "EXY", "EZY", "EXZ", "EYZ")
-"""Straightness components: deviation in the second letter while the third moves."""
+"""Straightness components: the axis of the third letter moves, the tool deviates along that of the second."""
 NO_KEY = ("",)
 STEEL_PER_K = 11.5e-6
 """Thermal expansion of steel, 1/K."""
@@ -34,14 +34,14 @@ VISITED = (2.0 / 3.0) ** 2 / 3.0
 """Mean square of the position x (-1 .. +1 over the stroke) in the middle two thirds, where tests go. The form x^2 - VISITED has mean zero
 there and so does not change the strength."""
 BLOCKS = 4
-"""Number of blocks of a run in which a temperature is averaged."""
+"""Number of blocks into which a run is divided to average its temperatures."""
 
 Deviation = Callable[[Places, str, Values], F3]
 WITH_LINE = (2.5, 1.5)
 """Ratio of the rms of a smooth curve to its rms without the straight line, which scale and squareness absorb, and its standard uncertainty.
 For stationary curves with a correlation length of 0.3 strokes the median is 2.6, and two of three curves have 1.5 to 5."""
 WITH_CONSTANT = (1.4, 0.7)
-"""Ratio of the rms of such a curve to its rms without the mean: the median is 1.4, and two of three curves have 1.0 to 2.6."""
+"""The same ratio for a curve without its mean: the median is 1.4, and two of three curves have 1.0 to 2.6."""
 
 
 def axis_of(key: str) -> int:
@@ -82,7 +82,7 @@ def of_places(deviation: Deviation) -> Signal:
 
 
 def of_path(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
-    """Do the same as `of_machine` for a deviation that also depends on the machine: its strokes, its vertical axis."""
+    """Do the same as `of_machine` for a deviation that also depends on the machine, e.g. on its strokes or its vertical axis."""
 
     def signal(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
         return [path.read(lambda at, p=path: deviation(p, at, key, values)) for path in paths]  # type: ignore[misc]
@@ -138,7 +138,7 @@ def order_of(names: Iterable[str]) -> dict[str, int]:
 
 
 def commanded_turns(at: Places, axis: int) -> tuple[F1, F1]:
-    """Return `Places.commanded_turns` of one axis, shape (n,) each."""
+    """Return direction of motion and travel since the last reversal of one axis, from `Places.commanded_turns`, shape (n,) each."""
     sign, since = at.commanded_turns
     return sign[:, axis], since[:, axis]
 
@@ -152,7 +152,7 @@ def wind_up(at: Places, axis: int, *over_mm: float) -> list[F1]:
 def before_first_turn(at: Places, axis: int) -> F1:
     """Return the travel of an axis since the first reading, mm, but `FAR_MM` once it has reversed.
 
-    With it, effects describe the rest of a reversal in the unrecorded run-in before the first reading.
+    Effects use it to describe what is left of a reversal in the unrecorded run-in before the first reading.
     """
     if len(at.t_s) < 2 or not at.v_mm_s.any():
         return np.full(len(at.t_s), FAR_MM)
@@ -170,7 +170,7 @@ def play(at: Places, axis: int, width_mm: float = 0.008) -> F1:
 
 
 def turn_between(at: Places, axis: int) -> F1:
-    """Return how `play` changes if the axis reverses between two readings, where it comes to rest."""
+    """Return a sudden step at the true point of reversal, which may lie between two readings, minus `play`."""
     return np.asarray(at.sign[:, axis] - play(at, axis))
 
 
@@ -230,17 +230,17 @@ def amplitude(coefficients: F1, values: Values) -> float:
 
 
 def rms(coefficients: F1, values: Values) -> float:
-    """Return the rms over the stroke of a sum of orthogonal columns with mean square 1 each as the strength."""
+    """Return as the strength the rms over the stroke of a sum of orthogonal columns, each with mean square 1."""
     return float(np.linalg.norm(coefficients))
 
 
 def size(coefficients: F1, values: Values) -> float:
-    """Return the root of a variance coefficient as the strength; zero if the coefficient is negative."""
+    """Return the square root of a variance coefficient as the strength; zero if the coefficient is negative."""
     return float(np.sqrt(max(float(coefficients[0]), 0.0)))
 
 
 def setup_length(parts: int) -> Callable[[F1, Values], float]:
-    """Make a strength for ``parts`` coefficients per set-up: their rms length over the set-ups that are not zero (observed)."""
+    """Make a strength function: the rms, over set-ups, of the length of their ``parts`` coefficients; all-zero set-ups do not count."""
 
     def strength(coefficients: F1, values: Values) -> float:
         lengths = np.linalg.norm(np.reshape(coefficients, (-1, parts)), axis=1)

@@ -56,7 +56,7 @@ class Effect:
     family : Family
         Part of the machine to which it belongs.
     keys : tuple of str
-        Axes, components or planes at which it may occur; ``("",)`` if there is only one.
+        Axes, components or planes at which it may occur; ``("",)`` if it has no key.
     unit : str
         Unit of the strength: ``"um"``, ``"urad"``, ``"ms"``, ``"K"``, ``"K/h"`` or ``"mrad"``.
     per_unit : float
@@ -79,13 +79,13 @@ class Effect:
         Paper, standard or model behind it.
     forms : tuple of Form
     unseen : tuple of float
-        Ratio of the whole strength to that of the columns, and its standard uncertainty, where the present model absorbs a part of the
-        effect (e.g. the line of a straightness). The stated strength includes this part.
+        Ratio of the whole strength to that of the columns, and its standard uncertainty. It differs from 1 where the present model absorbs
+        a part of the effect (e.g. the line of a straightness); the stated strength includes this part.
     kind : "mean" | "variance"
         Whether it shifts the readings or makes them noisier (stick-slip, vibration with an unknown phase, outliers). The columns of a
         "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative.
     absorbed_by : tuple of str
-        Entries of ``current_model.includes`` with which it is part of the present model and no candidate.
+        Entries of ``current_model.includes``: with any of them, the present model contains the effect, which is then no candidate.
     blind : tuple of str
         Tests that cannot show it.
     variant_of : str

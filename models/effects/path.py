@@ -49,9 +49,9 @@ class Places:
 
     @cached_property
     def commanded_turns(self) -> tuple[F2, F2]:
-        """``sign`` and ``since_mm``, shape (n, 3) each, if every axis reverses at a commanded position and not between two of them.
+        """``sign`` and ``since_mm`` as if every axis reversed at a commanded position and not between two of them, shape (n, 3) each.
 
-        A machine that dwells keeps its own ``sign`` and ``since_mm``.
+        If the machine dwells, they are ``sign`` and ``since_mm`` themselves.
         """
         n = len(self.t_s)
         if n < 2 or not self.v_mm_s.any():
@@ -77,8 +77,8 @@ class Path:
     at : Places
         The path itself.
     reference : Places
-        Where the reading is zero, one row. Ball-bar: the centre, where the spindle set the cup at ``t_set_s``, standing, approached from an
-        unknown direction. Laser: the first record.
+        One row: position and state of the machine for which the reading is zero. Ball-bar: at rest at the centre, where the spindle set the
+        cup at ``t_set_s``; the direction of approach is unknown. Laser: the first record.
     look : array, shape (n, 3)
         Direction of measurement, unit vector from cup to tool or along the beam: the reading per mm of deviation, to first order.
     feed_mm_min, direction : array, shape (n,)
@@ -155,8 +155,8 @@ RUN_IN = 2
 def driven(q_mm: F2, t_s: F1, feed_mm_min: F1, *, dwelling: bool, temp_c: Mapping[str, F1]) -> Places:
     """Return the `Places` of a sequence of commanded positions, mm, at times ``t_s``.
 
-    A moving axis reverses between two samples. The velocities on both sides give the position, at constant acceleration; backlash and
-    friction in the next samples depend on the travel from there.
+    A moving axis reverses between two samples. The velocities on both sides give the point of reversal, at constant acceleration; backlash
+    and friction in the next samples depend on the travel from this point.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
     Parameters
     ----------
     step_mm : array, shape (n, 3), optional
-        Motion per sample, at every sample. With it an axis reverses between two samples, where it comes to rest; without it, at a sample.
+        Motion per sample, at every sample. With it, an axis reverses where it comes to rest between two samples; without it, at a sample.
     """
     travel = np.abs(np.diff(q_mm, axis=0, prepend=q_mm[:1])).cumsum(axis=0)
     out = np.full(q_mm.shape, FAR_MM)

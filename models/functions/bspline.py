@@ -77,16 +77,16 @@ class BSpline:
         return np.unique(self.knots_mm[self.degree : self.coefficients.size + 1])
 
     def __call__(self, x_mm: ArrayLike) -> F1:
-        """Values at positions of any shape."""
+        """Return values at positions of any shape."""
         return np.asarray(self._spline(np.clip(positions(x_mm), *self.domain_mm)), dtype=np.float64)
 
     def derivative(self, x_mm: ArrayLike) -> F1:
-        """Slope per mm at positions of any shape."""
+        """Return slopes per mm at positions of any shape."""
         x, (lo, hi) = positions(x_mm), self.domain_mm
         return np.where((x >= lo) & (x <= hi), self._slopes(np.clip(x, lo, hi)), 0.0)
 
     def basis(self, x_mm: F1) -> F2:
-        """B_i at the positions, shape (n, m)."""
+        """Return B_i at the positions, shape (n, m)."""
         x = np.clip(positions(x_mm), *self.domain_mm)
         if x.size == 0:
             return np.zeros((0, self.coefficients.size))  # scipy looks for the least position
@@ -94,7 +94,7 @@ class BSpline:
         return np.asarray(matrix.toarray(), dtype=np.float64)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        """Other coefficients, same knots."""
+        """Return a spline with the same knots and other coefficients."""
         return replace(self, coefficients=same_size(parameters, self.coefficients))
 
     def plus_line(self, offset: float, slope: float) -> BSpline:

@@ -73,21 +73,21 @@ class Legendre:
         return self.coefficients.size - 1
 
     def __call__(self, x_mm: ArrayLike) -> F1:
-        """Values at positions of any shape."""
+        """Return values at positions of any shape."""
         return np.asarray(legendre.legval(_unit(positions(x_mm), self.stroke_mm), self.coefficients), dtype=np.float64)
 
     def derivative(self, x_mm: ArrayLike) -> F1:
-        """Slope per mm at positions of any shape."""
+        """Return slopes per mm at positions of any shape."""
         x = positions(x_mm)
         inside = (x >= self.stroke_mm[0]) & (x <= self.stroke_mm[1])
         return np.where(inside, legendre.legval(_unit(x, self.stroke_mm), self._slopes), 0.0)
 
     def basis(self, x_mm: F1) -> F2:
-        """P_k at the positions, shape (n, m)."""
+        """Return P_k at the positions, shape (n, m)."""
         return legendre_values(positions(x_mm), self.stroke_mm, self.degree)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        """Other coefficients, same stroke."""
+        """Return a series over the same stroke with other coefficients."""
         return replace(self, coefficients=same_size(parameters, self.coefficients))
 
     def plus_line(self, offset: float, slope: float) -> Legendre:

@@ -17,13 +17,13 @@ from abbe.models.functions.table import Table
 from abbe.models.machine import AXES
 
 PASSES = 2
-"""The second pass removes the rest that rounding leaves after the first."""
+"""Number of passes that remove a line or a constant; the second removes what rounding left after the first."""
 ROTATIONS = ("A", "B", "C")
 REVERSE = "@reverse"
 SQUARENESS: Mapping[str, tuple[int, int, float]] = MappingProxyType({"C0Y": (1, 0, -1.0), "B0Z": (2, 0, 1.0), "A0Z": (2, 1, -1.0)})
 """Moving axis, component, sign: Y's direction is (-C0Y, 1, 0), Z's direction is (B0Z, -A0Z, 1) (docs/explanation/conventions.md)."""
 _SLOPES = {"EXY": ("C0Y", -1.0), "EXZ": ("B0Z", 1.0), "EYZ": ("A0Z", -1.0), "EYX": ("C0Y", -1.0), "EZX": ("B0Z", 1.0), "EZY": ("A0Z", -1.0)}
-"""Squareness to which the slope of a straightness belongs, and the sign."""
+"""Squareness to which the slope of each straightness belongs, and the sign of its contribution."""
 _TURNS = {"EYX": (2, 1.0), "EZX": (1, -1.0), "EZY": (0, 1.0)}
 """Axis and sign of the frame's rotation when the slope of a straightness of the datum axes moves into squareness."""
 
@@ -181,7 +181,7 @@ class Straightened:
     motions : ErrorMotions
         Straightness without lines; their slopes are in the squareness errors.
     offset_mm, rotation_rad : arrays, shape (3,)
-        Rigid motion of the frame that came with the lines.
+        Rigid motion of the frame that belongs to the removed lines.
     """
 
     motions: ErrorMotions
@@ -337,7 +337,7 @@ class ErrorMotions:
         return Straightened(ErrorMotions(functions, squareness), offset, rotation)
 
     def _rows(self, key: str, sign: F1) -> slice | np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Return the positions at which a function holds."""
+        """Return a mask or slice of the positions at which the function ``key`` holds."""
         if key.endswith(REVERSE):
             return np.asarray(sign < 0.0)
         return np.asarray(sign >= 0.0) if key + REVERSE in self.functions else slice(None)

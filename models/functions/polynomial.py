@@ -44,7 +44,7 @@ class Polynomial:
 
     @property
     def domain_mm(self) -> tuple[float, float]:
-        """Everywhere."""
+        """All positions: the polynomial has no limits."""
         return -np.inf, np.inf
 
     @property
@@ -63,19 +63,19 @@ class Polynomial:
         return self.coefficients.size - 1
 
     def __call__(self, x_mm: ArrayLike) -> F1:
-        """Values at positions of any shape."""
+        """Return values at positions of any shape."""
         return np.asarray(polynomial.polyval(positions(x_mm) - self.origin_mm, self.coefficients), dtype=np.float64)
 
     def derivative(self, x_mm: ArrayLike) -> F1:
-        """Slope per mm at positions of any shape."""
+        """Return slopes per mm at positions of any shape."""
         return np.asarray(polynomial.polyval(positions(x_mm) - self.origin_mm, self._slopes), dtype=np.float64)
 
     def basis(self, x_mm: F1) -> F2:
-        """Powers (x - origin)^k, shape (n, m)."""
+        """Return the powers (x - origin)^k, shape (n, m)."""
         return np.asarray(polynomial.polyvander(positions(x_mm) - self.origin_mm, self.degree), dtype=np.float64)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        """Other coefficients, same origin."""
+        """Return a polynomial about the same origin with other coefficients."""
         return replace(self, coefficients=same_size(parameters, self.coefficients))
 
     def plus_line(self, offset: float, slope: float) -> Polynomial:

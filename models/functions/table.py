@@ -75,7 +75,7 @@ class Table:
         return 1 if self.interpolation == "linear" else 3
 
     def __call__(self, x_mm: ArrayLike) -> F1:
-        """Values at positions of any shape."""
+        """Return values at positions of any shape."""
         x = positions(x_mm)
         if self._spline is None:
             return np.asarray(np.interp(x, self.position_mm, self.value), dtype=np.float64)
@@ -102,11 +102,11 @@ class Table:
         return np.asarray(scipy.interpolate.CubicSpline(self.position_mm, unit)(x), dtype=np.float64)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        """Other values at the same positions."""
+        """Return a table with other values at the same positions."""
         return replace(self, value=same_size(parameters, self.value))
 
     def plus_line(self, offset: float, slope: float) -> Table:
-        """This table + offset + slope * x_mm."""
+        """Return this table + offset + slope * x_mm."""
         return replace(self, value=self.value + offset + slope * self.position_mm)
 
 

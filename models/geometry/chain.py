@@ -1,7 +1,7 @@
 """Deviation of the tool relative to the workpiece for any of the 24 chains, and its derivatives.
 
-The deviation comes to first order by rule G (docs/explanation/conventions.md) or from the exact transforms. Derivatives by error motions
-and squareness exist for both, mm per mm for translations and mm per rad for rotations and squareness.
+The deviation comes to first order by rule G (docs/explanation/conventions.md) or from the exact transforms. Derivatives with
+respect to error motions and squareness exist for both: mm per mm for translations, mm per rad for rotations and squareness.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from abbe.models.geometry.chain import exact_jacobian, motion_jacobian
 from abbe.models.machine import Machine
 
 TOLERANCE = 1e-6
-"""Tolerance of a correlation: covariances come from files with six or seven digits."""
+"""Accepted error of a correlation: covariances come from files with six or seven digits."""
 
 
 def checked_covariance(matrix: ArrayLike, size: int, what: str = "covariance") -> F2:
@@ -39,8 +39,8 @@ def checked_covariance(matrix: ArrayLike, size: int, what: str = "covariance") -
     Raises
     ------
     ValueError
-        The matrix has another shape, holds something else than finite numbers, or has a negative variance or a covariance with a parameter
-        of variance zero; or, beyond `TOLERANCE` of a correlation, it is not symmetric or not positive semidefinite.
+        The matrix has another shape, a value that is not a finite number, a negative variance, or a covariance with a parameter of variance
+        zero; or it deviates by more than `TOLERANCE` of a correlation from a symmetric, positive semidefinite matrix.
     """
     raw = np.asarray(matrix)
     if raw.dtype.kind not in "fiu":
@@ -188,7 +188,7 @@ def _motion_covariance(weights: F2, covariance: F2, first: NDArray[np.intp]) -> 
     Parameters
     ----------
     weights : array, shape (n, p)
-        Derivative of its motion with respect to each parameter; the parameters of one motion stand together.
+        Derivative, with respect to each parameter, of the motion in which it acts; parameters of one motion are adjacent.
     covariance : array, shape (p, p)
         In the same order.
     first : array of int, shape (g,)

@@ -1,6 +1,6 @@
 """Displacement (R − I) v of a vector v by a small rotation R, computed without R, so that no subtraction of long vectors loses digits.
 
-Three forms make a rotation of E = (EA, EB, EC) (docs/explanation/conventions.md, "Exact kinematics"). They agree to first order.
+Three forms make a rotation from E = (EA, EB, EC) (docs/explanation/conventions.md, "Exact kinematics"). They agree to first order.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def field_statistics(points_mm: F2, deviation_mm: F2) -> FieldStatistics:
 
 @dataclass(frozen=True)
 class RigidFree:
-    """A frame for the deviation: its best-fit rigid motion over these reference points, shape (k, 3), is removed."""
+    """A frame in which the deviation has no best-fit rigid motion over these reference points, shape (k, 3)."""
 
     reference_mm: F2
 

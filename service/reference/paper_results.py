@@ -42,7 +42,7 @@ class PaperResult:
         return {status: counted.count(status) for status in STATUSES[source]}
 
     def to_document(self) -> dict[str, Any]:
-        """JSON value for ``--json``."""
+        """Return the JSON value for ``--json``."""
         return {
             "paper": self.paper,
             "title": self.title,
@@ -66,5 +66,5 @@ def results(papers: Iterable[Paper] = tuple(TITLES)) -> list[PaperResult]:
 
 
 def document(found: Sequence[PaperResult]) -> dict[str, Any]:
-    """JSON document for ``--json``."""
+    """Return the JSON document for ``--json``."""
     return {"format": FORMAT, "papers": [f.to_document() for f in found]}

@@ -9,7 +9,7 @@ from decimal import Decimal
 from typing import ClassVar, Literal, TypeAlias
 
 Fit = Literal["equal", "rounding", "padding", "bound", "no"]
-"""Equal to the last printed digit; within the rounding of the inputs; only if trailing zeros are padding; bound holds; different."""
+"""Agreement: to the last printed digit; within the rounding of the inputs; only if trailing zeros are padding; a bound holds; none."""
 
 FLOAT = 1e-12
 """Relative tolerance for the rounding of float64 in a comparison of decimal digits."""
@@ -71,7 +71,7 @@ class Printed:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """An input that a computation must return within a tolerance; both in the unit of the comparison."""
+    """An input that a computation must return within a tolerance; input and tolerance are in the unit of the comparison."""
 
     value: float
     tolerance: float
@@ -85,7 +85,7 @@ class Given:
 
     @property
     def last(self) -> str:
-        """Unit of the last digit that the tolerance leaves."""
+        """A number with as many decimals as the tolerance leaves, as a pattern for computed ones."""
         return f"{1.0:.{self._decimals}f}"
 
     @property

@@ -21,9 +21,9 @@ RELATIVE = 1e-11
 class Quantity:
     """All comparisons of one quantity of one file.
 
-    ``floor`` is the rounding of the stored numbers in ``unit``, with its reason in ``rounding``. A comparison holds if the deviation
-    exceeds neither the larger of ``floor`` and ``relative`` times the stored value nor the larger of ``floor`` and LIMIT. If comparisons
-    have different roundings, the largest is kept. ``worst`` names the place of the largest deviation, ``allowed`` is the tolerance there.
+    ``floor`` is the rounding of the stored numbers in ``unit``, with its reason in ``rounding``. The tolerance of a comparison is the
+    smaller of LIMIT and ``relative`` times the stored value, but at least ``floor``. If comparisons have different roundings, the largest
+    is kept. ``worst`` names the place of the largest deviation, ``allowed`` is the tolerance there.
     """
 
     name: str
@@ -173,7 +173,7 @@ class Checks:
         return passed and bool(self.quantities) and not (self.error or self.refused or self.unread)
 
     def to_document(self) -> dict[str, Any]:
-        """JSON value for ``--json``."""
+        """Return the JSON value for ``--json``."""
         return {
             "file": self.file,
             "ok": self.ok,

@@ -34,7 +34,7 @@ def _turning(at: Places, key: str, values: Values) -> F3:
 
 
 def _run_in(at: Places, key: str, values: Values) -> F3:
-    """Wind-up left from a reversal just before the first reading."""
+    """Return the wind-up left from a reversal just before the first reading."""
     a = axis_of(key)
     return along(a, -0.5 * UM * at.sign[:, a] * np.exp(-before_first_turn(at, a) / WIND_UP_MM[2]))
 

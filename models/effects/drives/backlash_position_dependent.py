@@ -17,14 +17,14 @@ def _half(at: Places, key: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def unequal(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return -s/2 and -s x/2 times 1 um, s the direction of motion, x = -1 .. +1 over the stroke: mean width, and its change along x."""
+    """Return the mean width and its change along x, as -s/2 and -s x/2 times 1 um: s direction of motion, x = -1 .. +1 over the stroke."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     return along(a, _half(at, key), _half(at, key) * x)
 
 
 def _curved(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Wear in the middle or at the ends."""
+    """Return columns for a width that changes with x^2 or x^3: wear in the middle or at the ends."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     return along(a, _half(at, key) * (x**2 - VISITED), _half(at, key) * x**3)

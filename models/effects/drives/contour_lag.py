@@ -16,7 +16,7 @@ def inward(path: Path, key: str, values: Values) -> F2:
     """Return -tau^2 v^2 / (2 R) for a lag tau of 1 ms; the coefficient is the square of the lag in ms^2.
 
     A lag tau moves the tool by -tau v + tau^2 a. On a path around the cup with bar direction u, u.v = 0 and u.a = -v^2 / R; the sideways
-    displacement tau v lengthens the bar by tau^2 v^2 / (2 R), half of what the inward part shortens it.
+    displacement tau v lengthens the bar by tau^2 v^2 / (2 R), half as much as the inward part shortens it.
     """
     speed_squared = (path.at.v_mm_s**2).sum(axis=1)
     return np.asarray(-MS2 * speed_squared / (2.0 * path.radius_mm))[:, None]

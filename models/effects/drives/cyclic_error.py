@@ -10,8 +10,8 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
 LOW_MM, HIGH_MM, PER_MM = 4.0, 30.0, 0.0024
-"""Bounds of the pitch, and spacing of the start values in wave number, 1/mm: neighbours differ by less than one period over 300 mm, so the
-search converges from the nearer one."""
+"""Bounds of the pitch, mm, and spacing of the search's start values in wave number, 1/mm: over 300 mm neighbours differ by less than one
+period, so the search converges from the nearer one."""
 STARTS = tuple(float(1.0 / k) for k in np.arange(1.0 / HIGH_MM, 1.0 / LOW_MM + PER_MM, PER_MM) if 1.0 / k >= LOW_MM)
 
 
@@ -22,7 +22,7 @@ def _waves(at: Places, key: str, values: Values, harmonic: int) -> tuple[F3, F3]
 
 
 def wave(at: Places, key: str, values: Values) -> F3:
-    """Return sine and cosine of 2 pi x / pitch, 1 um."""
+    """Return sine and cosine of 2 pi x / pitch, each with an amplitude of 1 um."""
     return along(axis_of(key), *_waves(at, key, values, 1))
 
 
@@ -36,13 +36,13 @@ def _along(path: Path, at: Places, key: str) -> F1:
 
 
 def _modulated(path: Path, at: Places, key: str, values: Values) -> F3:
-    """The wave times -1 .. +1 along the screw; the strength remains the mean amplitude."""
+    """Return the wave times -1 .. +1 along the screw; the strength remains the mean amplitude."""
     x = _along(path, at, key)
     return along(axis_of(key), *(x * wave for wave in _waves(at, key, values, 1)))
 
 
 def _modulated_twice(path: Path, at: Places, key: str, values: Values) -> F3:
-    """The wave, strongest in the middle or at the ends of the screw; the strength remains the mean amplitude where tests go."""
+    """Return the wave, strongest in the middle or at the ends of the screw; the strength remains the mean amplitude where tests go."""
     x = _along(path, at, key)
     return along(axis_of(key), *((x**2 - VISITED) * wave for wave in _waves(at, key, values, 1)))
 

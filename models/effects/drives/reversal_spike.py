@@ -16,7 +16,7 @@ SHAPE = (
 
 
 def _height(path: Path, key: str, values: Values) -> F1:
-    """Signed height at the commanded feed of a spike of 1 um at 1000 mm/min."""
+    """Return the signed height, mm, at the commanded feed, of a spike that is 1 um high at 1000 mm/min."""
     return np.asarray(-UM * path.at.sign[:, axis_of(key)] * (path.feed_mm_min / 1000.0) ** values["p"])
 
 
@@ -44,25 +44,25 @@ def spike(path: Path, key: str, values: Values) -> F2:
 
 
 def _unlike(path: Path, key: str, values: Values) -> F2:
-    """Higher after a reversal to +, lower after one to -."""
+    """Return the spike times the direction of motion, for spikes of different height at the two ends of the axis."""
     return _read(path, key, _decay(path, key, values) * path.at.sign[:, axis_of(key)])
 
 
 def _rounded(path: Path, key: str, values: Values) -> F2:
-    """Slower rise and longer or shorter tail: the decay times d / d0 and its square."""
+    """Return exp(-d / d0) times d / d0 and times its square, for a slower rise and a longer or shorter tail."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     height = _height(path, key, values) * np.exp(-x)
     return _read(path, key, height * x, height * x**2)
 
 
 def _at_once(path: Path, key: str, values: Values) -> F2:
-    """Quicker rise: the difference during the rise."""
+    """Return what the spike gains during its rise if it rises at once."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     return _read(path, key, _height(path, key, values) * np.maximum(1.0 - x / RISE, 0.0))
 
 
 def _run_in(path: Path, key: str, values: Values) -> F2:
-    """Tail of a spike that began in the run-in, just before the first reading."""
+    """Return the tail of a spike that began in the run-in, just before the first reading."""
     past = before_first_turn(path.at, axis_of(key)) / values["d0_mm"]
     return _read(path, key, _height(path, key, values) * np.exp(-np.minimum(past, 60.0)) * (past < 60.0))
 

@@ -25,13 +25,13 @@ def _second(path: Path, key: str, values: Values) -> F2:
 
 
 def _offset(path: Path, key: str, values: Values) -> F2:
-    """A constant (the wavelength was set for air of another temperature), 1 K, and a slow drift, 1 K/h."""
+    """Return the error for an offset of 1 K (the wavelength was set for air of another temperature) and for a drift of 1 K/h."""
     base = AIR_PER_K * path.travel_mm
     return np.column_stack([base, base * path.at.t_s / 3600.0])
 
 
 def _sensed(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """The same error from the rise of the air sensor, K."""
+    """Return the error that follows from the rise of the air sensor, K; zeros without this sensor."""
     rise = rise_of(paths, "air")
     return [np.zeros((p.n, 1)) if rise is None else np.asarray(AIR_PER_K * p.travel_mm * rise(p.at.t_s))[:, None] for p in paths]
 

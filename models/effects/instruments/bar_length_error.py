@@ -16,7 +16,7 @@ def constant(path: Path, key: str, values: Values) -> F2:
 
 
 def _with_radius(path: Path, key: str, values: Values) -> F2:
-    """The part of the error that is proportional to the length of the bar, 1 um per 100 mm."""
+    """Return the part of the error that is proportional to the length of the bar, 1 um per 100 mm."""
     return np.full((path.n, 1), UM * path.radius_mm / 100.0)
 
 

@@ -20,7 +20,7 @@ def zero_drift(path: Path, key: str, values: Values) -> F2:
 
 
 def _bent(path: Path, key: str, values: Values) -> F2:
-    """A drift that is not linear in time."""
+    """Return a drift that grows with the square of the time, not linearly."""
     return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path) ** 2)
 
 

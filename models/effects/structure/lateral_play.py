@@ -13,18 +13,18 @@ SETTLING_MM = (0.1, 0.5, 3.0)
 
 
 def jump(at: Places, key: str, values: Values) -> F3:
-    """Return a sideways +P/2 times the direction of the moving axis, P = 1 um."""
+    """Return a sideways shift of P/2 times the direction in which the axis last moved, P = 1 um."""
     return along(direction_of(key), 0.5 * UM * at.sign[:, axis_of(key)])
 
 
 def _settling(at: Places, key: str, values: Values) -> F3:
-    """A jump that takes some travel of the axis."""
+    """Return a jump that takes some travel of the axis, one column per length in `SETTLING_MM`."""
     a = axis_of(key)
     return along(direction_of(key), *(0.5 * UM * at.sign[:, a] * np.exp(-at.since_mm[:, a] / d) for d in SETTLING_MM))
 
 
 def _along_guide(path: Path, at: Places, key: str, values: Values) -> F3:
-    """A jump that changes along the guide, worn at one end or in the middle."""
+    """Return a jump that changes along the guide, worn at one end or in the middle."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     half = 0.5 * UM * at.sign[:, a]

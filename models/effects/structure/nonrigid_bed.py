@@ -1,4 +1,4 @@
-"""Non-rigid bed: straightness of one axis that changes its sign across another."""
+"""Non-rigid bed: the straightness of one axis changes its sign along another."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _shares(path: Path, at: Places, key: str) -> tuple[F1, F1]:
 
 
 def twisted(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return sin(pi x / L) (2 y / L_y - 1), 1 um."""
+    """Return 1 um times sin(pi x / L) (2 y / L_y - 1): x on the moving axis, y on the axis that the key does not name."""
     x, y = _shares(path, at, key)
     return along(direction_of(key), UM * np.sin(np.pi * x) * y)
 

@@ -60,7 +60,7 @@ def sag(path: Path, at: Places, key: str, values: Values) -> tuple[F3, F3]:
 
 
 def _bent(path: Path, at: Places, key: str, values: Values) -> tuple[F3, F3]:
-    """Another bending curve, and another growth with the height."""
+    """Return sags with another bending curve and with another growth with the height."""
     z, length, y = _reach(path, at)
     return _sagging(path, (z**3 * y, 3.0 * z**2 / length * y), (z**2 * y**2, 2.0 * z / length * y**2))
 

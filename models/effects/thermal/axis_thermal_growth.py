@@ -27,13 +27,13 @@ def growth(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
-    """A part that warms up at another pace (nut, then bed)."""
+    """Return the change of the growth if a part warms up faster (nut) or more slowly (bed)."""
     x = STEEL_PER_K * _from_fixed(path, at, key, values)
     return along(axis_of(key), *(x * (warmth(at.t_s, values["tau_s"] * k) - warmth(at.t_s, values["tau_s"])) for k in (FAST, SLOW)))
 
 
 def _uneven(path: Path, at: Places, key: str, values: Values) -> F3:
-    """A screw that is hotter where the nut works: growth not proportional to the distance."""
+    """Return the growth, not proportional to the distance, of a screw that is hotter where the nut works."""
     a = axis_of(key)
     low, high = (float(v) for v in path.machine.stroke_mm[a])
     x = (at.q_mm[:, a] - low) / (high - low)
@@ -42,7 +42,7 @@ def _uneven(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _sensed(path: Path, at: Places, key: str, values: Values, rise_k: F1) -> F3:
-    """The same growth, from the temperature sensor of the axis."""
+    """Return the growth that follows from the temperature sensor of the axis."""
     return along(axis_of(key), STEEL_PER_K * _from_fixed(path, at, key, values) * rise_k)
 
 

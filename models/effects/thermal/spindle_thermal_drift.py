@@ -9,7 +9,7 @@ from abbe.models.effects.path import Path, Places
 
 
 def drift(at: Places, key: str, values: Values) -> F3:
-    """Return 1 - exp(-t / tau), 1 um; readings show only the change since the cup was set or the laser was zeroed."""
+    """Return 1 um times 1 - exp(-t / tau) along an axis; readings show only the change since the cup was set or the laser was zeroed."""
     return along(axis_of(key), UM * warmth(at.t_s, values["tau_s"]))
 
 
@@ -19,7 +19,7 @@ def _second_time(at: Places, key: str, values: Values) -> F3:
 
 
 def _sensed(path: Path, at: Places, key: str, values: Values, rise_k: F1) -> F3:
-    """The same drift, from the temperature of the spindle, 1 um per K."""
+    """Return the drift that follows from the temperature of the spindle, 1 um per K."""
     return along(axis_of(key), UM * rise_k)
 
 

@@ -29,7 +29,7 @@ def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _bent(path: Path, at: Places, key: str, values: Values) -> F3:
-    """A column that bends as it leans."""
+    """Return the deviation by a column that bends as it leans."""
     axis, direction, sign = CARRIED[key]
     low, high = (float(v) for v in path.machine.stroke_mm[axis])
     bow = share_of_stroke(at.q_mm[:, axis], path.machine.stroke_mm[axis]) ** 2 - VISITED

@@ -29,7 +29,7 @@ UNSEEN = 1e-9
 SPATIAL = 3
 """Number of coordinates of a point."""
 STRAY = 0.01
-"""Probability that a set without outliers has a point which is called outlying."""
+"""Probability that any point of a set without outliers is called outlying."""
 FRAME_NAMES = ("shift x", "shift y", "shift z", "turn a", "turn b", "turn c")
 PARAMETERS = parameter_names()
 TOLERANCE_MM, TOLERANCE_RAD = 0.05, 0.5e-3
@@ -52,7 +52,7 @@ class PriorTest:
     dof : int
         Number of carried directions. The prior of the others cannot be tested.
     p : float
-        Probability of a larger chi2 if the true deviations came from the stated prior; 1 when nothing is carried.
+        Probability of a larger chi2 if the true deviations came from the stated prior; 1 without carried directions.
     """
 
     chi2: float
@@ -134,7 +134,7 @@ def outlying_points(residual: F2) -> tuple[int, ...]:
 
 
 def _prior_factor(y2: F1, s2: F1, variance: float) -> float:
-    """Return the smallest prior factor, 1 or more, for which the sum of y^2 / (variance + factor^2 s^2) does not exceed its target."""
+    """Return the smallest prior factor, 1 or more, for which the sum of y^2 / (variance + factor^2 s^2) meets the target of `Weights`."""
     if y2.size == 0:
         return 1.0
     size, at_one = float(y2.size), float((y2 / (variance + s2)).sum())
@@ -315,7 +315,7 @@ class KwonCalibration:
         return warnings
 
     def predict_mm(self, lambda_mm: F2) -> F2:
-        """Ball centre for commands, CMM coordinates, shape (n, 3), mm."""
+        """Return the ball centres for commands, in CMM coordinates, shape (n, 3), mm."""
         return from_frame(self.frame, forward(self.geometry, lambda_mm))
 
     def u_predict_mm(self, lambda_mm: F2) -> F2:

@@ -163,7 +163,7 @@ def ladder_name(pair: tuple[int, int]) -> str:
 
 
 def in_plane_label(term: Exponents) -> str:
-    """Short key of an in-plane monomial: ``X2Y1``."""
+    """Return the short key of an in-plane monomial: ``X2Y1``."""
     return f"X{term[0]}Y{term[1]}"
 
 

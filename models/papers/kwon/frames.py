@@ -163,7 +163,7 @@ def three_point_errors(nominal3_mm: F2, measured3_mm: F2, nominal_mm: F2, measur
 
 
 def best_fit_errors(nominal_mm: F2, measured_mm: F2) -> F2:
-    """Errors after the best-fit rigid motion, along the axes of the nominal frame, shape (n, 3), mm."""
+    """Return the errors after the best-fit rigid motion, along the axes of the nominal frame, shape (n, 3), mm."""
     nominal, measured = _pair(nominal_mm, measured_mm)
     return into_frame(best_fit_frame(nominal, measured), measured) - nominal
 
@@ -176,7 +176,7 @@ def position_errors(nominal3_mm: F2, measured3_mm: F2, nominal_mm: F2, measured_
 
 
 def rms(errors_mm: F2) -> float:
-    """Root mean square length of error vectors, mm."""
+    """Return the root mean square length of error vectors, mm."""
     return float(np.sqrt((errors_mm**2).sum(axis=1).mean()))
 
 

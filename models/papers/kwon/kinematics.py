@@ -28,7 +28,7 @@ from abbe.models.papers.kwon.errors import (
 LEGS = 3
 THIRDS = np.array([0.0, 2.0 * np.pi / 3.0, 4.0 * np.pi / 3.0])
 PER_LEG = ("R", "r", "l", "thb", "thp", "dz")
-"""Parameters that may differ from leg to leg: the fields of `Geometry` in short, see `FIELDS`."""
+"""Parameters that may differ from leg to leg: short names of fields of `Geometry`, which `FIELDS` lists."""
 FIELDS = {"R": "R_mm", "r": "r_mm", "l": "l_mm", "thb": "theta_b_rad", "thp": "theta_p_rad", "dz": "dz_mm"}
 COMMON = ("l_up_mm", "l_dw_mm", "theta_rad", "le_mm")
 Branch = Literal["outside", "folded"]
@@ -383,7 +383,7 @@ def _flat(geometry: Geometry, bad: NDArray[np.bool_]) -> Fault:
 
 
 def _up(u: F3) -> F2:
-    """Return the upward unit normal of the plane of the sphere centres; z if they lie on a line."""
+    """Return the upward unit normal of the plane of the sphere centres; z if these lie on a line."""
     normal = np.cross(u[:, 0], u[:, 1])
     length = np.linalg.norm(normal, axis=1)[:, None]
     unit = np.where(length > 0.0, normal / np.where(length > 0.0, length, 1.0), np.array([0.0, 0.0, 1.0]))
@@ -391,7 +391,7 @@ def _up(u: F3) -> F2:
 
 
 def _above_centres(geometry: Geometry, lambda_mm: F2, p_mm: F2) -> F1:
-    """Return the height of positions above the plane of the sphere centres, shape (n,); h if all dz are equal."""
+    """Return the height of positions above the plane of the sphere centres, shape (n,); if all dz are equal it is Kwon's h."""
     centre = geometry.centres_mm(lambda_mm)
     if (geometry.dz_mm == geometry.dz_mm[0]).all():
         level: F1 = p_mm[:, 2] - centre[:, 0, 2]

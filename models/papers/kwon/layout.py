@@ -22,11 +22,11 @@ IN_PLANE: tuple[Exponents, ...] = tuple(
 )
 """The ten monomials of X and Y."""
 MOST_PLANES = 3
-"""Four planes carry a full cubic, fewer do not."""
+"""Largest number of planes to look for: four determine a full cubic anyway, fewer do not."""
 NO_SLOPE = 1e-12
-"""A smaller slope is rounding."""
+"""Slopes up to this size are rounding and count as zero."""
 STEEPEST = 1.0 + 1e-9
-"""Largest slope of a plane over the axis that it faces; every plane has an axis with slopes up to 1."""
+"""Largest slopes of the coordinate that a plane faces over the other two; for every plane, some coordinate has slopes up to 1."""
 RANK_TOLERANCE = 1e-3
 """Singular values below this share of the largest do not count: the coefficient would be a thousand times less certain than a reading."""
 FLATNESS = 5e-3
@@ -124,7 +124,7 @@ class Planes:
 
     @property
     def tilt_text(self) -> str:
-        """Text of the slope; empty for planes perpendicular to the axis."""
+        """Slope of the planes as text, e.g. for `Layout.plane_text`; empty for planes perpendicular to the axis."""
         return "".join(f" {s:+.4g} {letter}" for s, letter in zip(self.slope, "XYZ", strict=True) if s)
 
 
@@ -169,7 +169,7 @@ def _monomial(powers: dict[int, int]) -> Exponents:
 
 
 def _levels(offset_mm: F1, tolerance_mm: float, count: int) -> tuple[float, ...]:
-    """Return the middle of each group if the values form ``count`` groups within, and gaps above, twice the tolerance; else empty."""
+    """Return the middles of ``count`` groups no wider than twice the tolerance, with wider gaps between; empty if there are none."""
     values = np.sort(offset_mm)
     groups = np.split(values, np.flatnonzero(np.diff(values) > 2.0 * tolerance_mm) + 1)
     if len(groups) != count or any(g[-1] - g[0] > 2.0 * tolerance_mm for g in groups):
@@ -208,7 +208,7 @@ class Layout:
 
     @property
     def plane_mm(self) -> F1 | None:
-        """a (mm), b, c of the plane Z = a + b X + c Y on which all points lie, shape (3,).
+        """Coefficients a (mm), b, c of the plane Z = a + b X + c Y on which all points lie, shape (3,).
 
         None if they lie on no plane, on several, or on one that faces X or Y (`Planes.axis`).
         """
@@ -227,7 +227,7 @@ class Layout:
 
     @property
     def plane_text(self) -> str:
-        """Text of the positions of the points."""
+        """Statement of where the points lie; for one plane also of what is unknown."""
         at = self.planes
         if at is None:
             return f"points between Z = {self.low_mm[2]:.6g} and {self.high_mm[2]:.6g} mm"

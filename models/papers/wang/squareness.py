@@ -4,7 +4,7 @@ X, Y, Z are total travels, R is the diagonal. The squareness of (12), (13) is ac
 bias-free solution is `abbe.models.solvers.step_diagonal.squareness_contrast`.
 
 Angular errors of the machine FXYZ, with step order X, Y, Z, cause Abbe terms and spurious straightness, positioning and squareness; a
-machine with pure yaw seems bent. The closure test shows of this no more than the size of one step.
+machine with pure yaw seems bent. Of these errors, the closure test shows only the contribution of one step.
 """
 
 from __future__ import annotations

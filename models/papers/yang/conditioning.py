@@ -37,7 +37,7 @@ class SixParameters:
     syz: float
 
     def array(self) -> F1:
-        """The six values in the paper's order, shape (6,)."""
+        """Return the six values in the paper's order, shape (6,)."""
         return np.array(astuple(self))
 
 

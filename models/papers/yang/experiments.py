@@ -1,8 +1,8 @@
 """Experiments on Yang's machine as least-squares problems: what each could tell about the 21 error functions.
 
-There are ball-bar helices about one or several cups, step diagonals with a flat mirror, plain diagonals, and whole vector maps, with or
-without unknowns of the set-up. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. The number and positions of
-the paper's cups (Fig. 6) are lost; the reference vectors use the centre and four cups at (±200, ±75) mm.
+The experiments are ball-bar helices about one or several cups, step diagonals with a flat mirror, plain diagonals, and whole vector maps,
+with or without unknowns of the set-up. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. The number and
+positions of the paper's cups (Fig. 6) are lost; the reference vectors use the centre and four cups at (±200, ±75) mm.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from abbe.models.paths import DIAGONALS, diagonal_ends, helix_points, step_diago
 from abbe.models.solvers.designs import DesignRows, Field, bar_rows, laser_rows, stacked, vector_rows
 
 Problem = tuple[F2, F2]
-"""Columns of the machine and of the set-up of a design matrix."""
+"""The two parts of a design matrix: columns of the machine's coefficients and columns of the set-up's unknowns."""
 BAR_POINTS = 63
 MAP_NODES = 7
-"""Nodes per axis of a whole vector map; the rank does not depend on it, the effective rank hardly."""
+"""Nodes per axis of a whole vector map; the rank does not depend on it, and the effective rank hardly does."""
 LONG_TOOL_MM = np.array([0.0, 0.0, 250.0])
 LATERAL_TOOL_MM = np.array([100.0, 50.0, 150.0])
 """Second and third tool of the vector maps: a longer one, and one with a lateral offset."""
@@ -128,13 +128,13 @@ def across(beam: F1) -> F2:
 
 
 def one_helix(plan: YangPlan, *, setup: bool) -> Problem:
-    """Experiment (a): one helix with the first bar about the first origin; with ``setup``, cup offset and bar length are unknown."""
+    """Return experiment (a): one helix with the first bar about the first origin; with ``setup``, cup offset and bar length are unknown."""
     rows = helix_rows(plan, plan.origins_mm[0], plan.radii_mm[0])
     return rows.machine, rows.setup if setup else rows.setup[:, :0]
 
 
 def all_helices(plan: YangPlan, *, centres: bool, lengths: Literal["none", "common", "each"] = "none") -> Problem:
-    """Experiment (b): helices with every bar about every origin.
+    """Return experiment (b): helices with every bar about every origin.
 
     ``centres``: whether the cup offset of each origin is unknown. ``lengths``: bar lengths are known (``"none"``), have one unknown error
     (``"common"``) or one each (``"each"``); ValueError otherwise.
@@ -155,7 +155,7 @@ def all_helices(plan: YangPlan, *, centres: bool, lengths: Literal["none", "comm
 
 
 def step_diagonals(plan: YangPlan, *, tilts: bool, sequential: bool = True) -> Problem:
-    """Experiment (d): four diagonals; with ``tilts``, two mirror tilts per diagonal are unknown."""
+    """Return experiment (d): four diagonals; with ``tilts``, two mirror tilts per diagonal are unknown."""
     rows = diagonal_rows(plan, sequential=sequential)
     per = 2 if tilts else 0
     return stacked([r.machine for r in rows], [(r.setup[:, :per], tuple(range(per * k, per * k + per))) for k, r in enumerate(rows)])
@@ -168,7 +168,7 @@ def together(first: Problem, second: Problem) -> Problem:
 
 
 def vector_map(plan: YangPlan, tools_mm: tuple[F1, ...]) -> Problem:
-    """Experiment (e), an upper bound: the whole deviation vector on a grid over the volume, with each of the tools.
+    """Return experiment (e), an upper bound: the whole deviation vector on a grid over the volume, with each of the tools.
 
     Parameters
     ----------

@@ -179,7 +179,7 @@ def _coefficients() -> list[Comparison]:
 
 
 def _all_pairs() -> tuple[tuple[tuple[int, int, int], float], ...]:
-    """Return all quotients, including damaged ones."""
+    """Return all quotients of `LADDER` in Table 1, including damaged ones."""
     return implied_plane(np.array([values(paper.TABLE1[c]) for c in paper.COMPONENTS])).ratios_mm
 
 
@@ -196,7 +196,7 @@ def _in_plane() -> list[Comparison]:
 
 
 def _on_grid(component: str, z_mm: float, figure: Callable[[GridSums], float]) -> Computed:
-    """Return a figure of a component's surface on the 9 x 9 grid, with the allowance for the rounding of its coefficients."""
+    """Return the number that ``figure`` takes from a component's surface on the 9 x 9 grid; the allowance covers rounded coefficients."""
 
     def of(*beta: float) -> float:
         return figure(grid_sums(in_plane_coefficients(np.array(beta), z_mm)))

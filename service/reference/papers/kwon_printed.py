@@ -57,12 +57,12 @@ TABLE2_MEAN_SQUARES: dict[str, tuple[Printed, ...]] = {
     "e_y": printed("2.301e-3", "5.258e-6"),
     "e_z": printed("6.151e-4", "1.701e-6"),
 }
-"""Regression, residual."""
+"""Mean squares of regression and residual."""
 
 TABLE2_F: dict[str, Printed] = dict(zip(COMPONENTS, printed("981.08", "437.40", "361.61"), strict=True))
 DOF_REGRESSION, DOF_RESIDUAL, POINTS = printed("20", "60", "82")
 CRITICAL_F = Printed("2.20")
-"""F(20, 60, 0.01)."""
+"""F(20, 60, 0.01), the value that chance exceeds in one of 100 cases."""
 
 PLANE_Z_MM = Printed("113.61")
 LARGEST_UM: dict[str, Printed] = dict(zip(COMPONENTS, printed("51.2", "63.8", "65.4"), strict=True))

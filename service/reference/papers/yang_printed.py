@@ -24,7 +24,7 @@ TABLE2: dict[str, tuple[Printed, ...]] = {
     "Sxz": printed("3.8588E-05", "4.5772E-05", "-7.1843E-06"),
     "Syz": printed("-1.1094E-04", "-1.1912E-04", "-8.1715E-06"),
 }
-"""Laser, ball bar, difference: mm/mm or rad."""
+"""Parameter by laser, by ball bar, and their difference: mm/mm or rad."""
 
 TABLE3_X = printed(
     *("0", "25.4", "63.5", "101.6", "139.7", "177.8", "215.9", "4", "292.1", "330.2", "368.3", "406.4", "444.5", "482.6", "520.7"),
@@ -56,7 +56,7 @@ TABLE3_DIFFERENCE = (
         *("5.1", "3.7", "2.7", "2.7", "0.0", "1.8", "-1.6", "-5.9"),
     ),
 )
-"""um."""
+"""Laser, bar, and laser minus bar at `TABLE3_X`, um."""
 
 DAMAGED = 7
 """Index of the damaged position of Table 3."""

@@ -41,7 +41,7 @@ DIGITS = 4
 PRINTED_DIGITS = 7
 """Largest number of significant digits in Table 2."""
 SUM_DIGITS = 3
-"""Valid digits of the sums of squares of Table 2 and of their total; a printed fourth digit 0 (4.240e-2) may be padding."""
+"""Valid digits of the sums of squares of regression and total in Table 2; a printed fourth digit 0 (4.240e-2) may be padding."""
 COMPONENTS = ("ex", "ey", "ez")
 PLANES = ("rank plane 9x9, Z=const", "rank 2 planes", "rank 3 planes", "rank 4 planes")
 NEAR_F = 1e-3

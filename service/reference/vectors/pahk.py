@@ -22,14 +22,14 @@ SUBTRACTED = "coordinates of up to 900 mm were subtracted"
 LINE = "a fitted line was subtracted from the values"
 LAST = "last digit of a cubic polynomial"
 FLOORS = {"positioning": (1.2e-13, SUBTRACTED, LAST), "straightness": (1e-16, LINE, LINE)}
-"""Rounding of the stored number in mm, its reason, and the reason of the rounding of the parameters."""
+"""Rounding of the stored measured values, mm, its reason, and the reason for the rounding of the stored true values."""
 FLOOR_RAD = 2e-19
 FORMS: dict[str, tuple[Form, float, str]] = {
     "delta_first_order": ("first", 1e-13, SUBTRACTED),
     "delta_exact_rot": ("zyx", 3e-13, SUBTRACTED),
     "delta_paper_matrix": ("small", 3e-13, SUBTRACTED),
 }
-"""Key of the file, form of the chain, rounding of the stored number in mm and its reason."""
+"""By key of the file: form of the kinematics, rounding of the stored number, mm, and its reason."""
 FLOAT64 = 4e-15
 """Tolerance of the root of a sum of 21 squares: without cancellation, a few units in the last place."""
 PRINTED_TYPE = "MB1"

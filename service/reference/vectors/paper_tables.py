@@ -23,7 +23,7 @@ REVERSED = ("Syz",)
 """Rows of Table 2 whose difference is printed with the sign reversed."""
 
 ROWS = ("dxx", "dyy", "dzz", "Sxy", "Sxz", "Syz")
-"""Rows of Table 2: laser, bar, difference."""
+"""Rows of Table 2; its columns are laser, bar, difference."""
 
 TYPES = {"pahk_A": "MB1", "pahk_B": "MH2"}
 """Types of Pahk's machines (section 4). For squareness alone, all types with X on the tool side have the same diagonals."""

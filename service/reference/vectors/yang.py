@@ -50,23 +50,23 @@ LAWS: dict[str, Law] = {"angle": "angle", "area": "area"}
 RADII_MM = (175.0, 100.0)
 POINTS = 63
 TURNS = 5
-"""The file has 63 points and a bar of 175 mm, with two bars also 100 mm, and 5 turns unless a key says otherwise."""
+"""The file has 63 points, a bar of 175 mm (the second of two bars has 100 mm), and 5 turns unless a key says otherwise."""
 KINDS = ("six_angle_", "six_area_", "ten_", "corr9_", "two_radii")
 TWO_BARS = tuple(f"centre_{c}_radius_{r}" for c in ("common", "separate") for r in ("common", "separate"))
 ORIGIN = np.zeros(3)
 PER_UM = 1e-3
-"""mm of reading noise in one µm."""
+"""A micrometre in mm: turns uncertainties per mm of reading noise into those per µm."""
 INVERTED = "the file's numbers come from inverted normal equations with a condition number of up to 1900 squared"
 DETERMINED = "last digits of a least-squares solution"
 DECIMALS = 4
-"""Decimals of the combinations in the file; the computed ones, rounded to them, must be equal."""
+"""Decimals of the combinations of parameters in the file; the computed ones, rounded to them, must be equal."""
 NO_TRACE = 1e-9
 INNER = (0.1, 0.9)
 NODES = 4
 """Nodes per axis, over the inner 80 % of the travels, for the numbers about the map in the file (found by trial)."""
 STEPS = 20
 DEGREES = 4
-"""Number of degrees of the noise gains: d1 to d4 in the key of the file."""
+"""The file states noise gains for the degrees 1 to 4, under the keys d1 to d4."""
 UM = 1e3
 
 
@@ -277,7 +277,7 @@ def _cups(case: VectorCase) -> list[VectorCase]:
 
 
 def _nodes(plan: YangPlan) -> F2:
-    """Return the scale readings of the nodes for the numbers about the map."""
+    """Return the nodes, as scale readings, at which the file's numbers about the map hold."""
     return volume_grid(np.outer(plan.travel_mm, INNER), NODES)
 
 
