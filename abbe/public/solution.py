@@ -17,8 +17,10 @@ from abbe.public.estimates import Estimate
 from abbe.public.picture import Picture
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import TableRefused
+from abbe.service.identification.effect_removal import remove_effects
 from abbe.service.identification.solve import ProgressText, solve_runs
 from abbe.service.identification.solve_report import Assessment, assess, solution_of, solution_verdict
+from abbe.service.identification.table_removal import campaign_table, table_line
 from abbe.service.rendering.document_page import write_document
 from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.plots.tables import motion_bands
@@ -47,8 +49,10 @@ class Deviation:
 class Solution:
     """Error motions of a machine from the runs of a campaign; result of `solve`."""
 
-    def __init__(self, campaign: Campaign, found: Assessment) -> None:
+    def __init__(self, campaign: Campaign, found: Assessment, table: str = "") -> None:
         self.campaign = campaign
+        self.table = table
+        """The compensation table in force during the runs, and whether its side effects are subtracted; empty without one."""
         self._found = found
 
     @property
@@ -167,4 +171,6 @@ def solve(
     CampaignRefused, InstrumentsDisagree
         The data of a run, bar or mirror contradict its description; the message names it and the remedy.
     """
-    return Solution(campaign, assess(solve_runs(campaign.site, campaign.runs, model=model, progress=progress)))
+    known = remove_effects(None, campaign, campaign_table(None, campaign))
+    found = assess(solve_runs(campaign.site, known.campaign.runs, model=model, progress=progress))
+    return Solution(campaign, found, table_line(known.in_force) if known.in_force is not None else known.not_removed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from abbe.service.storage.store import Store
 class Campaign:
     """A campaign for a solver. ``folder``: its source, None if the store; ``doc``: its campaign object.
 
-    ``removed``: the table whose side effects were subtracted from the readings; None without one.
+    ``removed``: the table whose side effects were subtracted from the readings; None without one. ``tables``: images of the compensation
+    tables in force that the folder holds, by CRC; empty for a campaign of the store, which has its own.
     """
 
     name: str
@@ -31,6 +33,7 @@ class Campaign:
     folder: Path | None
     doc: dict[str, Any] = field(default_factory=dict)
     removed: TableRemoval | None = None
+    tables: Mapping[int, bytes] = field(default_factory=dict, repr=False)
 
     def without(self, labels: list[str]) -> Campaign:
         """Return the campaign without the named runs.
@@ -61,7 +64,7 @@ def from_folder(folder: Path) -> Campaign:
         A file has a mistake; the first one is reported.
     """
     content = read_folder(folder)
-    return _campaign(content.campaign["campaign"], content.campaign, content.runs, folder)
+    return replace(_campaign(content.campaign["campaign"], content.campaign, content.runs, folder), tables=content.tables)
 
 
 def from_store(store: Store, name: str) -> Campaign:

@@ -47,11 +47,13 @@ class RemovedEffects:
         return doc | {"machine_model": {"version": self.version, "taken_out": list(self.labels), "not_for_tables": list(self.lines)}}
 
 
-def remove_effects(store: Store, campaign: Campaign, table: CampaignTable, effects: tuple[Effect, ...] | None = None) -> RemovedEffects:
+def remove_effects(
+    store: Store | None, campaign: Campaign, table: CampaignTable, effects: tuple[Effect, ...] | None = None
+) -> RemovedEffects:
     """Subtract from a campaign's readings what tables cannot correct.
 
     These are the effect of ``table``, active during the measurement, beyond smooth corrections, and the effects of the machine's current
-    model that apply to this campaign and whose remedy is not a table.
+    model that apply to this campaign and whose remedy is not a table. Without a ``store`` there is no such model.
 
     Raises
     ------
@@ -64,8 +66,8 @@ def remove_effects(store: Store, campaign: Campaign, table: CampaignTable, effec
     return replace(_without_book_effects(store, left, effects), in_force=left.removed, not_removed=table.why)
 
 
-def _without_book_effects(store: Store, campaign: Campaign, effects: tuple[Effect, ...] | None) -> RemovedEffects:
-    record = current(store, campaign.site.name)
+def _without_book_effects(store: Store | None, campaign: Campaign, effects: tuple[Effect, ...] | None) -> RemovedEffects:
+    record = None if store is None else current(store, campaign.site.name)
     if record is None:
         return RemovedEffects(campaign, (), (), None)
     if record.book.machine_digest != machine_digest(campaign.site.machine):

@@ -18,6 +18,7 @@ from abbe.service.errors import TableRefused
 from abbe.service.identification.solve_report import Assessment, point, solution_verdict
 
 ProgressText = Callable[[str], None]
+DEVIATION_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,U_dx_um,U_dy_um,U_dz_um"
 GRID_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,u_dx_um,u_dy_um,u_dz_um,compensated"
 SEED, TRIALS = 101, 400_000
 
@@ -62,6 +63,17 @@ def grid_text(table: GridTable) -> str:
     rows = zip(nodes_mm(table.position_mm), values, table.compensated.reshape(-1), strict=True)
     lines = [",".join([*(f"{v:.10g}" for v in p), *(f"{v:.6g}" for v in d), str(int(c))]) for p, d, c in rows]
     return "\n".join([GRID_HEADER, *lines]) + "\n"
+
+
+def deviation_text(found: Assessment, points_mm: F2) -> str:
+    """Return the deviation at points, shape (n, 3), as CSV with a line for each point, and the verdict of the solution as a last comment.
+
+    ``dx_um`` to ``dz_um``: tool relative to workpiece, best-fit rigid motion over the strokes removed; ``U_``: expanded uncertainty, 95 %.
+    """
+    p = found.predict(points_mm)
+    rows = zip(p.points_mm, np.column_stack([p.deviation_mm, p.expanded_mm]) * 1e3, strict=True)
+    lines = [",".join([*(f"{v:.10g}" for v in at), *(f"{v:.6g}" for v in values)]) for at, values in rows]
+    return "\n".join([DEVIATION_HEADER, *lines, f"# verdict: {solution_verdict(found).word}"]) + "\n"
 
 
 def monte_carlo(found: Assessment, progress: ProgressText) -> MonteCarloCheck:

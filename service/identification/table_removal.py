@@ -50,8 +50,8 @@ class CampaignTable:
 NO_TABLE = CampaignTable()
 
 
-def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
-    """Return the table of this database with which all identify runs of a campaign were measured."""
+def campaign_table(store: Store | None, campaign: Campaign) -> CampaignTable:
+    """Return the table with which all identify runs of a campaign were measured, from the database or, without one, from its folder."""
     stated = [r.table for r in campaign.runs if r.identifies]
     acted = [one for one in stated if one.acting_crc is not None]
     crc = acted[0].acting_crc if acted else None
@@ -59,10 +59,11 @@ def campaign_table(store: Store, campaign: Campaign) -> CampaignTable:
         return NO_TABLE
     if len(acted) < len(stated) or any(one.crc != crc for one in acted):
         return CampaignTable(None, f"the runs were measured with different compensation tables: {NOT_REMOVED}")
-    image = images_of(store)(crc)
+    image = campaign.tables.get(crc) if store is None else images_of(store)(crc)
     if image is None:
+        where = "this folder" if store is None else "this database"
         sure = any(one.acting for one in acted)  # runs of older versions do not state whether a table acted
-        return CampaignTable(None, f"measured with table {crc:08X}, which is not in this database: {NOT_REMOVED}" if sure else "")
+        return CampaignTable(None, f"measured with table {crc:08X}, which is not in {where}: {NOT_REMOVED}" if sure else "")
     try:
         return CampaignTable(tables_from_image(image))
     except TableMismatch:

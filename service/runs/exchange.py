@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import tempfile
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,19 +23,32 @@ from abbe.service.storage.store import Store
 CAMPAIGN_FILE = "campaign.json"
 
 COMPLETE = "complete"
+Images = Callable[[int], bytes | None]
+
+
+def table_file(crc: int) -> str:
+    """Return the name of the file that holds the image of a compensation table beside the runs that were measured with it."""
+    return f"table-{crc:08X}.bin"
+
+
+def no_image(crc: int) -> bytes | None:
+    """Know no table."""
+    return None
 
 
 @dataclass(frozen=True, slots=True)
 class Folder:
     """Content of a checked campaign folder: ``campaign.json``, its runs in order, and the errors file of its ``current_model``.
 
-    ``run_files``: the documents of ``runs`` as they stand in the files, for an import that keeps unknown keys.
+    ``run_files``: the documents of ``runs`` as they stand in the files, for an import that keeps unknown keys. ``tables``: images of the
+    compensation tables in force that the folder holds, by CRC.
     """
 
     campaign: Doc
     run_files: list[Doc]
     runs: list[Run]
     errors: Doc | None
+    tables: dict[int, bytes]
 
 
 def read_folder(folder: Path) -> Folder:
@@ -69,7 +84,27 @@ def read_folder(folder: Path) -> Folder:
         path = folder / parsed.current_model.errors
         errors = read_json(path)
         check(path, errors, ErrorsFile)
-    return Folder(campaign, files, runs, errors)
+    return Folder(campaign, files, runs, errors, _tables(folder, runs))
+
+
+def _tables(folder: Path, runs: list[Run]) -> dict[int, bytes]:
+    """Read the images of the tables that acted during the runs, as far as the folder holds them."""
+    found = {}
+    for crc in _acting(runs):
+        path = folder / table_file(crc)
+        if not path.exists():
+            continue
+        image = path.read_bytes()
+        if zlib.crc32(image) != crc:
+            raise FileFormatError(
+                f"{path}: the CRC of this table is {zlib.crc32(image):08X}", "export the campaign again, or remove the file"
+            )
+        found[crc] = image
+    return found
+
+
+def _acting(runs: list[Run]) -> list[int]:
+    return sorted({run.table.acting_crc for run in runs if run.table.acting_crc is not None})
 
 
 def _parsed(path: Path, run: Doc) -> Run:
@@ -94,11 +129,14 @@ def import_folder(store: Store, folder: Path) -> int:
     campaign, machine = content.campaign, content.campaign["machine"]
     imported = [_imported(*one) for one in zip(campaign["runs"], content.run_files, content.runs, strict=True)]
     doc = {"imported": campaign, "errors": content.errors}
-    return store.runs.import_campaign((machine.get("name") or campaign["campaign"], machine), (campaign["campaign"], doc), imported)
+    named = machine.get("name") or campaign["campaign"]
+    return store.runs.import_campaign((named, machine), (campaign["campaign"], doc), imported, content.tables)
 
 
-def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
+def export_folder(store: Store, name_or_id: str | int, target: Path, images: Images = no_image) -> Path:
     """Write a campaign as the folder ``target``, completely or not at all, and return the folder.
+
+    ``images`` returns the image of a table by its CRC; the folder gets those that acted during the runs.
 
     Raises
     ------
@@ -118,7 +156,7 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
         raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a writable folder") from None
     try:
         aside.chmod(0o755)  # mkdtemp creates private folders; other users may read an export
-        _write_folder(store, record, runs, aside)
+        _write_folder(store, record, runs, aside, images)
         if target.exists():
             target.rmdir()
         aside.rename(target)
@@ -129,8 +167,8 @@ def export_folder(store: Store, name_or_id: str | int, target: Path) -> Path:
     return target
 
 
-def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path) -> None:
-    entries, setups = [], dict[str, Doc]()
+def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path, images: Images) -> None:
+    entries, setups, written = [], dict[str, Doc](), list[Run]()
     joined = {piece.run for run in runs if run.status == COMPLETE for piece in run.start.pieces}
     for run in runs:
         if run.id in joined:
@@ -139,6 +177,7 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
         read = whole_run(store, run) if run.status == COMPLETE else single_run(run, chunks)
         entry = run.start.entry or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
         entries.append(entry)
+        written.append(read)
         if read.setup.t_set_s is None:
             raise StoreError(
                 f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe, or is damaged: restore a backup"
@@ -146,6 +185,9 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
         setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
         _write_json(folder / entry["file"], run_document(read, run, chunks))
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
+    for crc in _acting(written):
+        if (image := images(crc)) is not None:
+            (folder / table_file(crc)).write_bytes(image)
     if record.doc.get("errors") is not None:
         _write_json(folder / record.doc["imported"]["current_model"]["errors"], record.doc["errors"])
 

@@ -131,6 +131,25 @@ def test_grid_and_tables_on_request(command, small, tmp_path):
     assert len(re.findall(r"\d ± \d", kinds)) >= 9
 
 
+def test_deviation_at_points_on_request(command, small, tmp_path):
+    """The same numbers as the report's map, and what the command refuses."""
+    (tmp_path / "points.csv").write_text("x_mm,y_mm,z_mm\n100,200,-50\n300,250,-100\n")
+    code, out, err = command("solve", small, "--at", "points.csv", "--out", "at.csv")
+    assert code == 0, err
+    assert "deviation: at.csv" in out
+    header, *rows, verdict = (tmp_path / "at.csv").read_text().splitlines()
+    assert header == "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,U_dx_um,U_dy_um,U_dz_um"
+    values = np.array([[float(v) for v in row.split(",")] for row in rows])
+    assert values[:, :3].tolist() == [[100.0, 200.0, -50.0], [300.0, 250.0, -100.0]]
+    assert (values[:, 6:] > 0.0).all()
+    assert verdict.startswith("# verdict: ")
+    for words, told in ((("--at", "points.csv"), "belong together"), (("--at", "none.csv", "--out", "b.csv"), "no such file")):
+        code, _, err = command("solve", small, *words)
+        assert code == 2
+        assert told in err
+    assert not (tmp_path / "b.csv").exists()
+
+
 def trials_agree(text):
     """The stated interval against the trials': limits count as rectangular, so theirs is a little narrower than a normal one's."""
     told = re.search(r"Monte Carlo \(GUM Supplement 1, (\d+) trials\).*?in µm: (.*?): the stated uncertainty is", text)

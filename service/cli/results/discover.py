@@ -87,12 +87,11 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Dis
     from abbe.service.discovery.discovery_store import journal_of
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
-    from abbe.service.identification.table_removal import NO_TABLE, campaign_table
+    from abbe.service.identification.table_removal import campaign_table
 
     base = None if store is None else current(store, campaign.site.name)
-    table = NO_TABLE if store is None else campaign_table(store, campaign)
     since = None if store is None else reference_solution(store, campaign)
-    job = prepare(campaign, catalogue(), base, table=table, since=since)
+    job = prepare(campaign, catalogue(), base, table=campaign_table(store, campaign), since=since)
     return job, DiscoveryJournal() if store is None else journal_of(store, job)
 
 

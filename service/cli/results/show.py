@@ -156,11 +156,12 @@ def export_campaign(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Write a campaign as a folder with campaign.json and one file for each run."""
+    """Write a campaign as a folder with campaign.json, one file for each run, and the compensation tables in force, if any."""
     from abbe.service.runs.exchange import export_folder
+    from abbe.service.tables.measured_with import images_of
 
     with open_store(database_url(db, machine)) as store:
-        written = export_folder(store, campaign, folder)
+        written = export_folder(store, campaign, folder, images_of(store))
         count = len(store.runs.all(store.campaigns.find(campaign).id))
     typer.echo(f"exported campaign {campaign!r} with {count} runs to {written}")
 

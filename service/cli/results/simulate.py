@@ -39,15 +39,15 @@ def simulate(
     from abbe.service.domain.progress import Progress
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
-    from abbe.service.identification.table_removal import NO_TABLE, campaign_table
+    from abbe.service.identification.table_removal import campaign_table
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:
         form_of(report)  # refuse a wrong suffix before the work
     with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
         sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
-        base, table = (None, NO_TABLE) if store is None else (current(store, found.site.name), campaign_table(store, found))
-        job = prepare(found, catalogue(), base, table=table)
+        base = None if store is None else current(store, found.site.name)
+        job = prepare(found, catalogue(), base, table=campaign_table(store, found))
         sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
         simulation = work(job)
         sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))

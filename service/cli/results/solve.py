@@ -15,6 +15,7 @@ from abbe.service.cli.common import DbOption, JsonOption, MachineOption, databas
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from abbe.models.arrays import F2
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.identification.reanalysis import Executor
@@ -63,6 +64,14 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     grid: Annotated[
         Path | None, typer.Option("--grid", metavar="FILE.csv", help="Also write the 3-D grid of corrections.", show_default=False)
     ] = None,
+    at: Annotated[
+        Path | None,
+        typer.Option("--at", metavar="POINTS.csv", help="Also predict the deviation at these points; with --out.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE.csv", help="Deviation and U at the points of --at.", show_default=False),
+    ] = None,
     nodes: Annotated[int, typer.Option("--nodes", min=2, max=33, help="Nodes of the grid on each axis.")] = 9,
     unit_um: Annotated[float, typer.Option("--unit-um", min=1e-6, max=10.0, help="The machine's unit for tables and grid, µm.")] = 0.1,
     trials: Annotated[bool, typer.Option("--monte-carlo", help="Also check the stated uncertainty by trials.")] = False,
@@ -74,17 +83,24 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     """
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, store_solution
     from abbe.service.domain.solution_file import SolutionFile
+    from abbe.service.errors import ConfigError
     from abbe.service.identification.effect_removal import remove_effects
     from abbe.service.identification.table_removal import campaign_table
     from abbe.service.rendering.document_page import form_of
+    from abbe.service.runs.points import read_points
 
     if report is not None:
         form_of(report)  # refuse a wrong suffix before the work
-    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials)
+    if (at is None) != (out is None):
+        raise ConfigError("--at and --out belong together", "give both: --at POINTS.csv --out FILE.csv")
+    points = None if at is None else read_points(at).axes_mm
+    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, out)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
-        chosen = found.without(without or [])
+        known = remove_effects(None, found.without(without or []), campaign_table(None, found))
+        chosen = known.campaign
         summary, doc = _solved(chosen, wanted)
+        doc |= known.doc
         if db is not None or machine is not None:
             with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: a refusal creates no database
                 doc |= store_solution(store, found, doc)
@@ -103,7 +119,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         print_json(doc)
         return
     _print(summary, SolutionFile.read(doc))
-    for name, target in (("report", report), ("grid", grid)):
+    for name, target in (("report", report), ("grid", grid), ("deviation", out)):
         if target is not None:
             typer.echo(f"{name}: {target}")
 
@@ -118,6 +134,8 @@ class _SolveRequest:
     nodes: int
     unit_mm: float
     trials: bool
+    points_mm: F2 | None
+    out: Path | None
 
 
 @contextmanager
@@ -162,14 +180,16 @@ def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict
 def _more(summary: Assessment, wanted: _SolveRequest, report_stage: Callable[[str], None]) -> dict[str, Any]:
     """Return the results that take longer, as requested. The grid is written here: if it is refused, nothing is stored."""
     out: dict[str, Any] = {}
-    if not (wanted.tables or wanted.grid or wanted.trials):
+    if not (wanted.tables or wanted.grid or wanted.trials or wanted.out):
         return out
-    from abbe.service.identification.solve_tables import grid_text, machine_grid, monte_carlo, table_rows
+    from abbe.service.identification.solve_tables import deviation_text, grid_text, machine_grid, monte_carlo, table_rows
     from abbe.service.rendering.page_file import write_page
 
     if wanted.grid is not None:
         report_stage(f"grid of {wanted.nodes} x {wanted.nodes} x {wanted.nodes} nodes")
         write_page(grid_text(machine_grid(summary, wanted.nodes, wanted.unit_mm)), wanted.grid)
+    if wanted.out is not None and wanted.points_mm is not None:
+        write_page(deviation_text(summary, wanted.points_mm), wanted.out)
     if wanted.tables:
         report_stage("what each kind of table could reach")
         out["tables"] = table_rows(summary, wanted.unit_mm)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from sqlalchemy import Connection, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
@@ -29,7 +30,7 @@ from abbe.service.domain.measured import (
 )
 from abbe.service.errors import CaptureConflict, NotStored, StoreError
 from abbe.service.storage.database import CAMPAIGN, CHECKPOINT, CHUNK, MACHINE, RUN, Repository, if_given, insert_row, owner_of
-from abbe.service.storage.tables import campaigns, checkpoints, chunks, heartbeats, machines, runs
+from abbe.service.storage.tables import campaigns, checkpoints, chunks, comp_tables, heartbeats, machines, runs
 
 MOST_DIGITS = 10
 """A text with this many digits or more is not a row id."""
@@ -149,7 +150,13 @@ class Runs(Repository):
 
         self._db.commit(work)
 
-    def import_campaign(self, machine: tuple[str, Doc], campaign: tuple[str, Doc], imported: Sequence[ImportedRun]) -> int:
+    def import_campaign(
+        self,
+        machine: tuple[str, Doc],
+        campaign: tuple[str, Doc],
+        imported: Sequence[ImportedRun],
+        tables: Mapping[int, bytes] = MappingProxyType({}),
+    ) -> int:
         """Store a campaign that was measured elsewhere; return its id. After an error nothing is stored.
 
         Parameters
@@ -158,6 +165,8 @@ class Runs(Repository):
             Name and document.
         imported : sequence of ImportedRun
             The runs; each gets one chunk in channel ``"columns"``.
+        tables : mapping of int to bytes
+            Images of the compensation tables that acted during the runs, by CRC; those that the machine has already are not stored twice.
 
         Raises
         ------
@@ -167,9 +176,15 @@ class Runs(Repository):
 
         def work(connection: Connection) -> int:
             now = self._db.now()
-            campaign_id = insert_campaign(connection, machine_id_of(connection, *machine, now), *campaign, now)
+            machine_id = machine_id_of(connection, *machine, now)
+            campaign_id = insert_campaign(connection, machine_id, *campaign, now)
             for run in imported:
                 _insert_imported(connection, campaign_id, run, now)
+            known = set(connection.scalars(select(comp_tables.c.crc).where(comp_tables.c.machine_id == machine_id)))
+            for crc, image in tables.items():
+                if crc not in known:
+                    row = {"machine_id": machine_id, "image": image, "crc": crc, "doc": {"kind": "imported"}, "created_utc": now}
+                    connection.execute(comp_tables.insert().values(row))
             return campaign_id
 
         return self._db.commit(work)

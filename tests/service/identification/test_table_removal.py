@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+import abbe
 from abbe.drivers.tables import crc32, encode
 from abbe.models.compensation.tables import NineTables
 from abbe.models.solvers.applied_tables import AppliedTables
@@ -155,6 +156,40 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
     assert f"table {crc32(image):08X} was in force: its effect beyond smooth corrections is subtracted" in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+def solved(capsys: pytest.CaptureFixture[str], *words: str) -> SolutionFile:
+    capsys.readouterr()
+    assert cli.run(["solve", *words, "--model", "rigid6", "--json"]) == 0
+    return SolutionFile.model_validate_json(capsys.readouterr().out)
+
+
+def test_an_exported_folder_gives_the_same_answer_as_the_database(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], clean_environment: object
+) -> None:
+    """It holds the table that was in force; without that file the answer says so, and a damaged file is refused."""
+    monkeypatch.chdir(tmp_path)
+    image = encode(table_image(kinked(), 100, 7))
+    folder = write_case(tmp_path / "files", campaign="july")
+    for path in folder.glob("r*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"table": {"crc": crc32(image), "acting": True}}))
+    file = f"table-{crc32(image):08X}.bin"
+    (folder / file).write_bytes(image)
+    assert cli.run(["import", str(folder), "--db", DB]) == 0
+    assert cli.run(["export", "july", "out", "--db", DB]) == 0
+    assert (tmp_path / "out" / file).read_bytes() == image
+    stored, read = solved(capsys, "july", "--db", DB), solved(capsys, "out")
+    assert read.table_removal == stored.table_removal
+    assert read.table_removal is not None
+    assert read.parameters == stored.parameters
+    assert abbe.solve(abbe.read_campaign(tmp_path / "out"), model="rigid6").table.startswith(f"table {crc32(image):08X} was in force")
+    (tmp_path / "out" / file).rename(tmp_path / file)
+    without = solved(capsys, "out")
+    assert without.table_removal is None
+    assert without.table_not_removed == f"measured with table {crc32(image):08X}, which is not in this folder: {NOT_REMOVED}"
+    (tmp_path / "out" / file).write_bytes(image[:-1])
+    assert cli.run(["solve", "out"]) == 2
+    assert "the CRC of this table is" in capsys.readouterr().err
 
 
 def test_a_table_of_a_kind_that_nobody_reads_is_not_known(tmp_path: Path) -> None:
