@@ -27,7 +27,7 @@ WIDTH = 120
 
 HEADINGS = ("where", "quantity", "printed", "computed", "off by", "within", "status", "note")
 DROPPED = (("within", 112), ("off by", 100), ("note", 76), ("where", 72))
-"""Columns that a narrow table lacks, each with the width below which it is dropped: a status must stay in one piece."""
+"""Columns to leave out of a narrow table, each with the width below which it is left out: a status must not be broken."""
 
 NAME = 12
 """Minimum width of the column of names, the only one that may wrap."""

@@ -118,7 +118,7 @@ log = structlog.get_logger("abbe.web")
 PERIOD_S, SHORTEST_S = 1.0, 0.2
 """Longest and shortest time between two messages to the page, s."""
 PAUSE_S, LONGEST_PAUSE_S, GOOD_LIFE_S = 0.1, 30.0, 30.0
-"""First and longest pause before a restart, s: it doubles with each restart, and begins anew after a process has lived this long, s."""
+"""First and longest pause before a restart, s: it doubles with each restart, and begins anew after a process has lived `GOOD_LIFE_S`."""
 START_S, HANG_S = 60.0, 20.0
 """Longest time until a web process serves, and its longest silence afterwards, s; beyond these the core ends it."""
 GOODBYE_S = 1.2

@@ -20,7 +20,7 @@ from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
 
 STOP_S = 10.0
-"""Longest time for a stop, s. The driver gives up earlier: after seconds for each write, and five until the axes stand still."""
+"""Longest time for a stop, s. The driver gives up earlier: it waits seconds for each write, and five until the axes stand."""
 Spare = Callable[[], Awaitable[bool]]
 UNDELIVERED = "the stop could not be delivered: press e-stop"
 

@@ -47,7 +47,7 @@ SAME_MM = 0.0015
 STEADY_MM = 0.1
 """Allowed change of the lag behind constant feed, either way."""
 BEHIND_S, BEHIND_MM = 0.15, 0.5
-"""Largest lag behind the command at constant feed, from acceleration and position control: the way of so many seconds, plus mm."""
+"""Largest lag behind the command at constant feed: feed times `BEHIND_S`, plus `BEHIND_MM`. Acceleration and position control cause it."""
 AROUND_MM = 100.0
 
 

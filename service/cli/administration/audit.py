@@ -31,7 +31,7 @@ def show_audit(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the newest records, oldest first."""
+    """Show the newest records of the audit in the order of their time."""
     from abbe.service.queries.people import audit as records
     from abbe.service.queries.reader import json_value
     from abbe.service.secrets import visible
@@ -48,7 +48,7 @@ def show_audit(
 
 @audit.command("verify")
 def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
-    """Check that no record was changed, removed, exchanged or cut off at the end; exit code 1 if one was."""
+    """Check that no record was changed, removed, swapped or cut off at the end; exit code 1 if one was."""
     from abbe.service.audit.book import AuditBook
     from abbe.service.secrets import visible
 

@@ -57,7 +57,7 @@ def restore(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a backup's files, schema and audit, then restore it. A database in use, or existing without --replace, is refused."""
+    """Check a backup's files, schema and audit, then restore it. Refuse a database in use, or, without --replace, one that exists."""
     from abbe.service.backup.restore import restore as restore_backup
     from abbe.service.clock import SystemClock
     from abbe.service.domain.document import document

@@ -100,7 +100,7 @@ def trend(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show whether each judged figure is in control or since when it drifts, and the days until its limit with their uncertainty."""
+    """Show whether each judged figure is in control or drifts (since when), and the days until its limit, with their uncertainty."""
     from abbe.service.cli.common import reader_of
     from abbe.service.queries.reader import json_value
     from abbe.service.queries.results import trends

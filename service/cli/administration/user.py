@@ -158,7 +158,7 @@ def new(
     db: DbOption = None,
     machine: MachineOption = None,
 ) -> None:
-    """Create a key pair. FILE gets the private key, readable by its owner only; the public key is printed, for [signatures] trusted."""
+    """Create a key pair. FILE gets the private key, readable by its owner only; list the printed key under [signatures] trusted."""
     from abbe.service.signed.keys import new_key
 
     typer.echo(new_key(file))

@@ -130,7 +130,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
 
 
 def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """Yield the blocks of a test. The cup is placed at the centre; the bar, too long for there, is hung in beside the path's start."""
+    """Yield the blocks of a test. The cup is placed at the centre; the bar does not fit there, so it is hung in beside the path's start."""
     here: Point | None = None
     steps = test.steps
     first = next((k for k, s in enumerate(steps) if isinstance(s, RecordPath | ReadBar)), 0)

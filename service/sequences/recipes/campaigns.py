@@ -77,9 +77,9 @@ STEPS, LINE_N = 12, 13
 JUDGED = "pnp"
 BACK = "check-back"
 CHORD_MM = 0.5
-"""Even chord of helices in a discovery: at a radius of 120 mm it runs at most 0.24 um inside the sphere, the usual uneven chords up to
-10 um. Where a sample lies on its path is known to half a sampling period (0.3 mm at 50 Hz and 2000 mm/min), so on the usual chords readings
-scatter, and a clean machine seems disturbed."""
+"""Chord of the helices in a discovery, even along the path: it runs at most 0.24 um inside the sphere at a radius of 120 mm. The usual
+chords run up to 10 um inside. The place of a sample is known only to half a sampling period (0.3 mm at 50 Hz and 2000 mm/min), so its
+readings would scatter there, and a clean machine would seem disturbed."""
 ROUND: tuple[Literal[1, -1], ...] = (1, -1)
 
 

@@ -66,9 +66,9 @@ from abbe.service.sequences.steps import (
 )
 
 MIN_TURNS = 3.0
-"""With fewer, a hemisphere hardly tells cup offset, scale and squareness apart (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
+"""With fewer turns cup offset, scale and squareness are hardly told apart (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
 PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
-"""Angles of the partial arc of ISO 230-4, and of its feed-in or feed-out."""
+"""Span of the partial arc of ISO 230-4, degrees, and of each of its feed-in and feed-out."""
 Turns = Annotated[float, Limits(ge=3.0, le=50.0)]
 Lead = Annotated[float, Limits(ge=0.0, le=90.0)]
 Arc = Annotated[float, Limits(ge=0.0, le=360.0)]
@@ -153,7 +153,7 @@ class Helix(CupTest):
 
 @dataclass(frozen=True, slots=True)
 class HelixPoints(CupTest):
-    """The same helix point by point: ``points`` positions from pole to equator (direction -1: back), each read at standstill.
+    """The helix of `Helix` point by point: ``points`` positions from pole to equator (direction -1: back), each read at standstill.
 
     Between two positions the machine moves along the sphere, so that the bar stays within its stroke, stops half a millimetre before the
     next one against the motion of each axis, and moves there straight: every axis arrives in its direction of travel between positions.
