@@ -111,7 +111,7 @@ def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Tar
 
 
 def _prove(part: Path, backup: Path) -> int:
-    """Prove that a copied backup is whole, known and unchanged; return its number of audit records."""
+    """Prove that a copied backup is whole, of a known schema, and unchanged; return its number of audit records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
         raise BackupRefused(f"{backup} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")

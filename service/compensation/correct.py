@@ -164,7 +164,7 @@ class _PushQuestions:
     context: PushContext
     admission: Admission
     drift_mm: float | None
-    """Rms residual of the solution in a newer run that it was not solved from, mm; None without such a run."""
+    """Rms residual of the solution in a newer run, which the solution did not use, mm; None without such a run."""
     bar: BarPlaces | None
     before: VerificationFigures
     read_before: PlaceReadings | None = None

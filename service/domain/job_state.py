@@ -15,10 +15,10 @@ JobKind = Literal["check", "campaign", "investigation", "push", "rollback"]
 class JobState:
     """A job since the service started: a check, a full campaign, work on an alarm, or a rollback ordered by a person.
 
-    ``state``: running, asking, pausing, paused, …; once it has ended ``done: VERDICT`` of a check, ``done: kept``
-    (``rolled back``, ``refused``, ``stopped``, ``failed``, ``open``) of a push, ``done: proposed`` (``ended``, ``failed``,
-    ``stopped``) of a campaign or an investigation, or ``interrupted``. A rollback is a push of the previous table: ``kept`` means that
-    this table is in force again. While it is ``asking``, a person has to do what ``ask`` says and confirm the number ``prompt``. ``who``:
+    ``state``: running, asking, pausing, paused, …; at the end ``interrupted``, or ``done: WORD``. The word is the verdict of a check;
+    ``kept``, ``rolled back``, ``refused``, ``stopped``, ``failed`` or ``open`` for a push; ``proposed``, ``ended``, ``failed`` or
+    ``stopped`` for a campaign or an investigation. A rollback is a push of the previous table: ``kept`` means that this table is in
+    force again. While it is ``asking``, a person has to do what ``ask`` says and confirm the number ``prompt``. ``who``:
     empty if no person ordered it. ``solution``, ``proposal``: results of a campaign in the store.
     """
 

@@ -17,8 +17,8 @@ class Progress:
     """Progress of work.
 
     ``done`` of ``total`` in the work's own unit (default: seconds of planned machine time); ``eta_s``: wall seconds left without waiting
-    times, None without a basis for an estimate. Of a measurement: ``state`` (of `abbe.service.sequences.control`) and
-    ``why`` it waits, ``step`` of ``steps``, and ``points`` read in the present test.
+    times, None without a basis for an estimate. For a measurement: its ``state`` (of `abbe.service.sequences.control`),
+    ``why`` it waits, the number ``step`` of ``steps``, and the number of ``points`` read in the present test.
     """
 
     stage: Word = ""
@@ -37,7 +37,7 @@ ProgressSink = Callable[[Progress], None]
 
 
 def ignore_progress(_: Progress) -> None:
-    """A sink that ignores progress."""
+    """Ignore progress: a sink for callers that do not want it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -296,7 +296,7 @@ class StoreBook:
 
     @classmethod
     async def of_chain(cls, store: Store, chain: str, clock: Clock) -> StoreBook | None:
-        """Journal of the last push in the journal of this name; None if it is empty."""
+        """The last push of the journal of this name; None if the journal is empty."""
         entries = await asyncio.to_thread(store.pushes.entries_of, chain)
         if not entries:
             return None
@@ -348,7 +348,7 @@ class StoreBook:
 
 
 def push_log(journal: Journal) -> tuple[str, ...]:
-    """Every transition of a push as a line for people."""
+    """Return every transition of a push as a line for people."""
     lines = []
     for entry in journal:
         known = facts((entry,))

@@ -66,7 +66,7 @@ class Capabilities:
     """The controller itself refuses an activation while the machine moves or an interlock is open."""
     lease: bool = False
     can_disable: bool = False
-    """One bank: compensation can be switched off, and drives-off is confirmed."""
+    """With one bank only: compensation can be switched off, and the controller confirms that the drives are off."""
 
     @property
     def level(self) -> int:

@@ -17,7 +17,7 @@ from abbe.service.domain.schedule import Schedule
 
 
 class Hindrance(NamedTuple):
-    """What keeps a slot from starting: the state of the slot if this lasts too long, and its sentence."""
+    """What keeps a slot from starting: the state that the slot gets if this lasts too long, and a sentence."""
 
     state: str
     text: str
@@ -34,7 +34,7 @@ class Waiting:
 
     @property
     def grace_ends(self) -> datetime:
-        """When the slot is late."""
+        """When the grace period of the slot ends."""
         return self.slot + timedelta(seconds=self.schedule.grace_s)
 
     @property

@@ -241,7 +241,7 @@ APPROVAL = RecordMapping(decisions.ProposalApproval, t.approvals)
 REJECTION = RecordMapping(decisions.ProposalRejection, t.rejections)
 PUSH_ENTRY = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id)
 PUSH_MARK = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id, doc=null())
-"""Without the document, which holds the images of tables."""
+"""A push entry without its document, which holds the images of tables."""
 
 ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries)
 SLOT = RecordMapping(service_records.SlotRecord, t.slots, reason=func.coalesce(t.slots.c.reason, ""))

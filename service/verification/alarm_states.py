@@ -101,7 +101,7 @@ class Alarm:
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
-    """Return the effect of a check on the alarm of its recipe, ``now`` (None: there is no alarm); None: no effect."""
+    """Return the effect of a check on ``now``, the alarm of its recipe (None: there is none); None: no effect."""
     if not found.judged:
         return None
     if now is None or not now.active:

@@ -16,7 +16,7 @@ from abbe.service.runs.observations import run_data
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
-"""Any figure may get worse by its expanded uncertainty plus this share of the worst diagonal before (diagonals) or of itself (helix)."""
+"""A figure may get worse by its expanded uncertainty plus this share: for diagonals of the worst one before, for a helix of itself."""
 
 SAME_AIR_C = 1.0
 """Largest range of air temperature over all readings before and after: steel and iron grow by 11 to 12 um per metre and kelvin, which is
@@ -113,7 +113,7 @@ def _expanded(a: VerificationFigure, b: VerificationFigure) -> float:
 def incomparable(before: VerificationFigures, after: VerificationFigures, pushed_crc: int | None = None) -> str:
     """Reason why the verifications before and after cannot be compared; empty if they can.
 
-    ``pushed_crc``: CRC of the new table; all runs of the verification after must have been measured with this table.
+    ``pushed_crc``: CRC of the new table; all runs of the later verification must have been measured with this table.
     """
     if not (before.finite and after.finite):
         return "a figure is not a number"
