@@ -33,7 +33,7 @@ def rules_of(config: MachineFile | None) -> Rules:
 
 
 def numbered_report(store: Store, what: str, number: int, rules: Rules, machine: str | None = None) -> Document:
-    """Report of push, discovery or verification ``number``; ``machine``: owner of the push, needed if several machines have this number.
+    """Report of push, discovery or verification ``number``; ``machine``: owner of the push, needed if several have this number.
 
     Raises
     ------

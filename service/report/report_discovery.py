@@ -204,7 +204,7 @@ def gap_table(finding: Finding) -> TextTable:
 
 
 def _what(finding: Finding) -> str:
-    """Name the addition to the model that leads from the gap before to the gap after; empty if there is none."""
+    """Name what was added to the model between the gap before and the gap after; empty if nothing was."""
     return {"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict]
 
 

@@ -221,7 +221,7 @@ def _run_table(found: Measured) -> TextTable:
 
 
 def _unfinished(states: Sequence[Sequence[str]], runs: Sequence[Run]) -> list[str]:
-    """Remarks about runs that no figure uses; for a resumed run, the run that holds its readings."""
+    """Remarks about runs that no figure uses; for a run that was resumed, they name the run that contains its readings."""
     whole = {piece.run: r.run_id for r in runs for piece in r.timing.pieces}
     short = {r.run_id: why for r in runs if (why := not_judged(r))}
     out = []

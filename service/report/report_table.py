@@ -54,7 +54,7 @@ def _corrects(crc: int, table: RunTable, images: Images) -> bool:
 
 
 def _remark(crc: int, known: KnownTables, chain: str) -> str:
-    """Origin of the table and who accepted it for this machine; empty if this machine's journal endorses it."""
+    """Origin of a foreign table, and who accepted it for this machine; empty if this machine's own pushes wrote it or found it in force."""
     elsewhere, here, push = known.elsewhere(crc, chain), known.endorsed.get(crc, {}).get(chain), known.pushed.get(crc)
     if elsewhere is not None:
         return f"measured with a table (CRC {crc:08X}) that was {elsewhere.not_here}: not accepted"

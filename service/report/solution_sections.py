@@ -153,7 +153,7 @@ def _residuals(found: Assessment) -> list[Block]:
 
 
 def motion_curves(found: Assessment) -> list[MotionCurve]:
-    """Every error motion as a function over its stroke, with its standard uncertainty, µm or µrad."""
+    """Every error motion except squareness as a function over its stroke, with its standard uncertainty, µm or µrad."""
     joint = found.joint
     stroke = joint.machine.stroke_mm
     nodes = np.stack([np.linspace(lo, hi, CURVE_NODES) for lo, hi in stroke], axis=1)
@@ -183,7 +183,7 @@ def _slice(found: Assessment, plane: tuple[int, int, int]) -> Slice:
 
 
 def _gain(found: Assessment, fixed: int) -> Slice:
-    """Noise gain over the plane in the middle of one axis."""
+    """Noise gain over the plane through the middle of axis number ``fixed``."""
     plane = found.observability.plane(fixed, SLICE_NODES)
     values = plane.volume.gain.reshape(SLICE_NODES, SLICE_NODES)
     at = f"{AXES[fixed]} = {plane.fixed_mm:.0f} mm"
@@ -239,7 +239,7 @@ def parameter_rows(joint: JointSolution) -> list[ParameterRow]:
 
 
 def contributions(joint: JointSolution) -> list[Contribution]:
-    """Rms over its stroke of every translation and squareness, largest first. Angles act through levers and appear in the map only."""
+    """Rms of each translation and squareness over its stroke, half of each lost motion; largest first. Angles appear in the map only."""
     weights: dict[str, list[tuple[int, float]]] = {}
     for k, term in enumerate(joint.terms):
         if term.order == 0:

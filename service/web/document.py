@@ -65,7 +65,7 @@ UNUSED = ("HTTPValidationError", "ValidationError")
 
 
 def complete(document: Doc, routes: Sequence[BaseRoute]) -> Doc:
-    """Add the permissions and answers of the middleware to FastAPI's OpenAPI document, in place; idempotent."""
+    """Add the permissions of the routes and the responses of the middleware to FastAPI's OpenAPI document, in place; idempotent."""
     needs = {(path, method.lower()): need for method, path, need in route_permissions(routes)}
     for path, methods in document.get("paths", {}).items():
         for method, operation in methods.items():

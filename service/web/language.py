@@ -61,7 +61,7 @@ def _weight(text: str) -> float:
 
 
 def span(language: str, seconds: float) -> str:
-    """A duration in the largest sensible unit, as `abbe.service.queries.timetable.span`."""
+    """A duration as text in the largest sensible unit, like `abbe.service.queries.timetable.span`."""
     s = abs(seconds)
     if s < 90:
         return translate(language, "span.s", n=f"{s:.0f}")

@@ -1,6 +1,6 @@
 """The OPC UA server as a part of the service: it updates its values once a second and accepts none. Its failures affect nothing else.
 
-asyncua decides only by user roles and by each node's access level. It also answers clients on an unencrypted channel, which it needs for
+asyncua grants access only by user roles and each node's access level. It also answers clients on an unencrypted channel, which it needs for
 discovery, even if only encrypted channels are offered. `ClientSession` therefore refuses every service that changes something. If client
 certificates are configured, it activates a session only on a channel encrypted with one of them.
 """

@@ -95,7 +95,7 @@ def difference_plot(x: Array, apart_um: Array, u_um: Array, *, key: str, heading
 
 
 def _compared(svg: Svg, heading: str, labels: tuple[str, str], xs: Sequence[Array], ys: Sequence[Array]) -> Panel:
-    """Heading and axes of a picture that holds all values."""
+    """Draw heading and axes of a picture with room for all values; return its panel."""
     svg.text((LEFT, 18.0), heading, "t-head")
     x_range = data_range((float(v) for x in xs for v in x), margin=0.02)
     y_range = data_range((float(v) for y in ys for v in y), zero=True)

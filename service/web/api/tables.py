@@ -95,7 +95,7 @@ def _add_decisions(app: FastAPI, sources: Sources) -> None:
 
 @contextmanager
 def _stored(sources: Sources, number: int) -> Iterator[None]:
-    """Require that the proposal exists; turn errors in its stored row into an answer."""
+    """Require that the proposal exists; within the context, errors in its stored row become a response."""
     sources.reader.row("proposals", number, "proposal")
     with as_stored():
         yield

@@ -26,7 +26,7 @@ MOST_BUSY = 100
 
 
 class TimeLimitedProtocol(H11Protocol):
-    """HTTP protocol of one connection with a limit for every wait."""
+    """HTTP protocol of one connection, with a time limit for every wait."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

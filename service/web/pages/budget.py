@@ -69,7 +69,7 @@ class BudgetScreen:
 
 
 def budget_screen(store: Store, record: SolutionRecord, translate: Translate) -> BudgetScreen:
-    """The stored budget. Computed here: the combined u, U of the means over the volume, and the ends of intervals."""
+    """The stored budget. Computed here: the combined u, U of the linear errors (means over the volume), and the ends of intervals."""
     solution = stored_solution(record.doc, record.id)
     campaign = store.campaigns.find(record.campaign_id).name
     lines, worst, trials = solution.uncertainty.budget, solution.uncertainty.worst_point, solution.monte_carlo

@@ -72,7 +72,7 @@ class VolumeScreen:
 
     @property
     def axes(self) -> list[tuple[str, list[tuple[str, str, bool, bool]]]]:
-        """Motions grouped by axis; squareness belongs to none."""
+        """Motions grouped by axis; squareness belongs to none and comes last."""
         groups = [(axis, [m for m in self.motions if m[0][1] != "0" and m[0][2] == axis]) for axis in "XYZ"]
         return [*groups, ("", [m for m in self.motions if m[0][1] == "0"])]
 
