@@ -82,7 +82,7 @@ def _against_feed(run: Run) -> list[CampaignIssue]:
 
 
 def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Flag runs whose times overlap: repeatedly the run with the most overlaps, which is then left out, until none remains."""
+    """Flag runs whose times overlap: flag the run with the most overlaps, leave it out, and repeat until no overlap remains."""
     spans = {r.run_id: (float(r.columns.t_s[0]), float(r.columns.t_s[-1])) for r in runs if len(r.columns)}
     spans = {k: v for k, v in spans.items() if np.isfinite(v).all()}
     meets = {k: [m for m in spans if m != k and _share(spans[k], spans[m]) > OVERLAP] for k in spans}
@@ -203,7 +203,7 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
     Raises
     ------
     CampaignRefused
-        The first such issue, and the runs with further ones.
+        The message states the first such issue, and names the runs with further ones.
     """
     bad = [f for f in issues if f.refuse]
     if bad:

@@ -100,7 +100,7 @@ def _version(package: str) -> str:
 
 @cache
 def revision() -> str | None:
-    """Return the commit of the sources, installed from a repository or in a work tree; None for a plain package. Cached per process.
+    """Return the commit of the sources if they were installed from a repository or are in a work tree, else None. Cached per process.
 
     The suffix ``+changes`` marks a work tree whose program differs from its commit.
     """

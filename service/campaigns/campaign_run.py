@@ -44,14 +44,14 @@ async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
 
 
 class BarBreaks:
-    """Handles the loss of the box during a test; without ``ballbar`` in the conditions of ``suspending``, a loss ends the measurement."""
+    """Handles loss of the ball-bar's box in a test. Without ``ballbar`` in the conditions of ``suspending``, it ends the measurement."""
 
     def __init__(self, session: Session, control: Control, suspending: Suspending) -> None:
         self._bar, self._control, self._suspending = session.ballbar, control, suspending
         self._count = 0
 
     async def wait(self, error: DriverError, runner: Runner, journal: Journal) -> None:
-        """Wait for a lost box after a run that ended with this error; return if the error is not such a loss.
+        """Wait for a lost box after a run that ended with this error; return at once if it is no such loss, or no reason to wait.
 
         Raises
         ------
@@ -93,7 +93,7 @@ async def decline(_: str) -> bool:
 
 
 async def _nothing_read(_: str, __: int) -> ReadProgress | None:
-    """Report no reading: paths begin again."""
+    """Report that nothing of a path was read, so that it begins again."""
     return None
 
 
@@ -107,8 +107,8 @@ class Item:
     """State of a test that is not complete yet.
 
     ``test`` and ``first`` as planned (``first`` mounts the set-up of ``test``); ``whole``: all steps in the present mounting, whose number
-    is ``mounting``; ``left``: the remaining steps, from ``offset`` on; ``hand``: last manual step done; ``before``: start position, if an
-    earlier test mounted the set-up; ``remainder``: rest of an interrupted path; ``kept_mm``: greatest length read so far.
+    is ``mounting``; ``left``: the remaining steps, from ``offset`` on; ``hand``: number of the last manual step done; ``before``: start
+    position, if an earlier test mounted the set-up; ``remainder``: rest of an interrupted path; ``kept_mm``: greatest length read so far.
     """
 
     test: TestPlan
@@ -130,7 +130,7 @@ class Item:
         return str(self.test.setup["setup_id"])
 
     def attempt(self) -> Attempt:
-        """Return the attempt for the runner."""
+        """Return this state as the runner needs it for its next attempt."""
         return Attempt(self.test.label, self.setup, self.offset, self.mounting, self.resume_trail, remainder=self.remainder)
 
 

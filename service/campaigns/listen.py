@@ -174,7 +174,7 @@ def _stream(heard: Heard) -> tuple[F1, F1]:
 
 
 def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
-    """Return the conversion from laser to controller time, by both clocks' fits to the host's, and the laser's lag."""
+    """Return the conversion from laser to controller time, by both clocks' fits to the host's, and the laser's lag, None if unknown."""
     laser = _fit([(r.device_us, r.host_s) for r in heard.readings])
     cnc = _fit([(s.ctrl_us, s.host_s) for s in heard.statuses])
 

@@ -160,9 +160,9 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
 class MeasureOptions:
     """Options of a measurement.
 
-    ``control``: interrupts it. ``confirm``: asks a person whether a set-up is untouched. ``source``: of the plan, for `abbe measure
-    --resume`. ``resumed``: where an interrupted campaign resumes. ``part``: the job of ``control`` continues after this measurement.
-    ``live``: receives the readings of paths.
+    ``control``: pauses, stops or aborts it. ``confirm``: asks a person whether a set-up is untouched. ``source``: where the plan comes
+    from, for `abbe measure --resume`. ``resumed``: where an interrupted campaign resumes. ``part``: the job of ``control`` continues
+    after this measurement. ``live``: receives the readings of paths.
     """
 
     control: Control | None = None

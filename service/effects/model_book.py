@@ -95,11 +95,11 @@ def without(case: Case, known_mm: dict[str, F1]) -> Case:
 
 
 ALIKE = 2.0
-"""Non-linear values that differ by fewer standard uncertainties than this count as equal, so their columns are the same."""
+"""Values of a non-linear parameter that differ by fewer standard uncertainties than this count as equal, and so do their columns."""
 OPPOSITE = -0.8
 """Below this cosine between two findings' coefficients the later finding reverses the earlier one; otherwise it is another change."""
 FORM = 0.1
-"""Relative standard uncertainty of coefficients, because no machine follows a formula exactly."""
+"""Relative standard uncertainty assumed for coefficients, because no machine follows a formula exactly."""
 LOOK = "`abbe model list MACHINE` shows all versions"
 REMEDIES = {
     "table": "compensation tables",
@@ -142,8 +142,8 @@ class Difference:
 def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
     """Return the total size of several entries of one label: coefficients add up, unsigned sizes (an rms, a length) do not.
 
-    If the non-linear values agree and no form was needed, this is the strength of the summed coefficients, scaled to the whole strength
-    that the entries state (`Effect.unseen`). Otherwise, and for an effect that is not in the catalogue, it is the sum of the strengths.
+    If the non-linear parameters agree and no other form was needed, this is the strength of the summed coefficients, scaled to the whole
+    strength that the entries state (`Effect.unseen`). Otherwise, and for an effect outside the catalogue, it is the sum of the strengths.
     """
     u, unit = float(np.hypot.reduce([e.u_strength for e in entries])), entries[-1].unit
     if effect is None or len(entries) == 1 or entries[0].forms or not _addable(entries):

@@ -52,8 +52,8 @@ def remove_effects(
 ) -> RemovedEffects:
     """Subtract from a campaign's readings what tables cannot correct.
 
-    These are the effect of ``table``, active during the measurement, beyond smooth corrections, and the effects of the machine's current
-    model that apply to this campaign and whose remedy is not a table. Without a ``store`` there is no such model.
+    This is what ``table``, active during the measurement, did beyond smooth corrections, and those effects of the machine's current model
+    that apply to this campaign and whose remedy is not a table. Without a ``store`` there is no such model.
 
     Raises
     ------

@@ -26,7 +26,7 @@ from abbe.service.site import Site
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
-"""Set-up unknowns that cannot be off by five times their uncertainty: they were calibrated, or the error would have been visible."""
+"""How names of set-up unknowns begin that cannot be off by five uncertainties: they were calibrated, or the error would be visible."""
 LASER_REMEDY = "look at beam, mirror and temperature of that set-up"
 UNUSUAL = {
     "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),
@@ -54,7 +54,7 @@ STEP_PLACE_MM = 0.1
 
 @dataclass(frozen=True)
 class Solved:
-    """Joint solution and, for comparison, the papers' own solutions of the same runs.
+    """Joint solution and, for comparison, the same runs solved by published methods (ten-parameter helix, step diagonals).
 
     ``flags``: oddities of single runs that are not certainly wrong. ``digests``: hash of every run's data as measured, by run label.
     ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of what was subtracted from the
@@ -218,7 +218,7 @@ def _longest_contained(names: list[str], unknown: str) -> str | None:
 
 
 def step_diagonals(runs: list[Run]) -> dict[str, dict[str, float]]:
-    """Return the papers' step-diagonal results by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
+    """Return step-diagonal results of Wang's method by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
 
     These are the end errors of the nine curves (um), the largest closure (um, with the u of one closure) and squareness contrasts (urad).
     """

@@ -53,7 +53,7 @@ from abbe.service.tables.measured_with import distinct
 
 VERDICTS = ("mostly assumption", "usable with care", "good")
 ENOUGH, HALF = 0.8, 0.5
-"""Shares of the volume where the error is larger than its uncertainty."""
+"""Shares of the volume where the error exceeds its uncertainty; a smaller share lowers the verdict."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class Assessment:
         return self.solved.joint
 
     def predict(self, points_mm: F2) -> Prediction:
-        """Return the deviation and uncertainty at other points, shape (n, 3), in the same frame."""
+        """Return the deviation and uncertainty at other points, shape (n, 3), with the same rigid motion removed."""
         return predict_deviation(self.sources, points_mm, frame=volume_frame(self.joint.machine))
 
 

@@ -1,8 +1,8 @@
 """Subtract what an active compensation table did beyond smooth corrections from a campaign's readings.
 
-The table is known exactly, from the controller or the database. Subtracted are the effect of lost motion on the axis moves that the table
-causes, and what interpolation and rounding add to these moves. The machine's lost motion is solved first, from the runs whose axes reverse
-by command, and not by the table while they are commanded to rest.
+The table is known exactly, from the controller or the database. Its moves of the axes suffer lost motion, and interpolation and rounding
+add to them: both effects are subtracted. The machine's lost motion is solved first, preferably without step diagonals, in which the table
+alone moves axes that are commanded to rest.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NOT_REMOVED = "the effect of tables beyond smooth corrections, above all with lo
 
 @dataclass(frozen=True)
 class RemovedTable:
-    """Effect of a table. ``force``: the applied tables, lost motion included; ``stays``: the part that stays in the readings."""
+    """A table whose effect is subtracted. ``force``: its whole effect, with lost motion; ``stays``: the part that stays in the readings."""
 
     force: AppliedTables
     stays: AppliedTables
@@ -119,7 +119,7 @@ def subtract_table(runs: list[Run], out: RemovedTable) -> list[Run]:
 
 
 def _lost_motion(site: Site, used: list[Run], table: NineTables) -> dict[str, tuple[float, float]]:
-    """Solve lost motion and its u by axis, mm, without the whole effect of the table, whose interpolation would look like reversals."""
+    """Solve lost motion and its u by axis, mm, after subtracting the whole table, whose interpolation would look like reversals."""
     plain = [r for r in used if r.is_bar or not r.laser.order]
     runs = subtract_table(plain or used, RemovedTable(AppliedTables(table.correction_at), NOTHING))
     return solve_joint(site.machine, tuple(run_data(r) for r in runs)).backlash_mm()
