@@ -1,4 +1,4 @@
-"""``python -m abbe.simulators.ballbar_box``: only the box of a ball-bar, on a pseudo terminal, at any speed, with its ledger in a file."""
+"""``python -m abbe.simulators.ballbar_box``: only a ball-bar's box, on a pseudo terminal, at any speed. Writes the fates of its samples."""
 
 import argparse
 import asyncio

@@ -11,7 +11,7 @@ from pathlib import Path
 class PseudoSerial:
     """One open pty. The host opens ``path``; ``received`` gets the bytes that it writes.
 
-    The slave stays open here, too, otherwise the master would read EIO whenever no host has opened it.
+    This process keeps the slave open, too: otherwise the master would read EIO whenever no host has it open.
     """
 
     def __init__(self, received: Callable[[bytes], None], link: Path | None = None) -> None:

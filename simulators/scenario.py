@@ -145,7 +145,7 @@ def from_dict(data: dict[str, Any]) -> Scenario:
 
 
 def check(scenario: Scenario) -> None:
-    """Refuse values no machine can have (raises ScenarioError)."""
+    """Raise ScenarioError for values that no machine can have."""
     parse_chain(scenario.machine.chain)
     for axis in AXES:
         low, high = getattr(scenario.machine.stroke_mm, axis)

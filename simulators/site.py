@@ -98,7 +98,7 @@ class Site:
         return {"ready": True, **urls, "speed": scenario.speed, "machine": asdict(scenario.machine)}
 
     async def stop(self) -> None:
-        """Close all wires and remove the links."""
+        """Close all lines and ports, and remove the stable paths."""
         if self._ticking is not None:
             self._ticking.cancel()
             self._ticking = None

@@ -47,7 +47,7 @@ class World:
     def advance(self, to_s: float) -> None:
         """Advance to an instant (s); an earlier one changes nothing.
 
-        On the way, all instants at which an instrument reads or an axis may reverse are evaluated in order.
+        On the way, it evaluates in order all instants of bar samples, the last one of the laser, and those at which an axis may reverse.
         """
         if to_s <= self.time_s:
             return
@@ -108,7 +108,7 @@ def with_hidden_bar(draws: Draws, scenario: Scenario) -> Draws:
 
 
 def laser_sizes(scenario: Scenario) -> Magnitudes:
-    """Return the magnitudes for the laser; a hidden cosine error (mrad) sets the misalignment of every beam to about its strength."""
+    """Return the magnitudes for the laser; a hidden ``laser_cosine`` sets the misalignment of every beam to about its strength."""
     if scenario.hidden.name != "laser_cosine":
         return scenario.magnitudes
     askew = 1e3 * scenario.hidden.parameters["strength"]

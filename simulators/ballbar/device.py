@@ -172,7 +172,7 @@ class BallbarDevice:
         return Samples(*(np.concatenate([none, *(getattr(s, name) for s in ready)]) for name in Samples.__slots__))
 
     def settle(self) -> None:
-        """Compute the readings of the samples taken so far; called before anything that readings depend on changes."""
+        """Compute the readings of the samples taken so far; called before every change that affects readings."""
         if not self._taken:
             return
         parts, self._taken = self._taken, []

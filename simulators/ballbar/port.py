@@ -23,7 +23,7 @@ class BytePort(Protocol):
         ...
 
     def room(self) -> int:
-        """Return the number of bytes that can be sent now without losing any."""
+        """Return the number of bytes that the buffer still takes."""
         ...
 
     def send(self, data: bytes) -> None:
@@ -88,7 +88,7 @@ class PtyPort:
 
 
 class TcpPort:
-    """The same bytes over raw TCP on 127.0.0.1; a new connection replaces the old one."""
+    """A raw TCP port on 127.0.0.1 in place of a serial line; a new connection replaces the old one."""
 
     def __init__(self, port: int) -> None:
         self._port = port

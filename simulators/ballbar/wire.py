@@ -15,7 +15,7 @@ SENT, SUPPRESSED, CORRUPTED = "sent", "suppressed", "corrupted"
 
 
 class BoxLedger:
-    """Fates of sequence numbers, as runs of equal fate: (stream, first, last, fate). Streams count from 0 at the first START."""
+    """What became of each sample: successive sample numbers of equal fate form a run (stream, first, last, fate); streams count from 0."""
 
     def __init__(self) -> None:
         self.runs: list[list[int | str]] = []
@@ -158,7 +158,7 @@ class Parser:
 
 
 class BallbarWire:
-    """The box on its line: answers commands, sends the samples that are due, drops whole samples when the host does not read."""
+    """The box on its line: answers commands, sends the samples taken, and drops whole samples when the host does not read."""
 
     def __init__(
         self,

@@ -120,7 +120,7 @@ class Rig:
         return self._read(path - (axes_mm - axes_mm[0]) @ nominal, self.conditions.laser_noise_mm)
 
     def _locate(self, times_s: F, axes_mm: F, tool_mm: F | None) -> F:
-        """Return the actual tool positions at commanded positions, (n, 3) mm, with lost motion and drift, after the approach."""
+        """Approach the first commanded position; return the actual tool positions at all of them, (n, 3) mm, with lost motion and drift."""
         first = np.array([_first_sign(axes_mm[:, a]) for a in range(3)])
         self._play.run(np.stack([axes_mm[0] - LEAD_IN_MM * first]))
         actual: F = self.machine(tool_mm).tool_position(self._play.run(axes_mm))
@@ -144,7 +144,7 @@ class Rig:
         return times
 
     def _sideways(self, direction: F, size_urad: tuple[float, float]) -> F:
-        """Return a small random vector perpendicular to a unit vector; its length is uniform between the ends (µrad)."""
+        """Return a small random vector perpendicular to a unit vector; its length is uniform between the two ``size_urad``."""
         across = self._setup.normal(size=3)
         across -= direction * (direction @ across)
         vector: F = across / np.linalg.norm(across) * self._setup.uniform(*size_urad) * URAD

@@ -36,7 +36,7 @@ def to_bytes(words: list[int]) -> bytes:
 
 
 def checksum(words: list[int]) -> int:
-    """Return the CRC-32 over the LENGTH words of an image that `parse` has checked."""
+    """Return the CRC-32 of an image that `parse` has checked, over the number of words that its header states."""
     return zlib.crc32(to_bytes(words[: words[3]]))
 
 
@@ -75,7 +75,7 @@ def _nothing(command_mm: F) -> F:
 
 
 def _cell(position_mm: F, start_mm: float, step_mm: float, count: int) -> tuple[I64, F]:
-    """Return the index of the lower grid point and the fraction towards the next one; beyond the grid the end point holds."""
+    """Return the index of the lower grid point and the fraction towards the next one; positions beyond the grid count as its end."""
     place = np.clip((position_mm - start_mm) / step_mm, 0.0, count - 1.0)
     index = np.minimum(place.astype(np.int64), count - 2)
     return index, place - index

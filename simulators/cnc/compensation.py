@@ -27,7 +27,7 @@ class BankState(IntEnum):
 
 
 class Compensation:
-    """Banks, GEN and lease. Times are controller seconds.
+    """Banks, their generation (register GEN) and the lease. Times are controller seconds.
 
     ``lease_scale``: controller seconds per second of the lease. A lease guards against a host that died, so it runs in wall time, however
     fast the simulated world runs.
@@ -59,7 +59,7 @@ class Compensation:
         return self._owner if now_s < self._lease_end_s else 0
 
     def lease_left_ms(self, now_s: float) -> int:
-        """Return the rest of the lease in milliseconds of wall time."""
+        """Return how long the lease still lasts, in milliseconds of wall time."""
         return int(1000.0 * (self._lease_end_s - now_s) / self._scale) if self.owner(now_s) else 0
 
     def lease(self, owner: int, lease_ms: int, now_s: float) -> CompResult:
@@ -112,7 +112,7 @@ class Compensation:
         return CompResult.OK
 
     def _refuse(self, number: int, owner: int, now_s: float) -> CompResult:
-        """Return why SEAL and ACTIVATE are refused, or OK."""
+        """Return why both SEAL and ACTIVATE of this bank would be refused, or OK."""
         if number not in (0, 1):
             return CompResult.BAD_ARGUMENT
         if owner == 0 or self.owner(now_s) != owner:

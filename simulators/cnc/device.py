@@ -164,7 +164,7 @@ _TOLERANCE_MM = 1e-9
 
 
 class Result(IntEnum):
-    """MOTION_RESULT and FIFO_RESULT."""
+    """Result of a motion or FIFO command, as in the registers MOTION_RESULT and FIFO_RESULT."""
 
     OK = 0
     BAD_ARGUMENT = 1
@@ -225,7 +225,7 @@ class Controller:
 
     @property
     def moving(self) -> bool:
-        """Whether a motion command is under way (also while held)."""
+        """Whether a move, path or NC program is under way (also while held)."""
         return self._motion is not None
 
     @property
@@ -235,7 +235,7 @@ class Controller:
 
     @property
     def fifo_free(self) -> int:
-        """Number of points that still fit; waiting points and unreached points of the running path take room."""
+        """Number of path points that still fit; points that wait, and those that the running path has not reached, take room."""
         waiting = len(self._fifo)
         if self.path_running and self._motion is not None:
             waiting += self._motion.vertex_count - self.path_points_done
@@ -243,7 +243,7 @@ class Controller:
 
     @property
     def path_points_done(self) -> int:
-        """Number of points reached of the running or last path."""
+        """Number of points that the running path has reached, or the last one if none runs."""
         if self.path_running and self._motion is not None:
             return self._motion.vertices_reached(self.now_s)
         return self._path_points
@@ -330,7 +330,7 @@ class Controller:
         return Result.OK
 
     def fifo_push(self, points_mm: F) -> Result:
-        """Store path points (n, 3); a running path is extended by them."""
+        """Store path points (n, 3) mm, or append them to the running path."""
         if not self._inside(points_mm):
             return Result.STROKE_LIMIT
         if len(points_mm) > self.fifo_free:
@@ -350,7 +350,7 @@ class Controller:
         return Result.OK
 
     def request_hold(self, request: Hold) -> None:
-        """Apply the level of HOLD_REQUEST."""
+        """Run, hold or abort, as written to the register HOLD_REQUEST."""
         self.hold = request
         if request == Hold.ABORT:
             self._fifo.clear()
@@ -396,7 +396,7 @@ class Controller:
             self._motion = None
 
     def _refuse(self, feed_mm_min: float, points_mm: F) -> Result:
-        """Return why MOVE and PATH_START are refused, or OK."""
+        """Return why a motion to these points would be refused, or OK."""
         if self.moving:
             return Result.BUSY
         if not self.may_move() or self.hold == Hold.ABORT:

@@ -8,7 +8,7 @@ HOLDS = ("run", "hold", "abort")
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One write as it arrived: ``time_s`` since the controller was switched on; ``moving``: whether the axes moved just before it."""
+    """One write as it arrived: ``time_s`` since the controller was switched on; ``moving``: whether a motion was under way (or held)."""
 
     time_s: float
     kind: str
@@ -17,15 +17,15 @@ class Command:
 
     @property
     def moves(self) -> bool:
-        """Whether the command starts, extends or resumes a motion; stopping one does not count."""
+        """Whether it is a motion or path command, or resumes a motion; holding or aborting one does not count."""
         return self.kind in MOTION or (self.kind == "run" and self.moving)
 
 
 @dataclass(frozen=True, slots=True)
 class TableAccess:
-    """One attempt to change a bank, the active table or the lease, as it arrived, in order.
+    """One attempt to change a bank, the active table or the lease, as it arrived.
 
-    ``kind``: write, seal, activate, lease or release, or "stale" for a command that did nothing because its number was not the next one.
+    ``kind``: write, seal, activate, lease or release, or "stale" for a command ignored because its number was not the next one.
     ``bank``, ``first``, ``words``: bank, first register and words of a write; for a command, ``words`` are its number and its result
     (stale: its code). ``by``: owner named in the command, 0 for a write. ``taken``: whether the controller executed it. ``owner``: owner of
     the lease just before; ``active``, ``gen``: active bank and generation just after.

@@ -182,7 +182,7 @@ class CncRegisters:
         return True
 
     def _take_motion(self) -> None:
-        """Execute the motion block if it carries the next number."""
+        """Execute the command in the motion registers if it carries the next command number."""
         number, command, x, y, z, feed = struct.unpack(">HHiiiI", struct.pack(f">{_MOTION_WORDS}H", *self._motion))
         if number != (self._motion_ack + 1) & 0xFFFF:
             return
@@ -206,7 +206,7 @@ class CncRegisters:
             self._motion_done, self._waiting = number, None  # finished as soon as it was executed
 
     def _take_fifo(self, values: list[int]) -> None:
-        """Store a chunk of path points if it carries the next number."""
+        """Store a chunk of path points if it carries the next command number."""
         if values[0] != (self._fifo_ack + 1) & 0xFFFF:
             return
         self._note("fifo", *values[1:])
@@ -218,7 +218,7 @@ class CncRegisters:
         self._fifo_ack, self._fifo_result = values[0], result
 
     def _take_comp(self) -> None:
-        """Execute the compensation block if it carries the next number."""
+        """Execute the command in the compensation registers if it carries the next command number."""
         number, command, bank, crc, generation, owner, lease_ms = struct.unpack(">HHHIIII", struct.pack(f">{_COMP_WORDS}H", *self._comp))
         comp, now_s = self._cnc.comp, self._cnc.now_s
         holder = comp.owner(now_s)

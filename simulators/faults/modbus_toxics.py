@@ -1,31 +1,31 @@
 """Faults of Modbus requests and replies on the line, from a fault scenario. Pure: proxies and lines call it.
 
-It also cuts MBAP (TCP) and RTU frames out of a stream, decodes and encodes them, and answers requests from a register map.
+This file also cuts MBAP (TCP) and RTU frames out of a stream, decodes and encodes them, and answers requests from a register map.
 
-A fault hits a request and its reply: the one with number ``at`` among the requests of the sort ``on`` (any, read, write). ``on`` may also
-name the first register (``write 64``). The kinds, and the keys of a fault that they use:
+A fault hits a request and its reply: request number ``at`` (from 0) of those of sort ``on``: any, read, write, or one with a first register
+(``write 64``). The kinds, and the keys of a fault that they use:
 
 ==================  ========================================================================================================
-drop_request        the device never sees it
-drop_reply          it is executed, the host gets no reply
-delay_reply         the answer comes ``seconds`` later, and all later ones after it, as from a device that does one thing at a time
+drop_request        the device never sees the request
+drop_reply          the device executes the request, the host gets no reply
+delay_reply         the answer comes ``seconds`` later, and all later answers after it, as from a device that does one thing at a time
 latency             the answer takes ``seconds`` to arrive, with a probability of ``value`` percent (0: always)
-duplicate_reply     a copy follows after ``seconds``
-swap_replies        the answer comes after the next one
+duplicate_reply     a copy of the answer follows after ``seconds``
+swap_replies        the answer comes after the answer to the next request
 twice               the answer and a copy of it in one segment
 one_byte            every byte is a segment of its own, ``seconds`` apart
-split               the answer in two halves, ``seconds`` apart
-cut                 only the first ``value`` bytes
-flip                bit ``value`` of the frame is flipped
-noise_before        ``data`` in front of it, in the same segment
-noise_after         ``data`` behind it
+split               the answer comes in two halves, ``seconds`` apart
+cut                 only the first ``value`` bytes arrive
+flip                bit ``value`` of the answer is flipped
+noise_before        ``data`` in front of the answer, in the same segment
+noise_after         ``data`` behind the answer, in the same segment
 echo                the request itself comes back first, as on a two-wire line
 instead             the answer has the PDU ``data``, in a valid frame
-set_unit            ``value`` instead of the right unit; likewise set_tid, set_pid, set_length, set_function, set_byte_count,
+set_unit            the answer has unit ``value``; likewise set_tid, set_pid, set_length, set_function, set_byte_count,
                     set_address, set_count
-more_registers      ``value`` registers too many (below 0: too few) in an otherwise valid frame
+more_registers      the answer has ``value`` registers too many (below 0: too few) in an otherwise valid frame
 exception           exception code ``value`` instead of the answer; the device does not see the request
-exception_after     the same, but the device has executed the request
+exception_after     the same, but the device executes the request first
 black_hole          from here on nothing passes, but the connection stays open
 fin, rst            the connection is closed or reset instead of the answer; fin_before, rst_before: before the device sees the request
 ==================  ========================================================================================================
@@ -58,7 +58,7 @@ def crc16(data: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The fields of a frame. ``tid``, ``pid``, ``length``: only MBAP; a ``length`` of None means the right one."""
+    """The fields of a frame. ``tid``, ``pid``, ``length`` exist only in MBAP frames; a ``length`` of None is computed."""
 
     unit: int
     pdu: bytes

@@ -30,7 +30,7 @@ class FaultScenarioError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault. See the module for the meaning of each key; ``data`` are bytes as hex, for kinds that insert some."""
+    """One fault; the module's example explains each key. ``data``: bytes in hex, for kinds that insert bytes."""
 
     kind: str
     at: int = 0
@@ -47,7 +47,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class FaultScenario:
-    """Faults that are played together. ``seed``: of the player's random numbers."""
+    """Faults that are played together. ``seed``: seed of the player's random numbers."""
 
     name: str = ""
     seed: int = 1

@@ -1,4 +1,4 @@
-"""A ball-bar's box on a bad line, with its own time, which tests advance instead of waiting."""
+"""A ball-bar's box on a bad line. It has its own time, which tests advance, so that they need not wait."""
 
 import asyncio
 from collections.abc import Callable
@@ -21,21 +21,21 @@ _PIECE = 200
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Samples ``begin`` to ``end - 1`` of a stream are not measurements: the box sets these status bits."""
+    """Makes samples ``begin`` to ``end - 1`` of a stream invalid: the box sets status ``bits`` and sends a false reading."""
 
     begin: int
     end: int
     bits: int = OUT_OF_RANGE
 
     def applied(self, sample: Sample) -> Sample:
-        """Return the sample, with the window's status bits if it lies in the window."""
+        """Return the sample, made invalid if its number lies in the window."""
         if not self.begin <= sample.seq < self.end:
             return sample
         return replace(sample, status=sample.status | self.bits, reading_nm=0 if self.bits & NO_BAR else 1_000_000)
 
 
 class _Tapped:
-    """The line as the box sees it: records the box's frames and applies its windows before the line spoils them."""
+    """The line as the box sees it: records the box's samples, with clock errors and windows applied, before the line spoils them."""
 
     def __init__(self, box: "FaultyBox", line: FaultyLine) -> None:
         self._box, self._line = box, line
@@ -144,7 +144,7 @@ class FaultyBox:
             self.world.ballbar.rate_hz = round(self.world.ballbar.rate_hz * self.rate_factor)
 
     def pause(self, seconds: float) -> None:
-        """Advance the box's clock without samples."""
+        """Let the box's clock jump ahead, as if it had paused between two samples."""
         self._late_us += round(seconds * 1e6)
 
     def reboot(self) -> None:
@@ -159,7 +159,7 @@ class FaultyBox:
         self._begun()
 
     def record(self, frame: bytes) -> bytes:
-        """Record a frame of the box and return it with its windows applied."""
+        """Return a frame of the box, with clock errors and windows applied if it is a sample, and record the sample."""
         sample = sample_of(frame)
         if sample is None:
             return frame

@@ -84,7 +84,7 @@ class _Terminal(PseudoSerial):
         super().close()
 
     def hold(self, held: bool) -> None:
-        """Stop the host's output if ``held``, else let it continue, like a device that sends XOFF or XON."""
+        """Stop the host's output (``held``), or let it continue, like a device that sends XOFF or XON."""
         termios.tcflow(self._slave, termios.TCOOFF if held else termios.TCOON)
 
     def stuff(self) -> int:

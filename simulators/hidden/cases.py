@@ -27,9 +27,9 @@ BEYOND = ["second_tool_length", "single_axis_laser", "angular_interferometer", "
 
 @dataclass(frozen=True)
 class Visibility:
-    """How visible an effect is: rms in µm, or (``snr_*``, ``left``) in standard deviations of one reading.
+    """How visible an effect is: rms in µm; ``snr_*`` and ``left`` (n,) in standard deviations of one reading.
 
-    All but ``raw_rms_um`` count only the part that the present model cannot absorb.
+    All but ``raw_rms_um`` count only the part that the present model cannot absorb. ``share_touched``: share of readings that it touches.
     """
 
     raw_rms_um: float
@@ -55,7 +55,7 @@ class Case:
 
 
 def make_case(name: str, seed: int, kind: str, *, wild: bool = True) -> Case:
-    """Draw one case of a kind: single, double, null or unknown. Equal seed and kind give an equal case."""
+    """Draw a case of a kind: single, double, null or unknown. Equal arguments give equal cases; ``wild``: see `Hidden.wild`."""
     rng = np.random.default_rng([51, seed])
     for attempt in range(50):
         names = _names(rng, kind)
@@ -100,7 +100,7 @@ def _filled(name: str, setting: Setting, runs: list[Run], names: list[str], rng:
 
 
 def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
-    """Return the effect with its place or time, if it has one, within one of the runs, so that they can show it."""
+    """Return the effect; its place or time, if it has one, is moved into one of the runs, so that they can show it."""
     run = runs[int(rng.integers(len(runs)))]
     at = int(rng.integers(run.track.n // 10, run.track.n - run.track.n // 10))
     if e.name == "local_bump":
@@ -130,9 +130,10 @@ def _sized(
 
 
 def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], model_projector: Projector) -> Visibility:
-    """Return the visibility of an effect, above all of the part that the present model cannot absorb.
+    """Return the visibility of an effect in runs to which the present model is fitted.
 
-    ``snr_total``: norm of that part over all identify runs, over the noise; ``snr_local``: its rms over the touched readings.
+    Two figures measure the part that the model cannot absorb, in units of the noise: ``snr_total`` is its norm over all readings,
+    ``snr_local`` its rms over the readings where it exceeds `TOUCHED` times its maximum.
     """
     without, with_it = Rig(perfect, ()), Rig(perfect, (e,))
     trace = np.concatenate([with_it.reading(r) - without.reading(r) for r in runs])
@@ -162,7 +163,7 @@ def _fact(
 
 
 def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: list[str]) -> dict[str, list[str]]:
-    """Return the additional measurements that would separate each alias: those of plan full if they suffice, else `BEYOND`."""
+    """Return which further measurements would tell each alias from the effect: those of plan full if they suffice, else `BEYOND`."""
     if not aliases:
         return {}
     still: list[str] = aliases
@@ -175,7 +176,7 @@ def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: li
 
 
 def where(e: Hidden, setting: Setting) -> dict[str, object]:
-    """Return the axis, time or place to which an effect outside the catalogue is confined."""
+    """Return the axis, time or place to which an effect outside the catalogue is confined; empty for other effects."""
     p = e.parameters
     if e.name in ("clamp_slip", "encoder_count_loss"):
         axis: dict[str, object] = {"axis": e.key} if e.key else {}

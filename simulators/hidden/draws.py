@@ -91,7 +91,7 @@ ONE_SIGN = RANDOM | {"reversal_spike", "cyclic_error", "contour_lag", "ram_sag",
 
 @dataclass(frozen=True)
 class Setting:
-    """A case without its hidden effects: plan, present model, true machine, its nominal geometry (``document``), set-up terms, noise."""
+    """A case without its hidden effects: plan, present model, true machine and its nominal geometry (``document``), set-up terms, noise."""
 
     seed: int
     kind: str
@@ -161,7 +161,7 @@ def _times(pair: Pair, factor: float) -> Pair:
 
 
 def draw_hidden(rng: np.random.Generator, name: str, setting: Setting, span_s: Pair, wild: bool) -> Hidden:
-    """Draw one effect, with the first guess of its strength."""
+    """Draw one effect, with a first guess of its strength; ``span_s``: first and last instant of the campaign."""
     keys, _, guess, _ = (CATALOGUE | OUTSIDE)[name]
     key = str(rng.choice(list(keys)))
     sign = 1.0 if name in ONE_SIGN or rng.random() < 0.5 else -1.0
@@ -173,7 +173,7 @@ def draw_hidden(rng: np.random.Generator, name: str, setting: Setting, span_s: P
 
 
 def _parameters(rng: np.random.Generator, name: str, key: str, setting: Setting, span_s: Pair) -> dict[str, float]:
-    """Draw the parameters of an effect besides its strength."""
+    """Draw all parameters of an effect but its strength."""
     out = {p: float(rng.uniform(*limits)) for p, limits in RANGES.get(name, {}).items()}
     if name == "backlash_position_dependent":
         out["k"] *= float(rng.choice([-1.0, 1.0]))

@@ -20,7 +20,7 @@ def backlash(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("backlash_position_dependent")
 def backlash_position_dependent(e: Hidden, track: Track, out: Bend) -> None:
-    """Lost motion strength (1 + k x), x = -1 to 1 over the stroke; if ``e.wild``, it also varies as x^2, and part of it is wind-up."""
+    """Lost motion of width strength (1 + k x), x = -1 to 1 over the stroke; if ``e.wild``, also a term in x^2, and part is wind-up."""
     a, k, bow, soft = e.axis, e["k"], e.freedom(0.05, 0.3, 1, signed=True), e.freedom(0.0, 0.3, 2)
     low, high = track.low_mm[a], track.high_mm[a]
 
@@ -33,7 +33,7 @@ def backlash_position_dependent(e: Hidden, track: Track, out: Bend) -> None:
 
 
 def wind_up(track: Track, axis: int, width_mm: float | F, over_mm: float) -> F:
-    """Return the elastic lag behind the motion, (n,) mm; it changes sign over a travel of ``over_mm`` after each reversal."""
+    """Return the elastic lag behind the motion, (n,) mm; after a reversal it changes sign within about ``over_mm`` of travel."""
     rest = np.exp(-np.minimum(track.since_mm[:, axis] / over_mm, 60.0))
     return np.asarray(-0.5 * width_mm * track.sign[:, axis] * (1.0 - 2.0 * rest))
 
@@ -57,7 +57,7 @@ def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("cyclic_error")
 def cyclic_error(e: Hidden, track: Track, out: Bend) -> None:
-    """Waves with the pitch and half of it; if ``e.wild``, amplitude and phase vary along the screw, and there is a third harmonic."""
+    """The axis errs in waves of the screw's pitch and half of it; if ``e.wild``, they vary along the screw, with a third harmonic."""
     a = e.axis
     x, place = track.q_mm[:, a], middle(track, a)
     angle = 2.0 * np.pi * x / e["pitch_mm"] + e.freedom(0.2, 1.0, 1, signed=True) * np.sin(2.0 * place + e.freedom(0.0, 6.0, 2))
@@ -70,7 +70,7 @@ NODES, WEIGHTS = np.polynomial.laguerre.laggauss(10)
 
 
 def lagging(track: Track, lag_s: float, second: float) -> F:
-    """Return actual minus commanded axis positions behind a second-order loop, (n, 3) mm.
+    """Return actual minus commanded axis positions, (n, 3) mm, when the axes follow the command through a second-order loop.
 
     Its time constants are a = lag_s (1 - second) and b = lag_s second. The commanded course is convolved with the impulse response
     (exp(-s/a) - exp(-s/b)) / (a - b) by Gauss-Laguerre quadrature.

@@ -66,12 +66,12 @@ class Hidden:
 
     @property
     def axis(self) -> int:
-        """Axis of a key such as X or (the moving axis) EYX."""
+        """Index of the axis in the key: its last letter, as in X or EYX."""
         return AXES.index(self.key[-1])
 
     @property
     def component(self) -> int:
-        """Direction of the deviation of a key such as EYX, or the axis of rotation of EAX."""
+        """Index of the direction of deviation in a key such as EYX (Y), or of the axis of rotation in EAX (A)."""
         return "XYZ".index(self.key[1]) if self.key[1] in "XYZ" else "ABC".index(self.key[1])
 
     def rng(self, *stream: int) -> np.random.Generator:
@@ -93,7 +93,7 @@ class Hidden:
         return -size if signed and rng.random() < 0.5 else size
 
     def bend(self, track: Track) -> Bend:
-        """Return what the effect changes in a run."""
+        """Return what the effect changes in this run."""
         out = Bend.none(track.n)
         BOOK[self.name](self, track, out)
         return out
@@ -124,6 +124,6 @@ def effect_names() -> frozenset[str]:
 
 
 def middle(track: Track, axis: int) -> F:
-    """Return the position along the stroke as -1 to 1, (n,)."""
+    """Return the position along the stroke, scaled to -1 to 1, (n,)."""
     low, high = track.low_mm[axis], track.high_mm[axis]
     return np.asarray((2.0 * track.q_mm[:, axis] - low - high) / (high - low))

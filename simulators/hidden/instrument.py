@@ -27,7 +27,7 @@ def mirror_tilt(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("laser_cosine")
 def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
-    """The beam is misaligned by ``strength`` mrad, in another direction in every set-up; if ``e.wild``, also by another angle."""
+    """The beam is misaligned by ``strength`` mrad, in another direction in every set-up; if ``e.wild``, the angle differs, too."""
     if track.kind == "laser":
         aside = per_setup(e, track.setup)
         size = 1.0 + e.freedom(0.02, 0.12, 1) * float(np.sin(7.0 * aside[0]))
@@ -36,14 +36,14 @@ def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("setup_centre_offset")
 def setup_centre_offset(e: Hidden, track: Track, out: Bend) -> None:
-    """The cup is offset from the spindle's position by ``strength`` um, in another direction in every set-up; written as a tool shift."""
+    """The cup is offset from the spindle's position by ``strength`` um, in another direction in every set-up (as a tool shift)."""
     if track.kind == "bar" and track.number >= 0:
         away = e.rng(21, zlib_of(track.setup)).normal(size=3)
         out.shift[2] -= e["strength"] * UM * away / np.linalg.norm(away)
 
 
 def per_setup(e: Hidden, setup: str) -> F:
-    """Return a random vector of a set-up, (2,), with a length of 0.6 to 1.3."""
+    """Return the random vector of this set-up, (2,), with a length of 0.6 to 1.3."""
     rng = e.rng(22, zlib_of(setup))
     angle, length = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.6, 1.3)
     return length * np.array([np.cos(angle), np.sin(angle)])
@@ -62,7 +62,7 @@ def air_rise(e: Hidden, t_s: F) -> F:
 
 @effect("air_refraction")
 def air_refraction(e: Hidden, track: Track, out: Bend) -> None:
-    """The measured path reads too short in warm air."""
+    """The laser reads a path too short while the air is warmer than it assumes, and too long while it is colder."""
     if track.kind == "laser":
         out.reading += AIR_PPM_PER_K * PPM * air_rise(e, track.t_s) * track.reach_mm
 

@@ -30,7 +30,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Machinery:
-    """What a plan needs to know of the machine: strokes (3,) mm, vertical axis, and ``rest`` (3,), +-1: direction of each last motion."""
+    """What a plan needs to know of the machine: strokes (3,) mm, vertical axis, and direction of each axis' last motion (``rest``, +-1)."""
 
     low_mm: F
     high_mm: F
@@ -45,7 +45,7 @@ class Machinery:
 
 @dataclass
 class _Clock:
-    """The runs so far, and the time after them."""
+    """The runs planned so far, and the time after them."""
 
     machine: Machinery
     t_s: float = POWER_ON_S
@@ -192,7 +192,7 @@ def _remembering(track: Track, dense_mm: F, at: np.ndarray, rest: F) -> Track:
 
 
 def standing(track: Track, centre_mm: F) -> Track:
-    """Return the track of the one instant at which the cup of a set-up was placed at the spindle."""
+    """Return the track of a single instant: when the cup was placed at the spindle."""
     zero, one = np.zeros((1, 3)), np.array([track.set_s])
     return Track(
         "bar", track.setup, centre_mm[None], one, zero, zero, zero, zero + 1e9, zero, zero, np.zeros(1), track.set_s, track.set_s,

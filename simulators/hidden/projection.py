@@ -46,7 +46,7 @@ def pushed(machine: PerfectMachine, q_mm: F, carriage: int, component: int) -> F
 def motion_columns(machine: PerfectMachine, run: Run, carriage: int, component: int, at: F, at_reference: F) -> F:
     """Return the readings of a run per unit of k functions of one error motion, (n, k).
 
-    ``at`` (n, k): values of the functions on the run; ``at_reference`` (k,): at its `reference_mm`.
+    ``at`` (n, k): values of the functions on the run; ``at_reference`` (k,): values at the run's `reference_mm`.
     """
     track = run.track
     moved = np.einsum("ij,ij->i", track.look, pushed(machine, track.q_mm, carriage, component))
@@ -89,7 +89,7 @@ def smooth_columns(machine: PerfectMachine, run: Run, level: str) -> F:
 def setup_columns(runs: list[Run], terms: frozenset[str]) -> F:
     """Return the readings of all runs per unit of each set-up term, mm per mm or mm per rad.
 
-    Terms: centre per bar set-up, bar length, mirror tilt per laser set-up, a zero per laser run.
+    Terms: a centre for each bar set-up, one bar length, a mirror tilt for each laser set-up, a zero for each laser run (always included).
     """
     rows = np.cumsum([0, *(r.track.n for r in runs)])
     pieces: dict[str, list[tuple[int, F]]] = {}
@@ -121,14 +121,14 @@ def tilt_columns(run: Run) -> F:
 
 @dataclass(frozen=True)
 class Projector:
-    """Columns of the present model over all fitted runs, divided by the noise, and the inverse of their products."""
+    """Columns of the present model over all fitted runs, divided by the noise and normalised; inverse of their normal matrix; 1 / noise."""
 
     columns: F
     inverse: F
     weight: F
 
     def left(self, signal_mm: F) -> F:
-        """Return what the model cannot absorb of signals (n, k) mm, in standard deviations of one reading."""
+        """Return the part of signals (n, k) mm that the model cannot absorb, in standard deviations of one reading."""
         white = signal_mm * self.weight[:, None]
         out = white - self.columns @ (self.inverse @ (self.columns.T @ white))
         return np.asarray(out - self.columns @ (self.inverse @ (self.columns.T @ out)))

@@ -102,7 +102,7 @@ def across(direction: F) -> tuple[F, F]:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the instruments: standard deviation of one reading, and ``*_step_mm``, its resolution.
+    """Noise of the instruments: standard deviation of one reading, and resolution (``*_step_mm``).
 
     ``coloured``: coloured share of the standard deviation; ``memory``: correlation of this share between successive readings.
     """

@@ -34,7 +34,7 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Return the readings when the tool is displaced along one axis by functions that are zero while the cup is set."""
+        """Return the readings, one column for each function, if it displaces the tool along one axis, but not while the cup is set up."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:
@@ -43,7 +43,7 @@ class FittedRuns:
             yield self.stack(lambda r, tau=tau: _warm(r, direction, arm, tau))  # type: ignore[misc]
 
     def of_instruments(self, bar: Function | None, laser: Function | None) -> F:
-        """Return the readings of an effect of the instruments themselves; None: this instrument has none."""
+        """Return the readings of an effect of the instruments themselves; None: the effect leaves this instrument alone."""
         return self.stack(lambda r: _instrument(r, bar if r.track.kind == "bar" else laser))
 
     def motion(self, carriage: int, component: int) -> F:
@@ -214,7 +214,7 @@ def _per_setup(fitted: FittedRuns, kind: str) -> F:
 
 
 def indistinct(fitted: FittedRuns, projector: Projector, left: F, own: str) -> list[str]:
-    """Return the labels of rivals that leave less than `INDISTINCT` of the chi-square of an effect's remainder ``left`` (n,)."""
+    """Return the labels of rivals that explain an effect's remainder ``left`` (n,) so well that its chi-square falls below `INDISTINCT`."""
     labels, blocks = zip(*traces(fitted), strict=True)
     raw = np.hstack(blocks) * projector.weight[:, None]
     kept = projector.columns.T @ raw

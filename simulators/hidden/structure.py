@@ -14,7 +14,7 @@ from abbe.simulators.hidden.track import Track
 
 @effect("lateral_play")
 def lateral_play(e: Hidden, track: Track, out: Bend) -> None:
-    """A carriage steps sideways by ``strength`` um when it reverses; if ``e.wild``, over some travel, and more at one end of the guide."""
+    """A carriage steps sideways by ``strength`` um when it reverses; if ``e.wild``, gradually, and more at one end of the guide."""
     a = e.axis
     half = 0.5 * e["strength"] * UM * (1.0 + e.freedom(0.05, 0.3, 1, signed=True) * middle(track, a))
     over = e.freedom(0.02, 0.4, 2) or 1e-9

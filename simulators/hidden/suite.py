@@ -22,7 +22,7 @@ STREAM_PICK = 61
 
 
 def packaged() -> list[Path]:
-    """Return the packaged scenarios with a hidden effect, and the one without, sorted by name."""
+    """Return the paths of the packaged ``hidden-*`` scenarios (one of them without a hidden effect), sorted by name."""
     return sorted(DEFAULT_PATH.parent.glob("hidden-*.toml"))
 
 
@@ -53,7 +53,7 @@ SENSORS = ("x", "y", "z", "spindle", "air")
 
 
 def temperatures(effects: tuple[Hidden, ...], seed: int, t_s: F) -> dict[str, F]:
-    """Return the true temperatures at the sensors of axes, spindle and air, degree C, (n,) each; all vary, even if they cause no effect."""
+    """Return the true temperatures (n,), degree C, at the sensors of axes, spindle and air; all vary, even without a thermal effect."""
     rng = np.random.default_rng([44, seed])
     out: dict[str, F] = {}
     for i, name in enumerate(SENSORS[:4]):
@@ -72,7 +72,7 @@ SENSOR_NOISE_C = 0.03
 
 
 def kinds_of(count: int, kinds: Sequence[str], first: int) -> list[str]:
-    """Return the kinds of the cases of a suite, in the proportions of `KINDS`, shuffled by the seed ``first``."""
+    """Return the kinds of the cases of a suite, in the proportions of `KINDS`, in random order by the seed ``first``."""
     shares = np.array([KINDS[k] for k in kinds], dtype=np.float64)
     wanted = count * shares / shares.sum()
     numbers = np.floor(wanted).astype(int)

@@ -22,12 +22,12 @@ STILL_MM = 1e-6
 class Track:
     """One run, or one instant at standstill.
 
-    Attributes: ``kind`` "bar" or "laser"; ``setup``; ``q_mm`` (n, 3) commanded; ``t_s`` (n,); ``v_mm_s`` and ``a_mm_s2`` (n, 3);
-    ``sign`` (n, 3) direction of each axis' last motion (0: standing for an unknown time); ``since_mm`` (n, 3) travel since the last
-    reversal (`NEVER_MM` before the first); ``travelled_mm`` (n, 3) travel of each axis in the run; ``look`` (n, 3) unit vector of the
-    measuring direction; ``reach_mm`` (n,) laser: nominal path since the first record, bar: zeros; ``start_s`` of the run; ``set_s`` of
-    the set-up; ``low_mm``, ``high_mm`` (3,) stroke; ``vertical`` axis; ``number`` of the run, -1 for the setting of a cup; ``radius_mm``
-    of the bar; ``course`` of a moving run.
+    ``kind``: "bar", "laser" or "live" (the simulated devices). ``setup``: its name, ``set_s``: its time. ``q_mm`` (n, 3), ``t_s`` (n,):
+    commanded positions and times of the readings; ``v_mm_s``, ``a_mm_s2`` (n, 3): their derivatives. ``sign`` (n, 3): direction of each
+    axis' last motion, 0 if unknown; ``since_mm`` (n, 3): travel since the last reversal (`NEVER_MM` before the first); ``travelled_mm``
+    (n, 3): travel in the run. ``look`` (n, 3): unit vector of the measuring direction; ``reach_mm`` (n,): nominal laser path since the
+    first record, zeros for a bar. ``start_s``: when the run began. ``low_mm``, ``high_mm`` (3,): strokes. ``vertical``: index of that axis.
+    ``number``: of the run, -1 while a cup is set. ``radius_mm``: of the bar. ``course``: commanded position by time, for a moving run.
     """
 
     kind: str
@@ -68,7 +68,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """State of the axes at n times, which their motion up to each time determines; arrays as in `Track`."""
+    """State that the axes have at n times because of their earlier motion; arrays as in `Track`."""
 
     sign: F
     since_mm: F
@@ -90,7 +90,7 @@ def history(dense_mm: F, at: np.ndarray, rest: F) -> History:
 
 
 def _axis(step_mm: F, rest: float) -> tuple[F, F, F]:
-    """Return direction, travel, and travel at the last reversal, at the start and after each of the m - 1 steps, (m,) each."""
+    """Return three arrays (m,), for the start and after each of m - 1 steps: direction, travel, and travel at the last reversal."""
     way = np.where(np.abs(step_mm) > 1e-9, np.sign(step_mm), 0.0)
     moved = np.flatnonzero(way)
     walked = np.concatenate([[0.0], np.cumsum(np.abs(step_mm))])

@@ -46,7 +46,7 @@ class Mount:
     zero_mm: F
 
     def displacement(self, position_mm: F) -> float:
-        """Return the growth since the zero of the path, mm, to the point where the true beam meets the mirror plane."""
+        """Return how far the point where the true beam meets the mirror plane has moved along the beam since the zero, mm."""
         return float(self.normal @ (position_mm - self.zero_mm) / (self.normal @ self.beam))
 
 
@@ -171,7 +171,7 @@ class LaserDevice:
 
 
 def _sideways(rng: np.random.Generator, direction: F, size_urad: tuple[float, float]) -> F:
-    """Return a small random vector perpendicular to a unit vector; its length is uniform between the ends (given in µrad)."""
+    """Return a small random vector perpendicular to a unit vector; its length is uniform between the two ``size_urad``."""
     across = rng.normal(size=3)
     across -= direction * (direction @ across)
     vector: F = across / np.linalg.norm(across) * rng.uniform(*size_urad) * 1e-6

@@ -99,7 +99,7 @@ STREAM_TRUTH, STREAM_CUP, STREAM_BAR_NOISE, STREAM_MIRROR, STREAM_LASER_NOISE, S
 
 
 def generator(seed: int, *stream: int) -> np.random.Generator:
-    """Return the random generator of one purpose, ``stream[0]``, and, with more numbers, of one event of that purpose."""
+    """Return the random generator for a purpose (``stream[0]``, a ``STREAM_*``); further numbers select one event of that purpose."""
     return np.random.default_rng([seed, *stream])
 
 
