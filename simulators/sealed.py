@@ -1,4 +1,4 @@
-"""The ``truth`` command: figures and drawn parameters of a scenario's machine under a compensation image."""
+"""The ``truth`` command: error figures and drawn parameters of a scenario's machine, with a compensation image or without."""
 
 import struct
 from collections.abc import Callable

@@ -241,7 +241,7 @@ _PATIENCE_S = 2.0
 
 
 class ModbusLink:
-    """One Modbus unit.
+    """Link to one Modbus unit: sends its requests one at a time, and reconnects when necessary.
 
     Parameters
     ----------
@@ -252,6 +252,7 @@ class ModbusLink:
         and there is no heartbeat.
     heartbeat_s : float, optional
         Read the canary after this idle time. This detects a vanished peer within ``heartbeat_s + timeout_s``, and reconnects a lost one.
+        None: no heartbeat.
     """
 
     def __init__(

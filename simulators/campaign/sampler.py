@@ -144,7 +144,7 @@ class Rig:
         return times
 
     def _sideways(self, direction: F, size_urad: tuple[float, float]) -> F:
-        """Return a small random vector perpendicular to a unit vector; its length is uniform between the two ``size_urad``."""
+        """Return a small random vector perpendicular to a unit vector; its length is drawn uniformly within ``size_urad``."""
         across = self._setup.normal(size=3)
         across -= direction * (direction @ across)
         vector: F = across / np.linalg.norm(across) * self._setup.uniform(*size_urad) * URAD

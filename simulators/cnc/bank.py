@@ -75,7 +75,7 @@ def _nothing(command_mm: F) -> F:
 
 
 def _cell(position_mm: F, start_mm: float, step_mm: float, count: int) -> tuple[I64, F]:
-    """Return the index of the lower grid point and the fraction towards the next one; positions beyond the grid count as its end."""
+    """Return the index of the lower grid point and the fraction towards the next one; a position beyond the grid is moved to its end."""
     place = np.clip((position_mm - start_mm) / step_mm, 0.0, count - 1.0)
     index = np.minimum(place.astype(np.int64), count - 2)
     return index, place - index

@@ -112,7 +112,7 @@ class Compensation:
         return CompResult.OK
 
     def _refuse(self, number: int, owner: int, now_s: float) -> CompResult:
-        """Return why both SEAL and ACTIVATE of this bank would be refused, or OK."""
+        """Return why this bank can be neither sealed nor activated, or OK."""
         if number not in (0, 1):
             return CompResult.BAD_ARGUMENT
         if owner == 0 or self.owner(now_s) != owner:

@@ -243,7 +243,7 @@ class Controller:
 
     @property
     def path_points_done(self) -> int:
-        """Number of points that the running path has reached, or the last one if none runs."""
+        """Number of points that the running path, or the last one if none runs, has reached."""
         if self.path_running and self._motion is not None:
             return self._motion.vertices_reached(self.now_s)
         return self._path_points

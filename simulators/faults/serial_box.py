@@ -144,7 +144,7 @@ class FaultyBox:
             self.world.ballbar.rate_hz = round(self.world.ballbar.rate_hz * self.rate_factor)
 
     def pause(self, seconds: float) -> None:
-        """Let the box's clock jump ahead, as if it had paused between two samples."""
+        """Let the box's clock jump ahead, as if the box had paused between two samples."""
         self._late_us += round(seconds * 1e6)
 
     def reboot(self) -> None:

@@ -1,4 +1,4 @@
-"""A serial line that can be unplugged, stalled, slowed and corrupted, between a box and the host at the stable path.
+"""A serial line between the ball-bar's box and the host, which tests can unplug, stall and corrupt.
 
 `heard` simulates a serial receiver whose baud rate or parity differs from the sender's: it samples the bits at wrong instants.
 """

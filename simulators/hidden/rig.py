@@ -115,7 +115,7 @@ class Noise:
     laser_step_mm: float = 1e-5
 
     def put(self, exact_mm: F, run: Run, seed: int) -> F:
-        """Return the readings of a run with white and coloured noise, the laser's zero, and the resolution, (n,) mm."""
+        """Return the readings of a run, (n,) mm: with noise, the laser zeroed at its first record, and rounded to the resolution."""
         rng = np.random.default_rng([STREAM_NOISE, seed, run.track.number])
         n, bar = len(exact_mm), run.track.kind == "bar"
         size, step = (self.bar_mm, self.bar_step_mm) if bar else (self.laser_mm, self.laser_step_mm)

@@ -34,7 +34,7 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Return the readings, one column for each function, if it displaces the tool along one axis, but not while the cup is set up."""
+        """Return one column of readings for each function: it displaces the tool along one axis, and is zero while the cup is set up."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:

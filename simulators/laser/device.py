@@ -129,7 +129,7 @@ class LaserDevice:
         self._mount, self._lost, self._zeroed = None, True, False
 
     def block(self, *, blocked: bool) -> None:
-        """Put a hand into the beam or take it out; counts are lost at once."""
+        """Block the beam, which loses counts at once, or free it."""
         self.output()
         self._blocked = blocked
         if blocked:
@@ -171,7 +171,7 @@ class LaserDevice:
 
 
 def _sideways(rng: np.random.Generator, direction: F, size_urad: tuple[float, float]) -> F:
-    """Return a small random vector perpendicular to a unit vector; its length is uniform between the two ``size_urad``."""
+    """Return a small random vector perpendicular to a unit vector; its length is drawn uniformly within ``size_urad``."""
     across = rng.normal(size=3)
     across -= direction * (direction @ across)
     vector: F = across / np.linalg.norm(across) * rng.uniform(*size_urad) * 1e-6
