@@ -1,4 +1,4 @@
-"""Agreement of holdout runs with the simulation: residuals against noise and the uncertainty of the prediction."""
+"""Agreement of holdout runs with the simulation: test of their residuals against noise and the uncertainty of the prediction."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ TOO_FEW = "too few of their readings count"
 
 @dataclass(frozen=True)
 class _Noise:
-    """Whitened noise of one instrument, estimated from the fitted runs.
+    """Noise of one instrument, estimated from the whitened residuals of the fitted runs.
 
-    ``variance``: ratio of a reading's variance to the assumed one. ``freedom``: degrees of freedom of this estimate. ``spread``: ratio of
-    the variance of the mean square to that of independent normal readings. ``long``: ratio of the long-run variance to that of a reading, 1
-    or more.
+    ``variance``: ratio of a reading's variance to the assumed one. ``freedom``: degrees of freedom of this estimate. ``spread``: variance
+    of the mean square of the residuals over that for independent normal readings. ``long``: variance of the mean of many readings over that
+    for independent readings, 1 or more.
     """
 
     variance: float
@@ -46,7 +46,7 @@ class _Noise:
 def agreements(
     problem: WhitenedProblem, solved: SolvedModel, predicted_mm: Mapping[str, F1]
 ) -> tuple[tuple[Agreement, ...], tuple[Unjudged, ...]]:
-    """Test the agreement of every holdout run with a solution without effects; the worst first.
+    """Test how every holdout run agrees with its prediction by a solution without effects; the worst run first.
 
     A run's whitened residual is tested twice, reading by reading and in block sums (sensitive to smooth deviations), weighted by the
     inverse covariance of noise and prediction together. The ratio of its mean square to that of the fitted runs of the same instrument
@@ -57,12 +57,12 @@ def agreements(
     ----------
     problem : fitted runs with their noise.
     solved : solution of this problem without effects.
-    predicted_mm : reading of every run, shape (n,), by label.
+    predicted_mm : predicted reading of every run, shape (n,), by label of the run.
 
     Returns
     -------
     tuple of Agreement
-        ``p`` family-wise over the runs (Sidak).
+        Their ``p`` is family-wise over the runs (Sidak).
     tuple of Unjudged
         Runs of an instrument whose noise is unknown (not fitted, or without degrees of freedom), and runs with too few valid readings.
     """
@@ -92,7 +92,7 @@ def _root(covariance: F2) -> F2:
 
 
 def _noise(problem: WhitenedProblem, kind: str) -> _Noise | None:
-    """Noise from the residuals of an instrument's fitted runs; None where these have too few degrees of freedom."""
+    """Estimate the noise of an instrument from its fitted runs; None if these have too few degrees of freedom."""
     res, leverage, use = (problem.by_run(v) for v in (problem.projection.residual, problem.projection.leverage, problem.use))
     mine = [k for k, name in enumerate(problem.kinds) if name == kind]
     parts = [res[k][use[k] > 0] for k in mine]
@@ -110,10 +110,10 @@ def _noise(problem: WhitenedProblem, kind: str) -> _Noise | None:
 def _white(
     problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, fitted_setups: set[str]
 ) -> tuple[F2, int]:
-    """Columns for the valid readings of a run: whitened residual, then uncertainties of the prediction (one standard deviation each).
+    """Return columns over the valid readings of a run, and how many of the last ones are the run's own unknowns.
 
-    Also returns how many of the last columns are the run's own unknowns. Readings are whitened with the assumed noise; `_tested` applies
-    the ratio of estimated to assumed noise.
+    The first column is the whitened residual. Each other column is the effect of one unknown of the prediction, one standard deviation
+    large. All are whitened with the assumed noise; `_tested` applies the ratio of estimated to assumed noise.
     """
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
@@ -126,7 +126,7 @@ def _white(
 
 
 def _worse(white: F2, free: int, known: _Noise) -> tuple[float, float] | None:
-    """Ratio of rms to expected rms, and p: the worse of single readings and block sums; None if neither can be tested."""
+    """Ratio of rms to expected rms, and p, for single readings or block sums, whichever is worse; None if neither can be tested."""
     tests = [_tested(white, free, known, 1.0, known.spread), _tested(_sums(white), free, known, known.long, 1.0)]
     tested = [t for t in tests if t is not None]
     if not tested:
@@ -136,7 +136,7 @@ def _worse(white: F2, free: int, known: _Noise) -> tuple[float, float] | None:
 
 
 def _sums(white: F2) -> F2:
-    """Sums over blocks of equal size, scaled to keep the variance of white noise."""
+    """Return sums over blocks of equal size, scaled so that white noise keeps its variance."""
     count = min(BLOCKS, len(white) // SHORTEST)
     if count < 1:
         return np.zeros((0, white.shape[1]))
@@ -147,9 +147,9 @@ def _sums(white: F2) -> F2:
 def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float) -> tuple[float, float] | None:
     """Ratio of rms to expected rms, and p; None where too few degrees of freedom remain.
 
-    The last ``free`` columns are the run's own unknowns. They take as many degrees of freedom as the values determine (for a circle about
-    its cup three, not four; for sums over whole turns hardly any). ``variance``: ratio of the values' noise variance to that of a reading.
-    ``spread``: as in `_Noise`.
+    The last ``free`` columns of ``white`` are the run's own unknowns. They cost only as many degrees of freedom as the values determine
+    (for a circle about its cup three, not four; for sums over whole turns hardly any). ``variance``: noise variance of a value over that of
+    a reading. ``spread``: as in `_Noise`.
     """
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
     inner = known.T @ known

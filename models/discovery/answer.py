@@ -13,8 +13,11 @@ Verdict = Literal["none", "named", "unknown"]
 
 @dataclass(frozen=True)
 class Significance:
-    """One localization test: ``kind`` ("run", "test", "axis", "direction", "feed", "time", "position", "frequency",
-    "temperature", "instrument"), ``value`` (which of them, as text), statistic, and family-wise p-value."""
+    """Result of one localization test, with statistic and family-wise p-value.
+
+    ``kind``: "run", "test", "axis", "direction", "feed", "time", "position", "frequency", "temperature" or "instrument". ``value``: which
+    run, axis, ... as text.
+    """
 
     kind: str
     value: str
@@ -24,8 +27,11 @@ class Significance:
 
 @dataclass(frozen=True)
 class Localization:
-    """Where a gap or an effect is. None or empty: not located in this respect. The fields are those of ``where`` in
-    docs/schemas/discovery.schema.json; ``shape``: form of the deviation, as text; ``table``: all tests."""
+    """Where a gap or an effect is located; a field that is None or empty: not located in this respect.
+
+    The fields are those of ``where`` in docs/schemas/discovery.schema.json. ``shape``: form of the deviation, as text. ``table``: all
+    tests.
+    """
 
     tests: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
@@ -52,11 +58,11 @@ class NamedEffect:
     strength, u_strength : strength and standard uncertainty in the effect's unit (um, urad, ms, K, K/h, mrad), signed where a sign has
         meaning.
     parameters : non-linear parameters by name, (value, standard uncertainty); the latter is NaN where it is unknown.
-    coefficients, covariance : linear coefficients, in the units of the effect's columns.
+    coefficients, covariance : linear coefficients of the effect's columns and their covariance; column times coefficient is mm.
     evidence : gain in log evidence (half the chi-square) after the price of the effect.
     alternatives : rivals that the data cannot exclude, (label, missing log evidence), best first.
     location : where its signal is largest.
-    forms : freedoms of form in use.
+    forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
     needed : ratio of the holdout runs' rms without this effect to that with it; 1 or less: not needed. None: no holdout run, or a variance
         effect, which changes no mean reading.
     """
@@ -82,8 +88,11 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class NextTest:
-    """Proposed measurement: ``adds`` as in docs/schemas/discovery.schema.json, suspects that it separates (labels; for a structure without
-    a name, possible causes as text), expected separation (None: not known), duration; ``like``: the run to repeat or vary, if any."""
+    """Proposed measurement: ``adds`` as in docs/schemas/discovery.schema.json.
+
+    ``separates``: labels of the suspects that it separates; for a structure without a name, possible causes as text. The expected
+    separation is None if it is unknown. ``like``: the run to repeat or vary, if any.
+    """
 
     adds: tuple[str, ...]
     separates: tuple[str, ...]
@@ -104,7 +113,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A significant value of the present simulation: ``name`` and ``key``, value and standard uncertainty in ``unit``."""
+    """A significant error that the present simulation already includes: ``name``, ``key``, value and standard uncertainty in ``unit``."""
 
     name: str
     key: str
@@ -115,7 +124,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """A blind spot of a campaign: ``what`` it cannot show, ``because`` of what, and ``adds``: the measurement that would show it."""
+    """A blind spot of a campaign: ``what`` its runs cannot show, ``because`` of what, and the measurement that would (``adds``)."""
 
     what: str
     because: str
@@ -128,9 +137,9 @@ class Agreement:
 
     Attributes
     ----------
-    run : its label.
+    run : label of the run.
     times : rms of its residuals (or of their block sums, if worse) over the rms expected from noise and prediction uncertainty.
-    p : family-wise over all holdout runs of the campaign.
+    p : p-value, family-wise over all holdout runs of the campaign.
     """
 
     run: str
@@ -154,21 +163,23 @@ class Discovery:
     ----------
     verdict : "none": the present model explains the runs; "named": named effects are missing; "unknown": something is missing that the
         catalogue does not explain.
-    effects : in order of evidence. rejected : rejected labels with the reason: structures without a name, names beside an unknown, residues
-        of other effects.
-    beside : structures without a name found beside named effects, (label, evidence), by evidence; the effects do not explain this part of
-        the gap.
+    effects : the named effects, strongest evidence first.
+    rejected : labels that were found but not named, each with the reason: structures without a name, effects of less evidence than these,
+        residues of other effects.
+    beside : structures without a name found beside named effects, (label, evidence), strongest first: the part of the gap that the named
+        effects do not explain.
     confounded_with : rivals of the named effects that the data do not exclude.
     location : location of the gap of the present model (for "unknown": of the structure without a name).
-    gaps : by role ("identify", "holdout").
-    residual_before_mm, residual_after_mm, predicted_mm, predicted_before_mm : by run label; predictions also of sealed runs.
-    noise_mm : noise of one reading, by "bar", "laser"; from repeats where these scatter less than the fit's residuals.
-    p_value : of the whole finding.
-    theta, theta_names, theta_covariance : the refitted model without the effects.
+    gaps : gap of the runs of each role ("identify", "holdout").
+    residual_before_mm, residual_after_mm, predicted_before_mm, predicted_mm : residuals and predictions without and with the effects, by
+        run label; sealed runs have predictions only.
+    noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals.
+    p_value : p-value of the whole finding.
+    theta, theta_names, theta_covariance : unknowns of the present simulation, fitted together with the effects.
     agreement : how holdout runs agree with their prediction, if nothing was found; the worst first.
     unjudged : holdout runs that cannot be judged.
     unseen : blind spots of the runs, if nothing was found.
-    fitted : significant values of the present simulation to be reported (the scale of a single axis).
+    fitted : significant errors that the present simulation already includes (the scale of a single axis).
     """
 
     verdict: Verdict

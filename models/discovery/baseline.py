@@ -1,4 +1,4 @@
-"""The present simulation of a campaign as unknowns and columns: smooth error motions, set-ups as far as known, zeros of laser runs."""
+"""The present simulation of a campaign as a linear model: smooth error motions, set-up errors that it includes, zeros of laser runs."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Baseline:
     ----------
     setup : set-up unknowns in the form of `abbe.models.solvers.observe`.
     parts : array: values of ``setup`` = parts @ the set-up unknowns of ``names``.
-    names, prior_sd : of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves all radii, so all share one length
-        error ``bar_length``.
+    names, prior_sd : names and prior standard deviations of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves
+        all radii, so all share one length error ``bar_length``.
     root : array, shape (p, p)
         Factor of the prior covariance root root^T, which includes the smoothness of the error motions.
     """
@@ -57,12 +57,12 @@ class Baseline:
         return np.concatenate([theta[:n], np.zeros(LOST), self.parts @ theta[n:]])
 
     def read(self, run: RunData, theta: F1) -> F1:
-        """Reading of a run, mm, shape (n,): exact (`abbe.models.solvers.observe`), with a mirror that turns with the tool."""
+        """Return the exact reading of a run, mm, shape (n,) (`abbe.models.solvers.observe`), with a mirror that turns with the tool."""
         value = predict(self.machine, self.terms, run, self.setup, self._full(theta))
         return value + self._turning(run) @ theta[: len(self.terms)]
 
     def linear(self, run: RunData, theta: F1) -> tuple[F1, F2]:
-        """Reading of a run and its derivative, shapes (n,), (n, p)."""
+        """Return the reading of a run, mm, shape (n,), and its derivative with respect to the unknowns, shape (n, p)."""
         value, jacobian = linearise(self.machine, self.terms, run, self.setup, self._full(theta))
         n, turning = len(self.terms), self._turning(run)
         return value + turning @ theta[:n], np.concatenate([jacobian[:, :n] + turning, jacobian[:, n + LOST :] @ self.parts], axis=1)
@@ -84,7 +84,7 @@ class Baseline:
         return out
 
     def along(self, path: Path, run: RunData, theta: F1) -> Path:
-        """The path with the actual direction of the bar (``look``), which the cup's offset and the machine's deviation turn.
+        """Return the path with the actual direction of the bar in ``look``: the cup's offset and the machine's deviation turn the bar.
 
         A lag of a millimetre along the path times an offset of 30 um over a bar of 150 mm is 0.2 um of reading.
         """
@@ -102,7 +102,7 @@ class Baseline:
 
 
 def baseline_of(case: Case) -> Baseline:
-    """Build the unknowns that the present simulation has by ``case.includes``."""
+    """Build the baseline with the unknowns that ``case.includes`` asks for."""
     terms = tuple(t for t in smooth_terms(ORDER) if "rigid21" in case.includes or t.order == 0 or (t.order == 1 and t.component == t.axis))
     sd: dict[str, float] = {}
     for run in case.runs:
@@ -128,7 +128,7 @@ def baseline_of(case: Case) -> Baseline:
 
 
 def _root(terms: tuple[Term, ...], prior_sd: F1, priors: Priors) -> F2:
-    """Prior factor of independent unknowns, except that orders of 2 and more of a motion are correlated (`smooth_shapes`)."""
+    """Factor of the prior covariance: unknowns are independent, except orders of 2 and more of the same motion (`smooth_shapes`)."""
     root = np.diag(prior_sd)
     motion = np.array([t.motion if t.order >= 2 else "" for t in terms])
     shapes, variance = smooth_shapes(ORDER, LENGTH)

@@ -1,4 +1,4 @@
-"""Candidates for the missing effect: every effect at every key over a grid of its non-linear parameters, all scored at once."""
+"""Candidates for the missing effect: every effect for every key (axis or error motion), over a grid of its non-linear parameters."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PART = 20
 
 @dataclass(frozen=True)
 class Pick:
-    """An effect with its key (axis or error motion), values of its non-linear parameters and the freedoms of form in use."""
+    """A candidate: an effect with key (axis or error motion), values of its non-linear parameters and the forms added to it (`Form`)."""
 
     effect: Effect
     key: str
@@ -46,7 +46,7 @@ class Pick:
         return self.effect.name.startswith(UNNAMED)
 
     def raw(self, problem: WhitenedProblem) -> F2:
-        """Columns, mm per unit of each coefficient, shape (n, k); those of the forms last."""
+        """Signal in all readings, mm per unit of each coefficient, shape (n, k); the columns of the forms come last."""
         parts = [problem.raw(self.effect.signal, self.key, self.values)]
         parts += [problem.raw(f.signal, self.key, self.values) for f in self.forms]
         return np.concatenate(parts, axis=1)
@@ -64,7 +64,7 @@ class Pick:
 
 
 def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
-    """Return the prior sd of a coefficient: the value with a strength of `GENEROUS` times the top of its usual range.
+    """Return the prior sd of an effect's coefficients: the value that gives `GENEROUS` times the largest usual strength.
 
     The strength may be any power of the coefficient. ``width``: number of columns of the effect along one run.
     """
@@ -81,35 +81,34 @@ def coefficient_sd(effect: Effect, values: Values, width: int) -> float:
 
 
 def competing(effects: Sequence[Effect], includes: frozenset[str]) -> tuple[Effect, ...]:
-    """Mean effects that the present simulation does not contain."""
+    """Return the effects on the mean reading that the present simulation (``includes``) does not contain."""
     return tuple(e for e in effects if e.kind == "mean" and not includes & set(e.absorbed_by))
 
 
 def grid(effect: Effect) -> list[dict[str, float]]:
-    """Every combination of the starts of an effect's non-linear parameters."""
+    """Return every combination of the start values of an effect's non-linear parameters."""
     return [dict(zip((p.name for p in effect.shape), v, strict=True)) for v in product(*(dict.fromkeys(p.starts) for p in effect.shape))]
 
 
 def starts_of(effects: Sequence[Effect]) -> list[Pick]:
-    """Every effect at every key at every start."""
+    """Return a pick for every effect, key and combination of start values."""
     return [Pick(e, key, values) for e in effects for key in e.keys for values in grid(e)]
 
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """All candidates of a problem, with the present simulation projected out.
+    """All candidates of a problem, with the present simulation projected out; the columns of one pick form a group.
 
     Attributes
     ----------
     picks : tuple of Pick, one per group.
-    known : group index of every requested start; -1 if it changes no reading.
-    first : array of int, first column of each group; size : number of columns of each.
-    parts : arrays, shape (columns, n): whitened columns as rows, no group split between parts. Single precision suffices, because the bank
-        only chooses where a refinement starts; the parts are half of the memory of a search.
-    own : array, shape (K,): squared norm of each column before projection.
+    known : group index of every requested pick, by `Pick.start`; -1 if it changes no reading.
+    first, size : arrays of int: first column of each group, and its number of columns.
+    parts : arrays, shape (columns, n): whitened columns as rows; no group is split between parts. Single precision suffices, because the
+        bank only chooses where a refinement starts; the parts take half of the memory of a search.
+    own : array, shape (K,): squared norm of each column before projection; K: number of all columns.
     gram : tuple of arrays (k, k), one per group: columns^T M columns (M: `SignalProjection`). rhs : array, shape (K,): columns^T M y.
-    prior_sd : array, shape (K,). logs : array, shape (groups,): sum over a group's columns of the log of the number of readings that they
-        change.
+    prior_sd : array, shape (K,). logs : array, shape (groups,): log of the number of readings that a column changes, summed over the group.
     """
 
     picks: tuple[Pick, ...]
@@ -124,7 +123,7 @@ class Bank:
     logs: F1
 
     def gains(self, y: F1, rows: F2) -> F1:
-        """Reduction of chi-square by each group, shape (groups,), with earlier picks projected out too by their ``rows`` (k, n)."""
+        """Reduction of chi-square of readings y by each group, shape (groups,); ``rows`` (k, n) project out the picks made before."""
         short = rows.astype(np.float32)
         also = np.concatenate([np.zeros((len(rows), 0)), *(short @ part.T for part in self.parts)], axis=1)
         rhs = self.rhs - also.T @ (rows @ y)
@@ -138,7 +137,7 @@ class Bank:
         return out
 
     def groups(self) -> Iterator[_Group]:
-        """One group after the other."""
+        """Yield the groups in order, each with its columns."""
         rows = (part[i:] for part in self.parts for i in range(len(part)))  # from each column on to the end of its part
         starts = dict(zip(self.first.tolist(), range(len(self.picks)), strict=True))
         for column, after in enumerate(rows):
@@ -160,7 +159,7 @@ class _Group:
 
 
 def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
-    """Gains of groups of one size: rhs^T (gram + prior^-2)^-1 rhs; columns that are hardly visible count as rounding errors."""
+    """Gains of groups with equally many columns, rhs^T (gram + prior^-2)^-1 rhs; columns hardly visible after projection add little."""
     k = gram.shape[1]
     eye = np.eye(k)
     weight = prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30
@@ -169,7 +168,7 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
-    """Build the bank of all candidates that change a reading; columns are taken over from other banks of the problem still in memory."""
+    """Build the bank of all picks that change a reading; take over columns from the problem's other banks in memory."""
     asked = [p.start for p in picks]
     banks = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in banks if list(b.known) == asked), None)
@@ -222,9 +221,9 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
 
 
 def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
-    """Reduction of chi-square by one pick, with other picks projected out too by their ``rows``.
+    """Reduction of chi-square by one pick; ``rows`` project out other picks.
 
-    In double precision: where the projection leaves little of a column, single precision would change an evidence of thousands by several.
+    It needs double precision: where the projection leaves little of a column, single precision would change a gain of thousands by several.
     """
     projection = problem.projection
     columns = problem.white(pick.raw(problem))
@@ -236,7 +235,7 @@ def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
 
 
 def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
-    """Whitened columns of a pick and their projection, from the problem's cache."""
+    """Return the whitened columns of a pick and what the projection leaves of them, using the problem's cache."""
     name = pick.start
     if name not in problem.column_cache:
         if len(problem.column_cache) >= MOST_CACHED:
@@ -247,7 +246,7 @@ def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
 
 
 def rows_for(problem: WhitenedProblem, picks: Sequence[Pick]) -> F2:
-    """Rows that project out several picks together, shape (k, n)."""
+    """Return the rows that project out several picks together, shape (k, n) (`SignalProjection.rows`)."""
     if not picks:
         return np.zeros((0, problem.gap.size))
     parts = [whitened(problem, p) for p in picks]
@@ -258,5 +257,5 @@ def rows_for(problem: WhitenedProblem, picks: Sequence[Pick]) -> F2:
 
 
 def with_values(pick: Pick, values: Values) -> Pick:
-    """The same effect with other non-linear parameters."""
+    """Return the pick with other values of its non-linear parameters."""
     return replace(pick, values=values)

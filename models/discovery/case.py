@@ -17,7 +17,7 @@ Role = Literal["identify", "holdout", "sealed"]
 
 @dataclass(frozen=True)
 class CaseRun:
-    """One run. ``deviation_mm`` (n,) is None for a sealed run; ``valid`` (n,) marks readings the instrument itself did not flag."""
+    """One run. ``deviation_mm`` (n,) is None for a sealed run; ``valid`` (n,) is False for readings that the instrument flagged."""
 
     path: Path
     role: Role
@@ -27,7 +27,7 @@ class CaseRun:
     length_calibrated: bool | None = None
 
     def data(self) -> RunData:
-        """The run as solver input with all its readings; those of a sealed run, and invalid ones, are zero."""
+        """Return the run as solver input; all its readings are kept, but flagged readings and those of a sealed run are set to zero."""
         p = self.path
         reading = np.zeros(p.n) if self.deviation_mm is None else np.where(self.valid, self.deviation_mm, 0.0)
         bar = p.kind == "bar"
@@ -57,5 +57,5 @@ class Case:
     resolution_mm: dict[str, float]
 
     def of(self, *roles: Role) -> tuple[CaseRun, ...]:
-        """Runs with one of the roles, in their order."""
+        """Return the runs with one of the roles, in the order of ``runs``."""
         return tuple(r for r in self.runs if r.role in roles)

@@ -1,9 +1,9 @@
 """Changes of a machine since a solution: which error motions have changed and by how much, cross-validated by other runs.
 
-The model of a known machine is complete, only its values are old. So the old solution, with its covariance, is compared with new runs, and
+The model of a known machine is complete; only its values are old. So new runs are compared with the old solution and its covariance, and
 changes of error motions compete to explain the residuals: the six linear ones (scales, squareness) and the shape of each motion. Selection
-is stepwise by the marginal likelihood of a linear normal model (as `abbe.models.solvers.components`) less a price, the logarithm of the
-number of candidates. For validation, each half of the set-ups judges the changes that the other half chose. Set-ups and lost motion are
+is stepwise by the log marginal likelihood of a linear normal model (as in `abbe.models.solvers.components`) minus a price, the logarithm of
+the number of candidates. For validation, each half of the set-ups judges the changes that the other half chose. Set-ups and lost motion are
 refitted throughout, because a new cup is not a change of the machine.
 """
 
@@ -43,9 +43,10 @@ FEWEST_SETUPS = 2
 
 @dataclass(frozen=True)
 class AskedChange:
-    """A candidate: normal coefficients along ``directions``, shape (p, q), with mean 0 and one of ``sizes`` as standard deviation.
+    """A candidate change of the p unknowns along the columns of ``directions``, shape (p, q).
 
-    ``several``: whether it is the shape of a motion, with several coefficients; else a scale or squareness.
+    The q coefficients are normal with mean 0 and one of ``sizes`` as standard deviation. ``several``: True for the shape of a motion, False
+    for a scale or squareness.
     """
 
     name: str
@@ -56,7 +57,7 @@ class AskedChange:
 
 @dataclass(frozen=True)
 class ChangeEvidence:
-    """Gain in log evidence at the best size, and that size."""
+    """Gain in log evidence of a candidate at its best size, and that size."""
 
     name: str
     gain: float
@@ -64,27 +65,27 @@ class ChangeEvidence:
 
 
 def evidence_of(gram: F2, rhs: F1, base: F2, asked: Sequence[AskedChange]) -> list[ChangeEvidence]:
-    """Return the evidence of every candidate alone.
+    """Return the evidence of each candidate if it is the only change added.
 
     Parameters
     ----------
     gram, rhs : arrays, shape (p, p) and (p,)
         Normal equations of the whitened readings minus their expectation without any change.
     base : array, shape (p, k)
-        Factor of the covariance of all other unknowns; they are integrated out.
+        Factor of the prior covariance of everything else; it is integrated out.
     asked : sequence of AskedChange
 
     Returns
     -------
     list of ChangeEvidence
-        In the same order. Gain: log ratio of the marginal likelihoods with and without the candidate.
+        In the order of ``asked``. Gain: log ratio of the marginal likelihoods with and without the candidate.
     """
     own, gradient = without(gram, rhs, base)
     return [_one(a, own, gradient) for a in asked]
 
 
 def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
-    """Normal equations (p, p) and (p,) with everything along ``base`` (p, k) integrated out."""
+    """Return normal equations, (p, p) and (p,), after everything along ``base`` (p, k) is integrated out."""
     if not base.shape[1]:
         return gram, rhs
     inside = base.T @ gram @ base
@@ -95,7 +96,7 @@ def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
 
 
 def log_evidence(gram: F2, rhs: F1, base: F2) -> float:
-    """Log marginal likelihood with everything along ``base`` unknown, less constants common to all bases."""
+    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, minus that with all unknowns zero."""
     if not base.shape[1]:
         return 0.0
     inside = base.T @ gram @ base
@@ -119,7 +120,7 @@ def _one(asked: AskedChange, gram: F2, rhs: F1) -> ChangeEvidence:
 
 @dataclass(frozen=True)
 class TakenChange:
-    """A chosen candidate: size and gain (after its price) given the other chosen ones, and rivals as (name, missing gain)."""
+    """A chosen candidate: its size and its gain (after the price) given all other chosen ones, and its rivals as (name, missing gain)."""
 
     asked: AskedChange
     size: float
@@ -129,9 +130,9 @@ class TakenChange:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Changes chosen from some runs, and the runs' normal equations relative to the old solution: (p, p) and (p,).
+    """Changes chosen from some runs, and these runs' normal equations relative to the old solution: ``gram`` (p, p) and ``rhs`` (p,).
 
-    ``own``, ``gradient``: the same with the unknowns other than changes integrated out.
+    ``own``, ``gradient``: the same equations after all unknowns except the changes are integrated out.
     """
 
     taken: tuple[TakenChange, ...]
@@ -155,7 +156,7 @@ class ChangeContext:
 
     @cached_property
     def _open(self) -> F2:
-        """Factor of the covariance without any change, shape (p, p): the old solution's, lost motion, set-ups."""
+        """Factor of the covariance if nothing changed, shape (p, p): that of the old solution, of lost motion and of set-ups."""
         typical, p, n = self.problem.sizes.typical, len(self.problem.names), self._n
         out = np.zeros((p, p))
         out[:n, :n] = self.known.root() / typical[:n, None]
@@ -172,7 +173,7 @@ class ChangeContext:
         return (*out, *(AskedChange(f"{m} shape", self._shape(m), SHAPE_SIZES, several=True) for m in bent))
 
     def _scaled(self, coefficients: F1) -> F2:
-        """One direction (P,) in mm and rad as a direction of all unknowns, shape (p, 1)."""
+        """Convert coefficients (P,), mm or rad, to a direction of all unknowns in units of their typical size, shape (p, 1)."""
         out = np.zeros((len(self.problem.names), 1))
         out[: self._n, 0] = coefficients / self.problem.sizes.typical[: self._n]
         return out
@@ -187,7 +188,7 @@ class ChangeContext:
         Greedy selection alone has two weaknesses. A flexible shape may first gain more than either of two linear changes that together
         explain everything. And if all axes grow equally, no axis alone gains anything, because a laser's wavelength explains the growth
         nearly as well. So selection starts three times: from no change, from linear changes chosen first, and from all linear changes. The
-        choice with the largest evidence wins, no change included.
+        choice with the largest evidence wins; no change at all is one of the choices.
         """
         weight = np.exp(-self.fit.components.eta)
         gram, rhs = np.tensordot(weight, sums.gram, 1), weight @ sums.rhs
@@ -202,7 +203,7 @@ class ChangeContext:
         return replace(best, taken=tuple(replace(t, rivals=self._rivals(best, t)) for t in best.taken))
 
     def _rivals(self, chosen: Chosen, taken: TakenChange) -> tuple[tuple[str, float], ...]:
-        """Candidates that explain nearly as much in place of a chosen one, given all other chosen ones."""
+        """Return the candidates that, in place of a chosen one, explain nearly as much."""
         names = {t.asked.name for t in chosen.taken}
         left = [a for a in self.candidates if a.name not in names]
         others = self._changed([t for t in chosen.taken if t is not taken])
@@ -257,14 +258,14 @@ class ChangeContext:
         return np.column_stack([self._open, self._changed(taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:
-        """As `_beside`, with all scales and squareness errors as changes, but without candidate ``but``."""
+        """Return `_beside` of the chosen changes and of all scales and squareness errors, candidate ``but`` left out."""
         others = [t for t in chosen.taken if t.asked.name != but]
         names = {but, *(t.asked.name for t in others)}
         linear = [TakenChange(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]
         return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
 
     def size(self, chosen: Chosen, asked: AskedChange) -> tuple[float, float]:
-        """Value of a change and its standard uncertainty, units as in `Change`; scales and squareness are estimated together with it."""
+        """Return the value of a change and its standard uncertainty, units as in `Change`, estimated with all scales and squareness."""
         coefficients, covariance = self._coefficients(chosen, asked)
         if not asked.several:
             direction = self.known.linear({asked.name: 1.0})
@@ -291,7 +292,7 @@ class ChangeContext:
         return turned @ x, turned @ covariance @ turned.T
 
     def _values(self, motion: str) -> F2:
-        """A motion over its stroke per coefficient, shape (POINTS, P)."""
+        """Error motion at `POINTS` points of its stroke per unit of each coefficient, shape (POINTS, P)."""
         stroke = self.known.machine.stroke_mm
         axis = AXES.index(motion[2])
         points = np.tile(stroke.mean(axis=1), (POINTS, 1))
@@ -300,9 +301,9 @@ class ChangeContext:
         return np.asarray(term_values(self.known.terms, points, stroke) * mine)
 
     def hidden(self, chosen: Chosen) -> dict[str, float]:
-        """Bound on the change (rad) of each scale or squareness that was not chosen: |estimate| + U (k = 2), all of them fitted.
+        """Bound on the change of each scale (m/m) and squareness (rad) that was not chosen: |estimate| + U (k = 2), all fitted together.
 
-        Those are left out for which U exceeds the largest size that is tried: these runs cannot show them.
+        One whose U exceeds the largest size tried is left out, because these runs cannot show it.
         """
         names = {t.asked.name for t in chosen.taken}
         out = {}
@@ -328,9 +329,9 @@ class ChangeContext:
         return np.asarray(self.fit.weight > 0.5)
 
     def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float, float]:
-        """Judge each half's choice by the other half: rms of all readings without and with it, mm, set-ups refitted; log likelihood gain.
+        """Judge each half's choice by the other half: return rms residual without and with the choice, mm, and gain in log likelihood.
 
-        The gain is that of the half with the smaller gain; the unknowns other than changes are integrated out.
+        The rms is over all readings, with set-ups refitted. The gain is the smaller of both halves; all other unknowns are integrated out.
         """
         old = self.known.coefficients
         before, after, count, gains = 0.0, 0.0, 0, []
@@ -344,14 +345,14 @@ class ChangeContext:
         return float(np.sqrt(before / count)), float(np.sqrt(after / count)), min(gains)
 
     def _likelier(self, mine: Chosen, change: F1) -> float:
-        """Log likelihood ratio of some runs for a change of coefficients that other runs chose."""
+        """Log likelihood of the runs of ``mine`` with a ``change`` of the coefficients (P,) minus that without."""
         moved = self._scaled(change)[:, 0]
         shifted = mine.rhs - mine.gram @ moved
         plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.rhs, shifted))
         return with_it - plain + float(moved @ mine.rhs) - 0.5 * float(moved @ mine.gram @ moved)
 
     def _left(self, rows: NDArray[np.bool_], coefficients: F1) -> float:
-        """Sum of squared differences of readings and prediction, mm²; lost motion and set-ups refitted within their priors."""
+        """Sum of squares of readings minus prediction, mm²; lost motion and set-ups are refitted within their priors."""
         r, n, typical = self.problem.readings, self._n, self.problem.sizes.typical
         noise = self._noise_mm[rows]
         sd = self.fit.prior_sd[n:] / typical[n:]
@@ -364,7 +365,7 @@ class ChangeContext:
 
 
 def _is_shape(term: Term) -> bool:
-    """Whether a term is neither scale nor squareness, which are candidates of their own."""
+    """Whether a term belongs to the shape of a motion; scales and squareness errors are candidates of their own."""
     return term.order > 0 and not (term.order == 1 and term.component == term.axis)
 
 
@@ -377,8 +378,8 @@ class Change:
     name : str
         ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for the whole motion (of positioning: without the scale).
     value, u : float
-        Change and standard uncertainty, estimated together with all scales and squareness errors: of a scale (m/m) or squareness (rad); of
-        a shape its rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.
+        Change and its standard uncertainty, estimated together with all scales and squareness errors. Scale: m/m; squareness: rad; shape:
+        rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.
     evidence : float
         Gain in log evidence after its price, given all other named changes.
     rivals : tuple of (name, missing evidence)
@@ -400,8 +401,9 @@ class Changed:
     """All changes found.
 
     ``before_mm``: rms of readings minus the old solution. ``after_mm``: the same with the changes that the OTHER half of the set-ups chose.
-    ``floor_mm``: rms noise. ``judged``: log likelihood ratio of each half for the other's choice, the smaller of the two. None: too few
-    set-ups to judge. ``hidden``: bound on the change (rad) of each scale and squareness that was not named but that these runs can show.
+    ``judged``: gain in log likelihood of each half by the other's choice, the smaller of the two. These three are None with too few
+    set-ups. ``floor_mm``: rms noise. ``hidden``: bound on the change (m/m, rad) of each scale and squareness that these runs can show, but
+    was not named.
     """
 
     changes: tuple[Change, ...]
@@ -425,7 +427,7 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
     Raises
     ------
     ValueError
-        No runs, or one that cannot be used (named).
+        No runs, or one that cannot be used; the message names it.
     """
     if not runs:
         raise ValueError("changes: no runs")
@@ -443,7 +445,7 @@ def _silent(_: str) -> None:
 
 
 def _halves(parts: tuple[InformationSums, ...], problem: CampaignProblem) -> list[tuple[InformationSums, ...]]:
-    """Folds (whole set-ups) with even and with odd numbers; none where one half would have too few set-ups."""
+    """Split the runs into two halves of whole set-ups (even and odd folds); empty if a half would have too few set-ups."""
     folds = problem.readings.fold
     setups = [{problem.runs[k].setup for k in np.unique(problem.readings.run[folds % 2 == odd])} for odd in (0, 1)]
     if min(len(s) for s in setups) < FEWEST_SETUPS:
@@ -452,7 +454,7 @@ def _halves(parts: tuple[InformationSums, ...], problem: CampaignProblem) -> lis
 
 
 def _changes(context: ChangeContext, whole: Chosen, by_half: list[Chosen]) -> tuple[Change, ...]:
-    """The changes that all runs together chose, largest evidence first."""
+    """Return the changes chosen from all runs together, largest evidence first."""
     out = []
     for taken in whole.taken:
         value, u = context.size(whole, taken.asked)

@@ -36,7 +36,7 @@ ROUNDS = 3
 
 
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
-    """Find variance effects in the residuals of simulation and ``picks``, this time with the lone outliers of lasers."""
+    """Find variance effects in the residuals of simulation and ``picks``; single laser outliers are included here."""
     solved = solve(problem, picks)
     model = problem.tangent.raw @ (solved.theta - problem.theta)
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
@@ -50,7 +50,7 @@ def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[Variance
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """The problem without these findings: vibrations are projected out of each run, readings with excess variance get weight 0."""
+    """Remove variance effects from a problem: project vibrations out of each ball-bar run, and give loud readings weight 0."""
     waves, use = [problem.also], problem.use
     for f in findings:
         if f.name == "vibration":
@@ -68,7 +68,7 @@ def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> Wh
 
 
 def _waves(problem: WhitenedProblem, axis: int, frequency_hz: float) -> F2:
-    """Sine and cosine of unknown size and phase in every ball-bar run, mm."""
+    """Columns of a vibration along an axis: a sine and a cosine for every ball-bar run, mm per mm."""
     out = np.zeros((problem.gap.size, 2 * sum(k == "bar" for k in problem.kinds)))
     start = column = 0
     for path in problem.paths:
@@ -94,10 +94,11 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     Parameters
     ----------
     case : Case
-        Identify runs are fitted, holdout runs judge, sealed runs are predicted.
+        Its identify runs are fitted, its holdout runs judge the result, its sealed runs are predicted.
     effects : tuple of Effect
         Effects to choose from.
-    progress : function (stage, share done from 0 to 1), optional
+    progress : function, optional
+        Called with a text and the share of the work done, 0 to 1.
 
     Returns
     -------
@@ -120,7 +121,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
 
 
 def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:
-    """Search for mean, then for variance effects; refit noise and simulation with the findings and repeat until these stay the same."""
+    """Search for mean and variance effects, refit noise and simulation, repeat (up to `ROUNDS` times) until the findings stay the same."""
     contest = Contest.of(problem, effects)
     found, loud = selected(contest), tuple[VarianceFinding, ...]()
     for i in range(ROUNDS):
@@ -139,10 +140,10 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
 
 
 def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], list[list[Rival]]]:
-    """Return the findings with their rivals, after a rival that explains more than a named effect has replaced it.
+    """Replace each named effect that a rival explains better; return the findings with their rivals.
 
-    The search compares effects without their freedoms of form, so it may have chosen the wrong one of two similar effects. Here both have
-    them.
+    The search compares effects without the deviations from their formulas (`Form`), so it may have chosen the wrong one of two similar
+    effects. Here both may use them.
     """
     changed = False
     for i in range(len(found)):
@@ -166,13 +167,13 @@ def _labels(found: list[Selection], loud: tuple[VarianceFinding, ...]) -> set[st
 
 
 def _merged(old: tuple[VarianceFinding, ...], new: tuple[VarianceFinding, ...]) -> tuple[VarianceFinding, ...]:
-    """The old findings and those that are new."""
+    """Return the old findings and those of the new ones that have other labels."""
     known = {f.label for f in old}
     return (*old, *(f for f in new if f.label not in known))
 
 
 def settled(problem: WhitenedProblem, picks: list[Pick]) -> WhitenedProblem:
-    """The problem linearised about the joint fit of simulation and picks, with the noise of its residuals."""
+    """Linearise the problem about the joint fit of simulation and picks, and estimate the noise from the residuals of this fit."""
     if not picks:
         return with_estimated_noise(problem, ())
     raw = [p.raw(problem) for p in picks]

@@ -70,12 +70,12 @@ STARTS = 2000.0
 
 
 def true_to_form(name: str, family: Family) -> float:
-    """Relative standard uncertainty of an effect's strength because its true form differs from its formula."""
+    """Relative standard uncertainty of an effect's strength that stems from the difference between its true form and its formula."""
     return TRUE_TO_FORM_OF.get(name, TRUE_TO_FORM[family])
 
 
 def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Non-linear parameters by name with their standard uncertainty; for thermal time constants it includes `TIME_TRUE_TO_FORM`."""
+    """Return value and standard uncertainty of each non-linear parameter; that of a thermal time constant includes `TIME_TRUE_TO_FORM`."""
     times = {"tau_s"} if pick.effect.family == "thermal" else set()
     values = {name: float(pick.values[name]) for name in u}
     return {name: (v, float(np.hypot(u[name], TIME_TRUE_TO_FORM * v)) if name in times else u[name]) for name, v in values.items()}
@@ -84,8 +84,9 @@ def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float
 def strength_of(problem: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
     """Strength and its standard uncertainty, in the effect's unit, from its coefficients (forms last) and their covariance.
 
-    The uncertainty has four parts: the coefficients (with free non-linear parameters), the form, the share of the effect that the present
-    simulation absorbs (`Effect.unseen`), and the choice of the constant (`as_plain`).
+    The uncertainty has four parts: that of the coefficients (with free non-linear parameters), the difference between true form and
+    formula, the share of the effect that the present simulation absorbs (`Effect.unseen`), and the choice of a sensor's start value
+    (`as_plain`).
     """
     effect = pick.effect
     plain = as_plain(problem, pick)
@@ -101,7 +102,7 @@ def strength_of(problem: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[f
 
 
 def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
-    """Change of the strength with each coefficient."""
+    """Derivative of the strength with respect to each coefficient."""
     out = np.zeros(c.size)
     for j in range(c.size):
         step = max(1e-4 * abs(c[j]), 1e-3 * float(np.sqrt(max(cov[j, j], 1e-30))))
@@ -111,11 +112,11 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
 
 
 def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
-    """Matrix that maps all coefficients of a pick to those of the plain effect, without forms, with the nearest signal (least squares).
+    """Return the matrix that maps all coefficients of a pick to those of the effect without forms whose signal is nearest (least squares).
 
-    Shape (columns of the effect, columns with those of its forms). Only forms that carry part of the effect's size count: an amplitude that
+    Shape (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's size count: an amplitude that
     changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic or wind-up, are no part of the
-    strength. ``offset``: fit the start value of a sensor as well, so that it does not count.
+    strength. ``offset``: fit the start value of a sensor as well, so that it does not change the strength.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]
@@ -135,12 +136,12 @@ def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2
 
 
 def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
-    """Find names that may be only the deviation of a stronger effect from its formula.
+    """Find named effects that may be mere residues: deviations of a stronger effect from its formula.
 
-    A name is such a residue if its evidence is below
+    An effect is a residue if its evidence is below
 
     - 0.1 % of that of any stronger effect;
-    - 1 % of that of a mean effect (0.3 % of a smooth one), for stick-slip or vibration, on any axis;
+    - for stick-slip and vibration: 1 % of that of an effect at reversals or a cyclic error, 0.3 % of that of another mean effect;
     - 2 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
       mismatch);
     - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
@@ -167,7 +168,7 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
 
 
 def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
-    """Share of ``big``'s evidence below which ``small`` counts as its residue."""
+    """Return the share of the evidence of ``big`` below which ``small`` is its residue (`residues`)."""
     if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
         return AXIS_SHARE
     grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
@@ -190,7 +191,7 @@ def _together(a: str, b: str) -> bool:
 
 @dataclass(frozen=True)
 class _Judgement:
-    """Sorted findings: indices of the kept mean effects, all named effects, structures without a name, rejected labels with reasons."""
+    """Sorted findings: named effects, structures without a name, rejected labels with reasons; ``mean``: indices of named mean effects."""
 
     mean: tuple[int, ...]
     effects: tuple[NamedEffect, ...]
@@ -212,9 +213,10 @@ def finding(
 
     Parameters
     ----------
-    problem, plain : the problem with the noise estimated beside the findings; the problem before the search.
-    found, loud : mean effects and variance effects. solved, rivals : of ``found``, in its order.
-    predicted : readings of every run, mm, without and with the effects.
+    problem, plain : the problem after the search, with noise estimated together with the findings; the problem before the search.
+    found, loud : the mean effects and the variance effects found.
+    solved, rivals : solution with ``found``; rivals of each of them, in the same order.
+    predicted : predicted readings of every run by label, mm, without and with the effects.
     """
     case, judgement = problem.case, _judge(problem, found, loud, solved, rivals)
     is_named, unnamed = judgement.verdict == "named", judgement.unnamed
@@ -259,7 +261,7 @@ def _judge(
     solved: SolvedModel,
     rivals: Sequence[Sequence[Rival]],
 ) -> _Judgement:
-    """Sort findings into names, structures without a name, and residues of others."""
+    """Sort the findings into named effects, structures without a name, and residues of other effects."""
     companions = _companions(problem, found, solved)
     named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companions]
     needed = _needed(problem, solved, named)
@@ -280,7 +282,7 @@ def _judge(
 
 
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
-    """Ratio of the holdout runs' rms without an effect to that with all effects, by the effect's index (`NamedEffect.needed`)."""
+    """Return, by index of the effect, the rms of the holdout runs without it over that with all effects (`NamedEffect.needed`)."""
     fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
@@ -298,21 +300,21 @@ def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int])
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
-    """Rivals that lack less than `EXCLUDED` chi-square; `NamedEffect.alternatives` holds the more distant ones too."""
+    """Return the labels of rivals whose chi-square is short by less than `EXCLUDED`; `NamedEffect.alternatives` also has weaker ones."""
     return tuple(dict.fromkeys(label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0))
 
 
 def _verdict(named: float, unnamed: float) -> Verdict:
-    """The larger of the two evidences decides."""
+    """Decide by the larger of the total evidences of named effects and of structures without a name; "none" if both are 0."""
     if named == unnamed == 0.0:
         return "none"
     return "unknown" if unnamed > named else "named"
 
 
 def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: Localization | None) -> float:
-    """Smallest p of a lack of fit; else a bound on the probability that noise alone gives the strongest finding.
+    """Return the smallest p of a lack of fit; else a bound on the probability that noise alone gives the strongest finding.
 
-    The bound is the chi-square tail of the finding's gain times the number of starts compared.
+    Bound for a mean effect: chi-square tail of its gain times the number of starts compared; for a variance effect: exp(-evidence).
     """
     if lack is not None:
         return min((s.p for s in lack.table), default=CHANCE)
@@ -322,7 +324,7 @@ def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: 
 
 
 def _companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
-    """Findings that are only residues of another: index of the other by their index."""
+    """Map the index of each finding that is only a residue of another to the index of that other."""
     power = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
         size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2
@@ -353,7 +355,7 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
 
 
 def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
-    """The measurement that best separates the strongest ambiguous name from its rivals."""
+    """Propose the measurement that best separates the strongest named effect with rivals from these."""
     for i in kept:
         if not rivals[i]:
             continue
@@ -368,7 +370,7 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
 
 
 def gaps_of(problem: WhitenedProblem, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:
-    """Gap of every role ("identify", "holdout") with at least one valid reading."""
+    """Return the gap of each role ("identify", "holdout") that has a valid reading; ``before``, ``after``: residuals by run, mm."""
     out = {}
     for role in ("identify", "holdout"):
         runs = [r for r in problem.case.runs if r.role == role and r.path.label in before]

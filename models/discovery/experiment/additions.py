@@ -48,10 +48,10 @@ MOVING = "errors that occur only in motion on a curve (reversals of two axes, se
 
 @dataclass(frozen=True)
 class ExperimentOffer:
-    """One addition to a campaign: ``adds``: its name; the runs to simulate; the minutes they take; ``why``: description as text.
+    """One possible addition to a campaign: its name (``adds``), the runs to simulate, the minutes they take, and a description (``why``).
 
     ``subtracted``: runs of an angular interferometer's second beam, whose readings are subtracted from those of ``runs``.
-    ``knows_length``: it makes the bar's length known.
+    ``knows_length``: whether the addition makes the bar's length known.
     """
 
     adds: str
@@ -63,7 +63,7 @@ class ExperimentOffer:
 
     @property
     def special(self) -> bool:
-        """Whether it needs more than a ball-bar and a linear laser."""
+        """Whether the addition needs more than a ball-bar, a linear laser and the present tool."""
         return self.adds in ("angular_interferometer", "second_tool_length", "reference_length")
 
 
@@ -138,7 +138,7 @@ def _bar_variants(bars: list[Path], start: float) -> list[ExperimentOffer]:
 def _with_back(
     like: Path, bars: list[Path], make: Callable[[F2, float, str], CaseRun], start: float, label: str, q_mm: F2 | None = None
 ) -> tuple[CaseRun, ...]:
-    """A run along a path and, if the campaign has both directions, one back along it."""
+    """Return a run along a path and, if the campaign has both directions, one back along it."""
     q = like.at.q_mm if q_mm is None else q_mm
     out = [make(q, start, label)]
     if not one_way(bars):
@@ -155,13 +155,13 @@ def _same_setup(path: Path, first: CaseRun) -> Path:
 
 
 def _fits(machine: Machine, centre_mm: F1, radius_mm: float) -> bool:
-    """Whether a sphere of this radius stays inside the strokes of at least two axes."""
+    """Whether a circle of this radius fits into the strokes of at least two axes."""
     room = np.minimum(centre_mm - machine.stroke_mm[:, 0], machine.stroke_mm[:, 1] - centre_mm)
     return bool(np.sum(room >= radius_mm) >= 2)
 
 
 def _bar(like: Path, q_mm: F2, feed_mm_min: float, t_set_s: float, label: str, centre_mm: F1 | None = None) -> CaseRun:
-    """A ball-bar run over given positions, thinned, in a set-up of its own."""
+    """Return a ball-bar run over some of the given positions (about `READINGS`), in a set-up of its own."""
     q = q_mm[:: max(len(q_mm) // READINGS, 1)]
     centre = like.centre_mm if centre_mm is None else centre_mm
     way = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1).cumsum()
@@ -252,7 +252,7 @@ def _line(like: Path, axis: int, start: float, label: str, tool_mm: F1 | None = 
 
 
 def _angles(like: Path, start: float) -> ExperimentOffer:
-    """An angular interferometer, as the difference of two beams, about both directions across each axis."""
+    """Offer an angular interferometer, simulated as the difference of two beams, for pitch and yaw of each axis."""
     one, two, t = [], [], start
     for a in range(3):
         for across in ((a + 1) % 3, (a + 2) % 3):
@@ -268,7 +268,7 @@ def _angles(like: Path, start: float) -> ExperimentOffer:
 
 
 def _late(known: list[Path], start: float) -> ExperimentOffer:
-    """The first paths repeated hours later, each in a set-up of its own."""
+    """Offer to repeat the first paths hours later, each in a set-up of its own."""
     runs = []
     for k, p in enumerate(_different(known)[:4]):
         runs.append(_again(p, start + LATE_S + 1500.0 * k, f"next_late_{k}", p.machine))
@@ -288,7 +288,7 @@ def _second_tool(known: list[Path], start: float) -> ExperimentOffer:
 
 
 def _different(known: list[Path]) -> list[Path]:
-    """The first run of every set-up, in the order of time."""
+    """Return the first run of every set-up, in order of time."""
     first: dict[str, Path] = {}
     for p in sorted(known, key=lambda p: float(p.at.t_s[0])):
         first.setdefault(p.setup, p)
@@ -341,7 +341,7 @@ def _repeated_late(paths: list[Path]) -> bool:
 
 
 def _place(path: Path) -> F1:
-    """Signature of a path regardless of direction, mm: extent along every axis; cup and radius of a bar, or scaled direction of a beam."""
+    """Return numbers, mm, that identify a path in either direction: extent, and cup and radius of a bar or scaled direction of a beam."""
     reach = [path.at.q_mm.min(axis=0), path.at.q_mm.max(axis=0)]
     if path.kind == "bar":
         return np.concatenate([*reach, path.centre_mm, [path.radius_mm]])

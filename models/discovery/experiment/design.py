@@ -1,8 +1,9 @@
 """Experiment design: the addition that best separates the remaining suspects, by simulation (T-optimal design, Atkinson and Fedorov).
 
 For every addition that the campaign lacks, each rival is fitted to the leading suspect's signal over old and new runs, with all unknowns
-free: the rival's coefficients, the present simulation, the set-ups. The residual, in sigmas of the noise, is the expected separation. The
-addition with the largest separation per minute is proposed; ball-bar and laser come before optics and standards that few shops have.
+free: the rival's coefficients, the present simulation, the set-ups. The norm of the residual, in sigmas of the noise, is the expected
+separation. The addition with the largest gain per minute is proposed; additions with ball-bar or laser that separate all rivals come first,
+because few shops have other optics and standards.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class SuspectEffect:
     Attributes
     ----------
     coefficients : array, shape (k,)
-        As found, needed only for the leading suspect. None: typical strength.
+        Fitted coefficients, used only for the leading suspect. None: those of typical strength (`usual`).
     """
 
     effect: Effect
@@ -59,7 +60,7 @@ class SuspectEffect:
 
 @dataclass(frozen=True)
 class Prospect:
-    """Expected separation of the leading suspect from each rival with an addition, and without it, sigmas, in the order of the rivals."""
+    """Expected separation of the leading suspect from each rival, in sigmas, with an addition (``sigmas``) and without it (``already``)."""
 
     offer: ExperimentOffer
     sigmas: F1
@@ -67,18 +68,18 @@ class Prospect:
 
     @property
     def gain(self) -> F1:
-        """Added sigmas, by rival."""
+        """Sigmas that the addition adds, for each rival."""
         return np.asarray(self.sigmas - self.already)
 
     @property
     def plain(self) -> bool:
-        """Whether the addition needs only ball-bar or laser and separates every rival that is not separated already."""
+        """Whether the addition is not special (`ExperimentOffer.special`) and separates every rival that is not separated already."""
         open_ = self.already < SEPARATED
         return not self.offer.special and bool((self.sigmas[open_] >= SEPARATED).all() and open_.any())
 
     @property
     def per_minute(self) -> float:
-        """Gain in squared separation per minute, each separation capped at `ENOUGH`."""
+        """Gain in squared separation per minute, summed over the rivals; each separation is capped at `ENOUGH`."""
         gain = np.minimum(self.sigmas, ENOUGH) ** 2 - np.minimum(self.already, ENOUGH) ** 2
         return float(np.maximum(gain, 0.0).sum() / max(self.offer.minutes, 1.0))
 
@@ -86,7 +87,7 @@ class Prospect:
 def propose(
     case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
 ) -> NextTest | None:
-    """Propose the addition that separates the leading suspect from its rivals best per minute.
+    """Propose the addition that gains most separation of the leading suspect from its rivals per minute.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def propose(
     Returns
     -------
     NextTest or None
-        None without rivals, or if no addition separates anything. If none adds `WORTH` sigmas, the addition that adds most.
+        None without rivals, or if no addition separates them by `LEAST` sigmas more. If none adds `WORTH` sigmas, the one that adds most.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:
@@ -114,7 +115,7 @@ def propose(
 def prospects(
     case: Case, leader: SuspectEffect, rivals: tuple[SuspectEffect, ...], noise_mm: Mapping[str, float] | None = None
 ) -> tuple[Prospect, ...]:
-    """All additions with their expected separations, best per minute first; parameters as `propose`."""
+    """Return all additions with their expected separations: `Prospect.plain` ones first, then by gain per minute; see `propose`."""
     found = offers(case)
     if not rivals or not found:
         return ()
@@ -137,12 +138,12 @@ def prospects(
 
 
 def _with_setups(case: Case) -> Baseline:
-    """The present simulation with set-up unknowns added, because a new mounting always has an unknown cup, length and tilt."""
+    """Return the present simulation with all set-up unknowns, because a new mounting always has an unknown cup, length and tilt."""
     return baseline_of(replace(case, includes=case.includes | {"setup_centre_offset", "bar_length_error", "mirror_tilt"}))
 
 
 def _decimated(run: CaseRun) -> tuple[CaseRun, float]:
-    """A run with fewer readings, and how many each represents."""
+    """Return the run with fewer readings, and how many old readings each of them represents."""
     step = max(run.path.n // THIN, 1)
     p, rows = run.path, slice(None, None, step)
     a = p.at
@@ -161,7 +162,7 @@ def _decimated(run: CaseRun) -> tuple[CaseRun, float]:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Signals of leader and rivals over all runs, old and new, and the present simulation."""
+    """Columns of the present simulation, the rivals and the leading suspect over all runs, old and new."""
 
     base: Baseline
     leader: tuple[F1, ...]
@@ -178,7 +179,7 @@ class _Columns:
         return cls(base, tuple(np.asarray(s @ c) for s in own), found)
 
     def gram(self, run: CaseRun, k: int, weight: float, subtracted: tuple[CaseRun, int] | None = None) -> F2:
-        """Normal matrix of one run: simulation, rivals, leader; ``subtracted``: the run whose columns are subtracted, its index."""
+        """Normal matrix of run number k (simulation, rivals, leader). ``subtracted``: a run whose columns to subtract, and its number."""
         columns = self._of_run(run, k)
         if subtracted is not None:
             columns = columns - self._of_run(*subtracted)
@@ -189,7 +190,7 @@ class _Columns:
         return np.column_stack([jacobian, *(r[k] for r in self.rivals), self.leader[k]])
 
     def left(self, gram: F2, *, knows_length: bool = False) -> F1:
-        """Norm of the part of the leader's signal that a rival and the simulation together cannot imitate, sigmas, by rival."""
+        """Norm of the part of the leader's signal that each rival and the simulation together cannot imitate, sigmas, shape (rivals,)."""
         n, out = self.base.size, []
         sd = self.base.prior_sd * WIDE
         if knows_length:
@@ -208,7 +209,7 @@ class _Columns:
 
 
 def usual(suspect: SuspectEffect, columns: int) -> F1:
-    """Return coefficients for the middle of the usual range; only the first is not 0, and the strength may be any power of it."""
+    """Return coefficients (columns,) of typical strength: only the first is not 0; the strength may be any power of it."""
     effect = suspect.effect
     sizes = [abs(effect.strength(c * effect.per_unit * np.eye(columns)[0], suspect.values)) / effect.per_unit for c in (1.0, 4.0)]
     power = np.log(sizes[1] / sizes[0]) / np.log(4.0)
