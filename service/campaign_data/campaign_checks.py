@@ -110,7 +110,7 @@ def _named(others: list[str]) -> str:
 
 
 COPIED_SHARE = 0.98
-"""Share of equal readings, positions included, from which a run is a copy: noise differs every time."""
+"""A run with at least this share of equal readings at equal positions is a copy: noise differs every time."""
 VISIBLE_STEPS = 2.0
 """Rms second difference of the readings, in sensor steps, above which they show noise: rounding alone gives 0.7."""
 NOTHING_MM = 1e-9
@@ -214,7 +214,7 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
 def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
     """Return issues that need no model: machine, geometry, units, times, copies, too few readings.
 
-    ``machine``: the campaign's machine object; ``runs``: with readings.
+    ``machine``: the campaign's machine object; ``runs``: those with readings.
     """
     out = _twice([r.run_id for r in runs])
     for run in runs:

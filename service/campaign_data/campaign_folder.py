@@ -24,7 +24,7 @@ class Campaign:
     """A campaign for a solver. ``folder``: its source, None if the store; ``doc``: its campaign object.
 
     ``removed``: the table whose side effects were subtracted from the readings; None without one. ``tables``: images of the compensation
-    tables in force that the folder holds, by CRC; empty for a campaign of the store, which has its own.
+    tables that acted during the runs, by CRC, as far as the folder holds them; empty for a campaign of the store, which has its own.
     """
 
     name: str

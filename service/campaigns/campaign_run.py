@@ -24,7 +24,7 @@ from abbe.service.sequences.waiting import ExpectedTable, check_expected, may_su
 from abbe.service.storage.store import Store
 
 BALLBAR = "ballbar"
-"""Value in ``[limits] continue_after``."""
+"""Name for a loss of the ball-bar's box in ``[limits] continue_after`` of the machine file."""
 MOST_BREAKS = 5
 """How often a test restarts after the ball-bar box was lost; after that a person has to look."""
 BREAKS = (LinkDown, ReplyTimeout, Rebooted)
@@ -51,7 +51,7 @@ class BarBreaks:
         self._count = 0
 
     async def wait(self, error: DriverError, runner: Runner, journal: Journal) -> None:
-        """Wait for a lost box after a run that ended with this error; return at once if it is no such loss, or no reason to wait.
+        """Wait for the box if a run ended with its loss; return at once after any other error, or if the measurement must not wait.
 
         Raises
         ------

@@ -203,7 +203,7 @@ def _fit(pairs: list[tuple[int, float]]) -> ClockFit:
 
 
 def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: float) -> list[float]:
-    """Return the laser time of every planned reading, shape (n,), s, rising: the middle of its window.
+    """Return the laser time of every planned reading, s, in rising order: the middle of its window.
 
     Missing readings get interpolated times. Before the first found reading these begin at ``start_s``, after the last they are ``apart_s``
     apart.

@@ -68,7 +68,7 @@ def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
 
 
 def check_configured(needed: Needed, there: Collection[str]) -> None:
-    """Raise ConfigError naming every needed role that the machine file does not name (``there``). Connects to nothing."""
+    """Raise ConfigError if needed roles are not in ``there``, the roles that the machine file names. Connects to nothing."""
     missing = [role for role in needed.first if role not in there]
     if missing:
         listed = " and ".join(f"{ROLE_NAMES[role]} for {needed.first[role]}" for role in missing)

@@ -136,7 +136,7 @@ BOX = "lost in the ball-bar's box (buffer overrun)"
 SLOW = "this computer did not keep up: the driver's buffer was full"
 
 Item = tuple[int, BarBatch] | tuple[str, dict[str, Any]]
-"""A batch of the ball-bar after the number of its stream, or another record after the name of its channel."""
+"""A stream number with a ball-bar batch, or a channel name with another record."""
 
 
 @dataclass(slots=True)
@@ -298,7 +298,7 @@ TORN = "the end of the segment is torn or damaged: the number of its samples is 
 def ledger_of(chunks: list[ChunkRecord], streams: dict[int, int] | None = None) -> Ledger:
     """Return the ledger of a stored run from the chunks of all its channels.
 
-    ``streams``: stream of each chunk by its number, from a segment. For other chunks a new stream begins where sequence numbers go back.
+    ``streams``: stream of each chunk by chunk number, if known from a segment. Other chunks begin a stream where sequence numbers go back.
 
     Raises
     ------

@@ -84,7 +84,7 @@ class LiveFeed:
         self.active.clear()
 
     def take(self, batch: BarBatch) -> None:
-        """Take a batch; in the driver's thread. Never waits, never raises."""
+        """Receive a batch in the driver's thread. Never waits, never raises."""
         if self._first_seq is None:
             self._first_seq = next((sample.seq for sample in batch.samples if on_path(sample.status)), None)
         if self._first_seq is not None:

@@ -28,7 +28,7 @@ from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.storage.store import Store
 
 GROUP_S = 0.01
-"""Longest time from a sample's arrival that it waits for others to share one sync. Time lost earlier, as by a slow sync, counts."""
+"""A sample waits for others to share one sync until this long after its arrival, even if a slow sync has used up part of that time."""
 MAX_PENDING = 8192
 HANG_S = 30.0
 
@@ -282,16 +282,16 @@ class CaptureRecorder:
         return _Tap(self.log, self._streams - 1, self.look)
 
     async def add_bar(self, batch: BarBatch) -> None:
-        """Check the capture after a batch that the tap has taken; raises as `check`."""
+        """Check the capture after a batch that the tap has taken; raises like `check`."""
         self.check()
 
     async def add_record(self, record: dict[str, Any]) -> None:
-        """Queue one record of the laser; raises as `check`."""
+        """Queue one record of the laser; raises like `check`."""
         self.check()
         self.log.put((LASER, record))
 
     async def flush(self) -> None:
-        """Wait until everything queued so far is on the disk; raises as `check`."""
+        """Wait until everything queued so far is on the disk; raises like `check`."""
         await asyncio.to_thread(self.log.flush)
         self.check()
 
@@ -342,7 +342,7 @@ class CaptureRecorder:
                 self.log.segment.path.parent.rmdir()
 
     def release(self) -> None:
-        """Stop protecting the segment from recovery by this process: its run is closed, or the recovery shall close it."""
+        """Let this process recover the segment like any other; until then `is_active` protects it."""
         _active.discard(_key(self.log.segment.path))
 
 
@@ -415,7 +415,7 @@ async def recording(
 
 
 async def _opened_or_closed(work: Callable[[], CaptureRecorder]) -> CaptureRecorder:
-    """Open a recorder; close it again if the caller is cancelled during that."""
+    """Open a recorder; close it again if the caller is cancelled meanwhile."""
     found: list[CaptureRecorder] = []
 
     async def opening() -> None:

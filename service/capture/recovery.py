@@ -118,7 +118,7 @@ def _try_lock(handle: int) -> bool:
 __all__ = ["DAMAGED", "RecoveredRun", "ledger_of", "read_segment", "recover_segments"]
 
 MOST_RUNS = 2**31
-"""Limit of run numbers. No database has a run with this number, but a damaged segment may name one."""
+"""Upper limit of run numbers; only a damaged segment names a larger one."""
 
 
 @dataclass(frozen=True, slots=True)

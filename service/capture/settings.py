@@ -103,7 +103,7 @@ def segment_path(folder: Path, run_id: int) -> Path:
 
 
 def free_name(path: Path, suffix: str) -> Path:
-    """Return an unused name beside a file with another suffix, e.g. ``run-00000012.orphan-2``."""
+    """Return an unused name in the same folder with another suffix, e.g. ``run-00000012.orphan-2``."""
     names = (path.with_suffix(suffix if k == 1 else f"{suffix}-{k}") for k in count(1))
     return next(name for name in names if not name.exists())
 

@@ -33,7 +33,7 @@ class _Scatter:
 
 
 def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
-    """Search a test of one axis for a drift of its repeats, and the rest for effects of the catalogue.
+    """Search a test of one axis for a drift of its repeats, then the readings without that drift for effects of the catalogue.
 
     The effects must exceed the scatter of the repeats, which is known without a noise model; otherwise the result is that of `axis_drift`.
     """

@@ -50,7 +50,7 @@ class ReferenceSolution:
 class _Before:
     """A solution, the CRC of the table that acted while it was measured, and the effects subtracted from its readings.
 
-    ``taken``: labels of these effects; ``version``: their version of the model book, None without one.
+    ``taken``: labels of these effects; ``version``: the version of the model book that has them, None without one.
     """
 
     number: int
@@ -76,7 +76,7 @@ def reference_solution(store: Store, campaign: Campaign) -> ReferenceSolution | 
 
 
 def _earlier(store: Store, campaign: Campaign) -> Iterator[SolutionRecord]:
-    """Return the solutions for all 21 motions from this machine's earlier campaigns, newest first."""
+    """Return the solutions of this machine's earlier campaigns that fitted all 21 motions, newest first."""
     numbers = {m.id for m in store.machines.all() if m.name == campaign.site.name}
     mine = [c for c in store.campaigns.all() if c.machine_id in numbers]
     at = next((c.id for c in mine if c.name == campaign.name), 0)
@@ -125,7 +125,7 @@ def _acting(tables: Sequence[RunTable]) -> int | None:
 
 
 def _tables_between(store: Store, campaign: Campaign, before: _Before) -> RemovedTable | None:
-    """Return the change that turns the readings into those of the machine with the earlier table; None if both tables are the same.
+    """Return what to subtract from the readings to get those with the earlier table; None if both tables are the same.
 
     Raises
     ------

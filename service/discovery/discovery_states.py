@@ -29,7 +29,7 @@ CLOSED = 0.5
 LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise."""
 WORSE = 1.05
-"""Largest ratio of the gap after to the gap before in any role: a diverged solution is not a finding."""
+"""Largest ratio of the gap with the effect to the gap without it, in the runs of any role: a diverged solution is not a finding."""
 NEAR = 3.0
 """Lead in evidence (natural logarithm) over every rival that an effect needs for the model book: twenty times as likely."""
 NOT_CONFIRMED = "the holdout runs do not agree better with the effect than without it"

@@ -13,7 +13,7 @@ from abbe.service.formats.model import Compensation, correction_at
 
 REMEDY = "do not load this file"
 ALIKE = 0.2
-"""Largest difference at which tables still count as the expected ones times a factor, as a share of these."""
+"""Tables count as a multiple of the expected ones if they differ from it by less than this share."""
 FACTORS = (
     (-1.0, "the sign is wrong: it would double every error"),
     (1000.0, "1000 times too large: µm were taken for mm"),
@@ -36,7 +36,7 @@ class FormatDifference:
 
 
 def places_mm(*parts: Compensation) -> F2:
-    """Return positions at which to compare tables, mm, shape (n, 3): all table points along the middle of their box, random ones in it."""
+    """Return the positions at which to compare tables, mm, shape (n, 3): each table point, the other axes centred, and random positions."""
     axes: list[list[F1]] = [[], [], []]
     for comp in parts:
         for t in comp.tables:

@@ -27,7 +27,7 @@ class ControlModel:
     Attributes
     ----------
     own, cross : str
-        Format of own-axis tables, and of cross and product tables; empty if the control has no such tables.
+        Format of own-axis tables (an axis corrects itself), and of cross and product tables; empty if the control has none.
     own_points, cross_points : int
         Largest number of points of a table.
     both_directions : bool
@@ -126,7 +126,7 @@ def control_of(key: str) -> ControlModel:
 
 JUDGE_NODES, COARSE_NODES = 12, 6
 MIN_GAIN = 0.02
-"""A larger set of tables must reduce the residual rms of a smaller one by at least this share."""
+"""A larger set of tables is chosen only if it reduces the residual rms by at least this share."""
 
 
 @dataclass(frozen=True)
@@ -273,12 +273,12 @@ class _Builder:
 
 
 def _added_by(product: ProductTable, points_mm: F2) -> F2:
-    """Return the correction by one product, mm: an additional error for the other tables, which need not correct it again."""
+    """Return what one product adds to the positions, mm; for the other tables this is a further error to correct."""
     return correction_at(Compensation(products=(product,)), points_mm)
 
 
 def rounded(comp: Compensation, unit_mm: float) -> Compensation:
-    """Round all corrections to the control's resolution (mm), and angles to a thousandth of the same number (rad)."""
+    """Round corrections to ``unit_mm``, and angles to a thousandth of the same number in rad."""
 
     def to(v: F1, unit: float = unit_mm) -> F1:
         return np.asarray(np.round(v / unit) * unit)

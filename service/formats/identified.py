@@ -1,7 +1,7 @@
 """An identified machine, and the decomposition of its errors into the tables that controls can hold.
 
-Rule G (docs/explanation/conventions.md): a carriage's angle times a travel of ANOTHER axis is a product of two functions of one axis each;
-everything else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products are sufficient.
+Rule G (docs/explanation/conventions.md): a carriage's angle times the travel of ANOTHER axis is a product of two functions of one axis
+each; everything else of a first-order machine is a sum of functions of one axis. So one-axis tables, cross tables and products suffice.
 """
 
 from __future__ import annotations

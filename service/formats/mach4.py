@@ -42,7 +42,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """Read the tables of sheets.
+    """Read the table of each sheet.
 
     Raises
     ------

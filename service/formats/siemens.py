@@ -34,7 +34,7 @@ class Assignments:
         return self.file.number(self.line[key], self.value[key], f"${name}[{','.join(index)}]")
 
     def values(self, name: str, *index: str, places: int = 1) -> F1:
-        """Return all numbered points 0, 1, ... of a table.
+        """Return the values of all points of a table, in the order of their numbers from 0.
 
         ``index`` holds the variable's other indices; the point's number is the index at ``places`` (from 0).
 

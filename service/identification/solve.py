@@ -26,7 +26,7 @@ from abbe.service.site import Site
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
-"""How names of set-up unknowns begin that cannot be off by five uncertainties: they were calibrated, or the error would be visible."""
+"""Prefixes of set-up unknowns that cannot be off by five uncertainties: they were calibrated, or such an error would be visible."""
 LASER_REMEDY = "look at beam, mirror and temperature of that set-up"
 UNUSUAL = {
     "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),

@@ -32,7 +32,7 @@ def table_file(crc: int) -> str:
 
 
 def no_image(crc: int) -> bytes | None:
-    """Know no table."""
+    """Return None: no table is known."""
     return None
 
 
@@ -41,7 +41,7 @@ class Folder:
     """Content of a checked campaign folder: ``campaign.json``, its runs in order, and the errors file of its ``current_model``.
 
     ``run_files``: the documents of ``runs`` as they stand in the files, for an import that keeps unknown keys. ``tables``: images of the
-    compensation tables in force that the folder holds, by CRC.
+    compensation tables that acted during the runs, by CRC, as far as the folder holds them.
     """
 
     campaign: Doc
