@@ -131,8 +131,7 @@ class SerialBallBar:
     """A telescoping ball-bar on a serial line or a serial device server (docs/protocols/ballbar.md).
 
     The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else that of the
-    first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer between reading and framing, in s of a 1000 Hz
-    stream.
+    first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer behind the reading thread, s at 1000 samples/s.
     """
 
     def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:

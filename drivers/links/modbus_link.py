@@ -251,8 +251,7 @@ class ModbusLink:
         For devices that have one and answer function 4 like function 3 (docs/protocols). Without it, a disturbed RTU line is not verified,
         and there is no heartbeat.
     heartbeat_s : float, optional
-        Read the canary after this idle time. This detects a vanished peer within ``heartbeat_s + timeout_s``, and reconnects a lost one.
-        None: no heartbeat.
+        Idle time until the canary is read (None: never): this detects a vanished peer within ``heartbeat_s + timeout_s``, and reconnects.
     """
 
     def __init__(

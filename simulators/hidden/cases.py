@@ -132,8 +132,7 @@ def _sized(
 def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], model_projector: Projector) -> Visibility:
     """Return the visibility of an effect in runs to which the present model is fitted.
 
-    Two figures measure the part that the model cannot absorb, in units of the noise: ``snr_total`` is its norm over all readings,
-    ``snr_local`` its rms over the readings where it exceeds `TOUCHED` times its maximum.
+    Of the part that the model cannot absorb, over the noise, ``snr_total`` is the norm, ``snr_local`` the rms where it is noticeable.
     """
     without, with_it = Rig(perfect, ()), Rig(perfect, (e,))
     trace = np.concatenate([with_it.reading(r) - without.reading(r) for r in runs])
