@@ -299,12 +299,18 @@ def _worst(runs: Sequence[_Run], limit: float) -> SuspectRun | None:
 def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
     """A run with the mistake that explains the campaign best."""
     others = together(rest)
-    best, cause = others.log_evidence + together([run.as_is]).log_evidence, "other"
+    misfit, expected = _misfit(others, run)
+    noisy = _noisier(run.as_is, max(1.0, misfit / expected))
+    best, cause = others.log_evidence + max(together([run.as_is]).log_evidence, conditional(others, {"": noisy})[""]), "other"
     for name, log_p in conditional(others, run.undone).items():
         if others.log_evidence + log_p > best + NAMED * (cause == "other"):
             best, cause = others.log_evidence + log_p, name
-    misfit, expected = _misfit(others, run)
     return SuspectRun(run.label, cause, best - as_is, misfit, expected)
+
+
+def _noisier(part: Part, factor: float) -> Part:
+    """Return the run with this many times the usual noise: dividing a noisy run by 25.4 makes it quiet, too, but proves no wrong unit."""
+    return Part(part.a / factor, part.y / factor, part.log_sigma + part.y.size * float(np.log(factor)))
 
 
 def _swapped(run: RunData) -> dict[str, RunData]:

@@ -55,6 +55,15 @@ def test_a_clumsy_set_up_a_worn_bar_and_outliers_are_no_reason():
     assert suspects(MACHINE, runs) == ()
 
 
+@pytest.mark.parametrize("seed", [3, 5, 8])
+def test_a_run_of_sixteen_times_the_noise_is_suspect_but_no_wrong_unit(seed):
+    """Divided by 25.4 it would be quiet, too: that alone proved inches before."""
+    runs = list(Truth(seed).campaign())
+    noise = np.random.default_rng(seed).normal(0.0, 4e-3, runs[-3].deviation_mm.size)
+    runs[-3] = replace(runs[-3], deviation_mm=runs[-3].deviation_mm + noise)
+    assert [(s.run, s.cause) for s in suspects(MACHINE, runs)] == [(runs[-3].label, "other")]
+
+
 def test_two_runs_that_contradict_each_other_are_both_named():
     truth = Truth(5)
     first, second = (truth.bar(n, np.array([300.0, 250.0, 135.0]), 200.0) for n in ("a", "b"))
