@@ -167,12 +167,12 @@ class ClockFit:
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster the device's clock runs than the host's."""
+        """By how many ppm the device's clock runs faster than the host's."""
         return (1.0 / self.rate - 1.0) * 1e6
 
     @property
     def u_drift_ppm(self) -> float:
-        """Standard uncertainty of the drift."""
+        """Standard uncertainty of the drift, ppm."""
         return self.u_rate / self.rate**2 * 1e6
 
     def host_s(self, device_s: F1) -> F1:

@@ -82,7 +82,7 @@ class NamedEffect:
 
     @property
     def label(self) -> str:
-        """``name:key``."""
+        """Label of the effect: ``name:key``, or the name alone without a key."""
         return f"{self.name}:{self.key}" if self.key else self.name
 
 

@@ -37,12 +37,12 @@ class Pick:
 
     @property
     def label(self) -> str:
-        """``name:key``."""
+        """Label of the effect: ``name:key``, or the name alone without a key."""
         return self.effect.label(self.key)
 
     @property
     def unnamed(self) -> bool:
-        """Whether it is a structure without a name."""
+        """Whether the effect is a structure without a name, outside the catalogue."""
         return self.effect.name.startswith(UNNAMED)
 
     def raw(self, problem: WhitenedProblem) -> F2:

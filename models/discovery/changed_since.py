@@ -165,7 +165,7 @@ class ChangeContext:
 
     @cached_property
     def candidates(self) -> tuple[AskedChange, ...]:
-        """All candidates for which the old solution has terms."""
+        """All candidate changes for which the old solution has terms."""
         names = {t.motion if t.order == 0 else t.name for t in self.known.terms}
         linear = [m for m in LINEAR if (m if m[1] == "0" else f"{m}.1") in names]
         out = [AskedChange(m, self._scaled(self.known.linear({m: 1.0})), LINEAR_SIZES) for m in linear]

@@ -21,7 +21,9 @@ LONE = 7.0
 
 @dataclass(frozen=True)
 class Colour:
-    """Noise of one instrument: standard deviation of a reading, mm; share of its variance with memory; memory from reading to reading."""
+    """Noise of one instrument: standard deviation of a reading, mm; ``share`` of its variance in the correlated part, with correlation
+    ``memory`` from reading to reading.
+    """
 
     sd_mm: float
     share: float = SHARE
@@ -44,7 +46,7 @@ class Colour:
 
 
 def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> F2:
-    """Whiten columns (n, k) of stacked runs as for an instrument noise of 1 mm; the caller divides by the actual noise."""
+    """Whiten columns (n, k) of stacked runs (``lengths``, ``kinds``) as if the noise were 1 mm; the caller divides by the actual noise."""
     out = np.empty_like(columns)
     start = 0
     for n, kind in zip(lengths, kinds, strict=True):
@@ -58,17 +60,17 @@ def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours:
 
 
 def robust_sd(values: F1) -> float:
-    """Robust standard deviation: median absolute value over 0.6745; NaN without values."""
+    """Robust standard deviation of values about zero: median absolute value over 0.6745; NaN without values."""
     return float(np.median(np.abs(values)) / 0.6745) if values.size else float("nan")
 
 
 def level(
     residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1, resolution_mm: Mapping[str, float]
 ) -> dict[str, Colour]:
-    """Estimate the noise of each instrument from whitened residuals, mm (times the noise assumed for whitening).
+    """Estimate the noise of each instrument from residuals that are whitened but not divided by the noise, mm (`unscaled`).
 
-    Differences of neighbours are insensitive to smooth effects that are not in the model yet. If they give clearly less noise, they are
-    used (`CLEARLY`).
+    Differences of neighbours are insensitive to smooth effects that are not in the model yet. They are used if they give clearly less noise
+    (`CLEARLY`).
     """
     out: dict[str, Colour] = {}
     for kind in dict.fromkeys(kinds):

@@ -57,7 +57,7 @@ def floors(problem: WhitenedProblem) -> dict[str, Floor]:
 
 
 def repeat_steps(case: Case, kind: str) -> F1:
-    """Differences of successive dwell readings at the same place, from the same side, in the same set-up, mm.
+    """Return the differences, mm, of successive dwell readings of a run at the same position, approached from the same side.
 
     Slow drift contributes little to them; errors of position, direction and set-up contribute nothing.
     """
@@ -77,7 +77,7 @@ def repeat_steps(case: Case, kind: str) -> F1:
 def lack_of_fit(
     problem: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
 ) -> Localization | None:
-    """Locate where the residuals of a solution without effects exceed noise; None: nowhere.
+    """Locate where the residuals of a solution without effects exceed noise; None if they do so nowhere.
 
     Parameters
     ----------
@@ -106,19 +106,19 @@ def lack_of_fit(
 
 
 def _times(rest: F1) -> float:
-    """Rms of valid readings in units of the noise (residuals are divided by it; exact zeros are not readings)."""
+    """Rms of residuals that are divided by the noise; exact zeros mark invalid readings."""
     read = rest[rest != 0.0]
     return float(np.sqrt(np.mean(read**2))) if read.size else 0.0
 
 
 def _louder(rest: F1, floor: Floor, tried: int) -> bool:
-    """Whether one run's residuals exceed noise in size and in significance over all runs."""
+    """Whether a run's residuals clearly exceed noise, with a significance corrected for the number of runs (``tried``)."""
     count, times = np.count_nonzero(rest), _times(rest)
     return bool(count >= FEWEST and times > TIMES and tried * f_above(times**2, count, floor.freedom) < CHANCE)
 
 
 def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping[str, Floor]) -> Localization | None:
-    """Shape of the residuals if all runs are laser lines along one axis: span, direction, period; else None."""
+    """Describe the residuals (span, direction, period) if all runs are laser lines along the same axis; else None."""
     lines = [r for r in runs if r.path.test == "laser_linear" and np.abs(r.path.look[0]).max() > ALONG_ONE_AXIS]
     axes = {int(np.argmax(np.abs(r.path.look[0]))) for r in lines}
     if not lines or len(axes) != 1 or len(lines) < len(runs):
@@ -145,7 +145,7 @@ def _shape_of(runs: Sequence[CaseRun], left_mm: Mapping[str, F1], floor: Mapping
 
 
 def _common(x: F1, y: F1, up: F1) -> tuple[F1, F1]:
-    """Index of every reading's position, and the mean of both directions there, shape (n,) each."""
+    """Return, for each reading, the index of its position and the mean of both directions there, shape (n,) each."""
     place = np.round(x / NEAR_MM)
     both = np.zeros(len(y))
     for p in np.unique(place):
@@ -156,13 +156,13 @@ def _common(x: F1, y: F1, up: F1) -> tuple[F1, F1]:
 
 
 def _loudest(y: F1, up: F1) -> int:
-    """Direction with the larger residuals."""
+    """Return the direction of motion, 1 or -1, with the larger residuals."""
     energy = {s: float(np.mean(y[up == s] ** 2)) for s in (-1, 1) if (up == s).any()}
     return max(energy, key=lambda s: energy[s])
 
 
 def _period(x: F1, y: F1) -> float | None:
-    """Period that explains most of a shape beside a straight line, mm; None if none explains enough or there are too few positions."""
+    """Return the period, mm, of the wave that explains most of y beside a straight line; None if none explains enough."""
     if x.size < FEWEST:
         return None
     spacing, span = float(np.median(np.diff(x))), float(np.ptp(x))

@@ -53,7 +53,7 @@ DEPENDS = {
 
 @dataclass(frozen=True)
 class _SignalRows:
-    """All readings of some runs: squared signal, squared direction cosines, time, position, direction along the path."""
+    """Table with a row per reading: squared signal, squared direction cosines of bar or beam, time, position, direction along the path."""
 
     energy: F1
     along: F2
@@ -73,7 +73,7 @@ def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localiza
     Returns
     -------
     Localization
-        Tests and runs that see it, axes that it lies along, directions of the path, and, only if it is confined, the time and the position
+        Tests, runs, axes and directions of the path in which the signal is strong, and, only if it is confined, the time and the position
         that hold 90 % of its energy. Empty for a signal of zeros.
     """
     rows = _signal_rows(paths, signal)
@@ -141,7 +141,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Residuals of all runs with the run and the block of each reading."""
+    """Whitened residuals of all runs, with the number of the run and of the block of each reading."""
 
     rest: F1
     run: np.ndarray[tuple[int], np.dtype[np.intp]]
@@ -201,7 +201,7 @@ def _rows(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> _Rows:
 
 
 def _excess(rows: _Rows, paths: tuple[Path, ...]) -> tuple[F1, ...]:
-    """Root of the energy above noise, smoothed over blocks, by run."""
+    """Return the size of the residuals above noise, the same for all readings of a block, one array per run."""
     count = np.bincount(rows.block)
     total = np.bincount(rows.block, rows.rest) ** 2 / np.maximum(count, 1)
     energy = np.bincount(rows.block, rows.rest**2) - count
@@ -210,7 +210,7 @@ def _excess(rows: _Rows, paths: tuple[Path, ...]) -> tuple[F1, ...]:
 
 
 def _by_group(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Energy tests by run, test, instrument, feed, axis, position and set-up."""
+    """Test the energy of the residuals by run, test, instrument, feed, axis, position and set-up."""
     q = np.concatenate([p.at.q_mm for p in paths])
     look = np.concatenate([p.look**2 for p in paths])
     for kind, names in (
@@ -234,7 +234,7 @@ def _by_group(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
 
 
 def _energy(kind: str, value: str, rows: _Rows, weight: F1) -> _Group:
-    """Weighted energy of block sums and of single readings against noise; p is twice the smaller of the two."""
+    """Test the weighted energy of block sums and of single readings against noise; p is twice the smaller p of both tests."""
     read = rows.rest != 0.0
     w = weight * read
     count = np.bincount(rows.block, read)
@@ -247,7 +247,7 @@ def _energy(kind: str, value: str, rows: _Rows, weight: F1) -> _Group:
 
 
 def _weighted_p(weight: F1, square: F1) -> float:
-    """Probability of a weighted sum of chi-squares this large or larger (Satterthwaite)."""
+    """Probability that noise gives a weighted sum of squares at least as large (Satterthwaite)."""
     if weight.sum() <= 0:
         return 1.0
     scale, freedom = float(weight @ weight / weight.sum()), float(weight.sum() ** 2 / (weight @ weight))
@@ -255,7 +255,7 @@ def _weighted_p(weight: F1, square: F1) -> float:
 
 
 def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_Group]:
-    """Ljung-Box test of each run over the first ten lags."""
+    """Test each run for correlation of neighbouring residuals: Ljung-Box over the first ten lags."""
     for p, r in zip(paths, whitened, strict=True):
         if p.n < 4 * LAGS:
             continue
@@ -266,7 +266,7 @@ def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_G
 
 
 def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Tests of each direction of the path, and of the difference between an axis' two directions of motion."""
+    """Test each direction of the path, and for each axis the difference between its two directions of motion."""
     way = np.concatenate([np.sign(p.direction) for p in paths])
     for d in (1, -1):
         yield _energy("direction", f"{d:d}", rows, (way == d).astype(np.float64))
@@ -277,7 +277,7 @@ def _direction(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
 
 
 def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Tests whether the residuals follow a temperature sensor, in proportion to the position along any axis."""
+    """Test whether residuals follow a temperature sensor times the position along an axis, as an expansion does."""
     for sensor in sorted(set.intersection(*(set(p.at.temp_c) for p in paths)) if paths else ()):
         value = np.concatenate([p.at.temp_c[sensor] for p in paths])
         if np.ptp(value) < 0.05:
@@ -288,13 +288,13 @@ def _temperature(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
 
 
 def _score(column: F1, rows: _Rows) -> float:
-    """Inner product of a column with the residual, in standard deviations."""
+    """Inner product of a column with the residuals, in standard deviations of noise."""
     parts = np.bincount(rows.block, column * rows.rest)
     return float(parts.sum() / np.sqrt(max(float(np.sum((column * (rows.rest != 0)) ** 2)), 1e-300)))
 
 
 def _lines(paths: tuple[Path, ...], rows: _Rows) -> Iterator[_Group]:
-    """Strongest spectral line between 1/100 Hz and 1/15 Hz over all bar runs, along each axis."""
+    """Test the strongest spectral line between 1/100 Hz and 1/15 Hz over all bar runs, along each axis."""
     bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
     inside = np.isin(rows.run, bars)
     if inside.sum() < LEAST:

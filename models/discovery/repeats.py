@@ -1,8 +1,8 @@
 """Repeats of a positioning test: does one slow drift, common to all positions, explain their differences?
 
-Positions approached repeatedly from the same side differ by noise and by drift. A drift in time that is the same at all positions shows
-in the repeats alone, without a model of the axis. Correlated noise looks like drift, so the p-value is simulated with noise that has the
-residuals' correlation from reading to reading ("memory"), for the best of all forms of drift tried.
+Readings at a position approached repeatedly from the same side differ by noise and by drift. A drift in time that is the same at all
+positions shows in the repeats alone, without a model of the axis. Correlated noise looks like drift, so the p-value is simulated with noise
+that has the residuals' correlation from reading to reading ("memory"), for the best of all forms of drift tried.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class RepeatDrift:
 
     Attributes
     ----------
-    named : whether it is claimed (`P_LIMIT`, `SHARE_LIMIT`).
-    share : part of the repeat variance that it explains, 0 to 1.
+    named : whether the drift is reported: p below `P_LIMIT` and share of `SHARE_LIMIT` or more.
+    share : part of the variance of the repeats that the drift explains, 0 to 1.
     p : probability that noise with the residuals' memory gives as large a share.
     form, tau_s : "linear", or "exponential" with its time constant.
-    change_mm, u_change_mm : from the first to the last reading, with its standard uncertainty.
-    before_mm, after_mm : standard deviation of the repeats before and after its removal.
+    change_mm, u_change_mm : drift from the first to the last reading, with its standard uncertainty.
+    before_mm, after_mm : standard deviation of the repeats before and after the drift is removed.
     memory : correlation of the noise of neighbouring readings.
     drift_mm : array, shape (n,): drift since the earliest reading, in the caller's order.
     """
@@ -57,7 +57,7 @@ class RepeatDrift:
 
 
 def repeat_drift(place: F1, t_s: F1, reading_mm: F1) -> RepeatDrift | None:
-    """Look for one drift in the repeats of a test.
+    """Look for a common drift in the repeats of a test.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def repeat_drift(place: F1, t_s: F1, reading_mm: F1) -> RepeatDrift | None:
 
 
 def _size(r: F1, after: F1, unit: F1, places: int, memory: float) -> F1:
-    """Size of the drift along a unit column and its standard uncertainty under noise with memory, shape (2,)."""
+    """Return the drift's coefficient for a column of unit length and its standard uncertainty under noise with memory, shape (2,)."""
     noise = float(after @ after) / max(r.size - places - 1, 1)
     return np.array([float(unit @ r), float(np.sqrt(noise * (unit @ _correlation(r.size, memory) @ unit)))])
 
@@ -123,19 +123,19 @@ def _correlation(n: int, memory: float) -> F2:
 
 
 def _shapes(x: F1) -> F2:
-    """A straight line and exponentials over 0 to 1, shape (n, forms)."""
+    """Return all forms of drift at times x, 0 to 1: a straight line and exponentials, shape (n, forms)."""
     return np.column_stack([x, *((1.0 - np.exp(-x / tau)) for tau in TAUS)])
 
 
 def _simplest(gains: F1, dof: int) -> int:
-    """Index of the straight line, unless an exponential is significantly better (F at 1 %, about 7)."""
+    """Return the index of the straight line, or of the best exponential if it is significantly better (F at 1 %, about 7)."""
     best = int(np.argmax(gains))
     left, straight = 1.0 - float(gains[best]), 1.0 - float(gains[0])
     return best if (straight - left) * max(dof - 1, 1) > 7.0 * left else 0
 
 
 def _memory(residual: F1, taken: F2) -> float:
-    """Memory of the noise that explains the neighbour correlation of the residuals after the fit, plus two standard errors.
+    """Estimate the memory of the noise from the correlation of neighbouring residuals after the fit, plus two standard errors.
 
     Without the margin, noise with a memory of 0.8 was called a drift in 3 of 100 tests, because the fitted drift absorbs memory.
     """

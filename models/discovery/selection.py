@@ -1,7 +1,7 @@
 """Forward selection of missing effects with backward steps and a price for every parameter and label tried.
 
-A label is an effect with its key; the search calls labels of the catalogue names. A candidate's non-linear parameters are refined between
-the starts of its grid before it is compared (`refined`). Other names are tried in place of a chosen one on the same readings (`rivals_of`).
+A label is an effect with its key; a label of the catalogue is called a name. Before a candidate is compared, its non-linear parameters are
+refined between the starts of its grid (`refined`). Other names are tried in place of a chosen one on the same readings (`rivals_of`).
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _along(parameter: Parameter, pick: Pick, best: float, gain: Callable[[Pick],
 
 
 def _neighbours(parameter: Parameter, value: float) -> tuple[float, float]:
-    """The starts next to a value, or the bounds of the parameter."""
+    """Return the next start below and above a value, or the bound of the parameter where there is none."""
     below = [s for s in parameter.starts if s < value * (1 - 1e-9) - 1e-12]
     above = [s for s in parameter.starts if s > value * (1 + 1e-9) + 1e-12]
     return max(below, default=parameter.low), min(above, default=parameter.high)
@@ -99,9 +99,10 @@ class Selection:
 
 
 def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
-    """Gain that a new name needs: for each parameter, for the number of names tried, and for being new.
+    """Return the gain that a new label needs: a price for each parameter, for the number of labels tried, and a threshold.
 
-    ``logs``: sum over its columns of the log of the number of readings that each changes; a non-linear parameter counts all ``readings``.
+    ``logs``: log of the number of readings that a column changes, summed over the columns; each non-linear parameter costs the log of the
+    number of all ``readings``.
     """
     return (
         logs
@@ -113,13 +114,13 @@ def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
 
 
 def form_price(logs: float) -> float:
-    """Gain that a freedom of form needs."""
+    """Return the gain that a form (`Form`) needs; ``logs`` as in `price`, over its columns."""
     return FORM_SHARE * logs + FORM_PRICE
 
 
 @dataclass(frozen=True)
 class Contest:
-    """The search over one problem: banks of candidates, price of each label's columns (``widths``), number of labels and of readings."""
+    """The search over one problem: banks of candidates, ``logs`` of `price` by label (``widths``), number of labels and of readings."""
 
     problem: WhitenedProblem
     banks: list[Bank]
@@ -158,7 +159,7 @@ class Contest:
         return self.widths[key]
 
     def shortlist(self, rows: F2, without: Sequence[str], most: int = SHORTLIST) -> list[Selection]:
-        """Best candidate of each label on the grid, best labels first."""
+        """Return the best candidate of each label on the grid, best labels first; labels in ``without`` are left out."""
         best: dict[str, Selection] = {}
         for bank in self.banks:
             for pick, gain in zip(bank.picks, bank.gains(self.problem.projection.y, rows), strict=True):
@@ -167,7 +168,7 @@ class Contest:
         return sorted(best.values(), key=lambda f: (-f.score, f.pick.label))[:most]
 
     def next(self, picks: Sequence[Pick], rows: F2, without: Sequence[str] = (), beat: float = 0.0) -> Selection | None:
-        """The best new name after refinement whose score is above ``beat``, or None."""
+        """Return the best refined new label with a score above ``beat``, or None; a name nearly as good wins over an unnamed structure."""
         tried: list[Selection] = []
         for candidate in self.shortlist(rows, [*without, *(p.label for p in picks)]):
             most = max([beat, *(f.score for f in tried)])
@@ -185,7 +186,7 @@ class Contest:
         return best
 
     def next_form(self, picks: Sequence[Pick], rows: F2) -> tuple[int, Pick, float] | None:
-        """The best freedom of form of a chosen effect: index of the pick, the pick with the form, its score."""
+        """Find the best form (`Form`) to add to a chosen effect; return the index of the pick, the pick with the form, and its score."""
         best: tuple[int, Pick, float] | None = None
         for i, pick in enumerate(picks):
             for form in pick.effect.forms:
@@ -221,12 +222,12 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
 
 
 def others(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
-    """Projection rows of all picks but one."""
+    """Return the rows that project out all picks but number i."""
     return rows_for(problem, [p for j, p in enumerate(picks) if j != i])
 
 
 def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Refine every pick again given the others, and replace it by another name if that explains more."""
+    """Refine every pick again given the others, and replace it by another label if that scores higher."""
     if len(picks) < 2:
         return picks
     for i in range(len(picks)):
@@ -239,7 +240,7 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Replace two picks of one effect by one where that scores higher: a lag of Y looks much like equal leads of X and Z."""
+    """Replace two picks of the same effect by a third where it scores higher: a lag of Y looks much like equal leads of X and Z."""
     for i, j in combinations(range(len(picks)), 2):
         a, b = picks[i], picks[j]
         if a.effect.name != b.effect.name or a.unnamed:
@@ -269,7 +270,7 @@ def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
-    """Gain and score of each pick given all others, in the order of the picks."""
+    """Return gain and score of each pick given all others, in the order of the picks."""
     out = []
     for i, pick in enumerate(picks):
         gain = gain_of(contest.problem, pick, others(contest.problem, picks, i))
@@ -279,7 +280,7 @@ def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
 
 @dataclass(frozen=True)
 class Rival:
-    """A name that could replace another: ``deficit``: missing chi-square after price; ``share``: its gain over that of the other."""
+    """A name that could replace a chosen one. ``deficit``: how much lower its score is; ``share``: its gain over that of the chosen one."""
 
     pick: Pick
     deficit: float
@@ -287,7 +288,7 @@ class Rival:
 
 
 def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
-    """Names that the readings do not exclude in place of pick ``i``, best first; variants of the same name are not rivals."""
+    """Return the names that the readings do not exclude in place of pick ``i``, best first; variants of its name are no rivals."""
     picks = [f.pick for f in found]
     rows = others(contest.problem, picks, i)
     own = found[i]
@@ -305,12 +306,12 @@ def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Riva
 
 
 def _nested(a: Pick, b: Pick) -> bool:
-    """Whether one is a variant of the other: backlash and position-dependent backlash of one axis."""
+    """Whether one pick is a variant of the other, such as backlash and position-dependent backlash of the same axis."""
     return a.key == b.key and (a.effect.name == b.effect.variant_of or b.effect.name == a.effect.variant_of)
 
 
 def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:
-    """Add the freedoms of form that are worth their price to a rival; return it with gain and score."""
+    """Add the forms (`Form`) that are worth their price to a rival; return it with gain and score."""
     score = gain - contest.price(pick)
     for form in pick.effect.forms:
         more = replace(pick, forms=(*pick.forms, form))

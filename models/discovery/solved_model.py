@@ -22,13 +22,13 @@ LONGEST_STEP = 0.3
 
 @dataclass(frozen=True)
 class SolvedModel:
-    """Unknowns of the simulation and of the effects, fitted to the identify runs with usual sizes as priors.
+    """Unknowns of the simulation and of the effects, fitted together to the identify runs; usual sizes of errors are the priors.
 
     Attributes
     ----------
     picks : the effects, with fitted non-linear parameters.
-    theta, theta_covariance : unknowns of the simulation, mm and rad.
-    coefficients, covariance : of each pick, forms last.
+    theta, theta_covariance : unknowns of the simulation, mm and rad, and their covariance.
+    coefficients, covariance : coefficients of each pick, those of its forms last, and their covariance.
     shape_u : standard uncertainty of the non-linear parameters of each pick, by name.
     """
 
@@ -41,7 +41,7 @@ class SolvedModel:
 
 
 def solve(problem: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
-    """Joint fit of simulation and effects, their non-linear parameters included (Gauss-Newton, inside their bounds)."""
+    """Fit simulation and effects together, including the non-linear parameters within their bounds (Gauss-Newton)."""
     picks = tuple(picks)
     raw, first, second = _steps(problem, picks)
     for _ in range(STEPS):
@@ -60,7 +60,7 @@ def solve(problem: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
 
 
 def _steps(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], SolvedModel, SolvedModel]:
-    """Columns of the picks, the fit at their present non-linear parameters, and the fit with these free too."""
+    """Return the columns of the picks, the fit with their non-linear parameters held, and the fit with these free too."""
     raw = [p.raw(problem) for p in picks]
     sd = [p.prior_sd(problem, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
     first = _fit(problem, raw, sd)
@@ -74,7 +74,7 @@ def _shape_sd(pick: Pick) -> F1:
 
 
 def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:
-    """The pick after a step of its non-linear parameters (`LONGEST_STEP`); steps below a tenth of the standard uncertainty are skipped."""
+    """Step the non-linear parameters of a pick, at most by `LONGEST_STEP`; skip steps below a tenth of the standard uncertainty."""
     k = len(covariance) - len(change)
     values = dict(pick.values)
     for j, q in enumerate(pick.effect.shape):
@@ -113,7 +113,7 @@ def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> Solve
 
 
 def predictions(problem: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
-    """Predicted reading of every run, mm, sealed runs included; set-up unknowns that no identify run determines are zero."""
+    """Predict the readings of every run, sealed runs included, mm; set-up unknowns that no identify run determines are zero."""
     runs = ordered(problem.case.runs)
     data = [r.data() for r in runs]
     out = [problem.base.read(d, solved.theta) for d in data]
@@ -135,7 +135,7 @@ def _width(signal: Signal, problem: WhitenedProblem, pick: Pick) -> int:
 
 
 def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
-    """Coefficients for columns over all runs; zero for columns that change no reading of an identify run."""
+    """Spread the coefficients c, fitted on identify runs, over the columns of all runs; 0 for columns that change no identify run."""
     if columns[0].shape[1] == c.size:
         return c
     observed = np.any([np.abs(col).max(axis=0) > 0.0 for col, known in zip(columns, identified, strict=True) if known], axis=0)
@@ -145,7 +145,7 @@ def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
 
 
 def free_columns(run: CaseRun, fitted_setups: set[str]) -> F2:
-    """Columns of a run's own unknowns: the zero of a laser; cup and bar length of a set-up that no identify run shares."""
+    """Return columns of the unknowns fitted to the run itself: zero of a laser, or cup and bar length of a set-up without identify runs."""
     p = run.path
     if p.kind == "laser":
         return np.ones((p.n, 1))
@@ -165,7 +165,7 @@ def left_over(run: CaseRun, predicted_mm: F1, fitted_setups: set[str]) -> F1:
 
 
 def left_together(runs: Sequence[CaseRun], predicted_mm: Mapping[str, F1], fitted_setups: set[str]) -> dict[str, F1]:
-    """As `left_over` for several runs, by label; ball-bar runs that share a set-up without identify runs share cup and bar lengths."""
+    """Return `left_over` of several runs, by label; ball-bar runs of the same set-up without identify runs share cup and bar lengths."""
     groups: dict[str, list[CaseRun]] = {}
     for run in runs:
         own_cup = run.path.kind == "bar" and run.path.setup not in fitted_setups

@@ -1,4 +1,4 @@
-"""Structures without a name, that is, found deviations that no effect of the catalogue explains: description and proposed experiment."""
+"""Describe structures without a name (deviations that no effect of the catalogue explains) and propose experiments for them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Structure:
 
 
 def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFinding]) -> tuple[Structure, ...]:
-    """Structures without a name among the mean effects (``found``) and the variance effects (``loud``), by evidence."""
+    """Return the structures without a name among mean effects (``found``) and variance effects (``loud``), strongest evidence first."""
     out = [
         Structure(f.pick.label, f.pick.effect.title, f.score / 2.0, location_of(f.pick.effect, f.pick.key, f.pick.values, case))
         for f in found
@@ -45,7 +45,7 @@ def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFi
 
 
 def lacking(location: Localization) -> Structure:
-    """A lack of fit (`abbe.models.discovery.lack`) as a structure."""
+    """Return a lack of fit (`abbe.models.discovery.lack`) as a structure without a name."""
     axis = f":{location.axes[0]}" if len(location.axes) == 1 else ""
     if location.shape:
         return Structure(f"{PREFIX}smooth{axis}", location.shape, 0.0, location)
@@ -53,7 +53,7 @@ def lacking(location: Localization) -> Structure:
 
 
 def describe_structure(structure: Structure, *, beside: bool) -> str:
-    """``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: names were found too."""
+    """Return e.g. ``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: named effects were found too."""
     parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.location)]
     return ", ".join(parts) + ("; the named effects do not explain this part of the gap" if beside else "")
 
@@ -76,9 +76,10 @@ def _place(location: Localization) -> list[str]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Experiment for a kind of structure. The first of ``adds`` that the campaign lacks is proposed. If it has all, the last is proposed
-    again (``always``), or the run is repeated. ``between``: the two causes that it separates; ``why``: text with ``{run}`` and
-    ``{standstill}``.
+    """Experiment for a kind of structure: the first addition of ``adds`` that the campaign lacks.
+
+    If it lacks none of these, the last one is proposed again (with ``always``), or else a repetition of the run. ``between``: the two
+    causes that the experiment separates; ``why``: text with ``{run}`` and ``{standstill}``.
     """
 
     adds: tuple[str, ...]
@@ -134,7 +135,7 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
 
     Parameters
     ----------
-    structures : by evidence (`abbe.models.discovery.unnamed.structures`).
+    structures : strongest evidence first (`abbe.models.discovery.unnamed.structures`).
 
     Returns
     -------
@@ -156,7 +157,7 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
 
 
 def _chosen(kind: str, like: Path, open_: set[str]) -> tuple[_Plan, str]:
-    """The plan for a kind of structure and the addition to propose."""
+    """Return the plan for a kind of structure, and which of the additions that the campaign lacks (``open_``) to propose."""
     plan = _PLANS[kind]
     adds = next((a for a in plan.adds if a in open_), None)
     if kind == "bump" and like.kind != "bar":  # the plan needs a ball-bar
@@ -170,7 +171,7 @@ def _chosen(kind: str, like: Path, open_: set[str]) -> tuple[_Plan, str]:
 
 
 def _like(case: Case, structure: Structure) -> Path:
-    """The run to measure again: among those that show the structure, near its time; helices first, which a machine runs unattended."""
+    """Choose the run to repeat, of those that show the structure: a helix (runs unattended), else a circle, else any; nearest in time."""
     paths = [r.path for r in case.of("identify", "holdout")]
     location = structure.location
     shown = [p for p in paths if p.label in location.runs] or paths
@@ -189,5 +190,5 @@ def _once_minutes(like: Path) -> float:
 
 
 def _repeat_minutes(like: Path) -> float:
-    """Minutes of a wait, one set-up and the repeats."""
+    """Minutes for the wait, one set-up and `REPEATS` runs."""
     return WAIT_MIN + _once_minutes(like) + (REPEATS - 1) * _run_minutes(like)

@@ -1,4 +1,4 @@
-"""Readings of a campaign, prepared for the search: present simulation fitted, noise estimated, the simulation's unknowns projected out.
+"""Readings of a campaign, prepared for the search: simulation fitted, noise estimated, the simulation's unknowns projected out.
 
 Readings and candidates are projected onto the orthogonal complement of the simulation's columns (Frisch-Waugh-Lovell).
 """
@@ -50,7 +50,7 @@ class SignalProjection:
     columns : array, shape (n, p); weight : array, shape (n,)
         Whitened columns of the unknowns are ``columns`` times ``weight``, reading by reading.
     root : array, shape (p, p), lower triangle.
-    more : array, shape (k, n): rows of T for further columns that are projected out.
+    more : array, shape (k, n): rows of T for further columns that are projected out, such as those of effects.
     y_coordinates : array, shape (p + k,) = T @ y.
     """
 
@@ -63,7 +63,7 @@ class SignalProjection:
 
     @classmethod
     def nothing(cls, n: int) -> SignalProjection:
-        """Projection without unknowns (the identity), with n readings of zero."""
+        """Return the projection that projects nothing out (the identity), with n readings of zero."""
         return cls(np.zeros(n), np.zeros((n, 0)), np.ones(n), np.zeros((0, 0)), np.zeros((0, n)), np.zeros(0))
 
     @classmethod
@@ -76,26 +76,26 @@ class SignalProjection:
         return replace(projection, y_coordinates=projection.coordinates(y[:, None])[:, 0])
 
     def coordinates(self, columns: F2) -> F2:
-        """T @ columns, shape (p + k, columns)."""
+        """Apply T of the class to columns (n, q): return T @ columns, shape (p + k, q)."""
         return np.concatenate([self.root @ (self.columns.T @ (columns * self.weight[:, None])), self.more @ columns])
 
     def spread(self, amounts: F2) -> F2:
-        """T^T @ amounts, shape (n, columns)."""
+        """Apply the transpose of T to amounts (p + k, q): return T^T @ amounts, shape (n, q)."""
         p = len(self.root)
         return np.asarray((self.columns @ (self.root.T @ amounts[:p])) * self.weight[:, None] + self.more.T @ amounts[p:])
 
     def left(self, columns: F2) -> F2:
-        """M @ columns, shape (n, k)."""
+        """Project the unknowns out of columns (n, q): return M @ columns, shape (n, q)."""
         return columns - self.spread(self.coordinates(columns))
 
     @cached_property
     def residual(self) -> F1:
-        """M @ y, the whitened residual."""
+        """Whitened residual: the readings with the unknowns projected out, M @ y, shape (n,)."""
         return np.asarray(self.y - self.spread(self.y_coordinates[:, None])[:, 0])
 
     @cached_property
     def leverage(self) -> F1:
-        """Leverage: share of every reading's noise variance that the fit absorbs, shape (n,)."""
+        """Share of every reading's noise variance that the fit absorbs, 0 to 1, shape (n,)."""
         out: F1 = np.einsum("kn,kn->n", self.more, self.more)
         for start in range(0, self.y.size, ROWS):
             at = slice(start, start + ROWS)
@@ -105,21 +105,21 @@ class SignalProjection:
 
     @property
     def chi2(self) -> float:
-        """y^T M y."""
+        """Sum of squares that the fit leaves, with the penalty of the priors: y^T M y."""
         return float(self.y @ self.y - self.y_coordinates @ self.y_coordinates)
 
     def rows(self, columns: F2, prior_sd: F1) -> F2:
-        """Rows of T that project out more columns (n, k), shape (k, n)."""
+        """Return the rows, shape (k, n), to add to T so that it projects out more columns (n, k) with independent priors."""
         return rows_of(self.left(columns), columns, prior_sd)
 
     def without(self, columns: F2, prior_sd: F1) -> SignalProjection:
-        """The projection with more columns projected out."""
+        """Return a projection that projects out more columns (n, k), too."""
         rows = self.rows(columns, prior_sd)
         return replace(self, more=np.concatenate([self.more, rows]), y_coordinates=np.concatenate([self.y_coordinates, rows @ self.y]))
 
 
 def rows_of(left: F2, columns: F2, prior_sd: F1) -> F2:
-    """Rows that project out columns, given the columns after projection (``left``); the unknowns have independent priors."""
+    """Return the rows of `SignalProjection.rows` for ``columns``, given what the projection leaves of them (``left``)."""
     gram = columns.T @ left + np.diag(prior_sd**-2.0)
     return np.asarray(scipy.linalg.solve_triangular(scipy.linalg.cholesky(0.5 * (gram + gram.T), lower=True), left.T, lower=True))
 
@@ -132,11 +132,11 @@ class WhitenedProblem:
     ----------
     paths : paths of the runs, with the bar directions of the fitted machine (`Baseline.along`).
     gap : array, shape (n,): reading minus the fitted simulation, mm.
-    use : array, shape (n,): 1, or 0 for readings that do not count (flagged, or single laser outliers).
+    use : array, shape (n,): 1, or 0 for readings that do not count (flagged, single laser outliers, or excess variance).
     theta : array, shape (p,): unknowns of the fitted simulation.
     tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
     projection : whitened gap, and the operator that projects the simulation's unknowns out of it.
-    also : array, shape (n, k): further columns to project out that are not part of the simulation (waves of a vibration), mm per mm.
+    also : array, shape (n, k): columns beside the simulation that are projected out, too (waves of a vibration), mm per mm.
     column_cache : whitened columns of picks and their projection. banks : banks of candidates of this problem that are still in
         memory. widths : number of columns of an effect along one run, by label. All three are caches.
     """
@@ -167,7 +167,7 @@ class WhitenedProblem:
         return tuple(p.kind for p in self.paths)
 
     def white(self, columns: F2) -> F2:
-        """Whitened columns (n, k); readings that do not count are zero."""
+        """Whiten columns (n, k), mm, to unit noise; readings that do not count become zero."""
         return unscaled(columns * self.use[:, None], self.lengths, self.kinds, self.colours) / self.sd_mm()[:, None]
 
     def raw(self, signal: Signal, key: str, values: Values) -> F2:
@@ -175,23 +175,23 @@ class WhitenedProblem:
         return np.concatenate(signal(self.paths, key, values))
 
     def sd_mm(self) -> F1:
-        """Noise of every reading, shape (n,)."""
+        """Standard deviation of every reading's noise, mm, shape (n,)."""
         return np.repeat([self.colours[k].sd_mm for k in self.kinds], self.lengths)
 
     def by_run(self, values: F1) -> list[F1]:
-        """Stacked values (n,) run by run."""
+        """Split stacked values (n,) into one array per run."""
         return np.split(values, np.cumsum(self.lengths)[:-1])
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives (n, p) in single precision, because linearising about the perfect machine has a relative error of 1e-4 anyway."""
+    """Derivatives of the readings, shape (n, p), in single precision: linearising about the perfect machine errs by 1e-4 anyway."""
 
     short: NDArray[np.float32]
 
     @classmethod
     def of(cls, runs: Sequence[CaseRun], base: Baseline) -> Slopes:
-        """Derivatives of the readings with respect to the simulation's unknowns."""
+        """Compute the derivatives of the readings of ``runs`` with respect to the simulation's unknowns at the perfect machine."""
         out = np.empty((sum(r.path.n for r in runs), base.size), dtype=np.float32)
         start = 0
         for run in runs:
@@ -200,17 +200,17 @@ class Slopes:
         return cls(out)
 
     def __matmul__(self, theta: F1) -> F1:
-        """Change of every reading, mm, shape (n,)."""
+        """Return the change of every reading, mm, shape (n,), for values ``theta`` of the unknowns."""
         parts = [self.short[i : i + ROWS].astype(np.float64) @ theta for i in range(0, len(self.short), ROWS)]
         return np.concatenate(parts) if parts else np.zeros(0)
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """Derivatives of all readings with respect to the simulation's unknowns at the perfect machine, whitened for noise of 1 mm.
+    """Derivatives of all readings with respect to the simulation's unknowns at the perfect machine.
 
     Errors of micrometres turn bar and beam by 1e-4 at most, so the derivatives are constant and only the reading is computed exactly.
-    ``columns``: whitened, (n, p). ``gram``: (p, p) per instrument. ``raw``: not whitened, (n, p).
+    ``raw``: not whitened, (n, p). ``columns``: whitened for noise of 1 mm, (n, p). ``gram``: their Gram matrix (p, p), per instrument.
     """
 
     raw: Slopes
@@ -219,7 +219,7 @@ class Tangent:
 
     @classmethod
     def of(cls, raw: Slopes, use: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> Tangent:
-        """Whiten run by run and accumulate the Gram matrices, with no more than one large matrix besides ``raw``."""
+        """Whiten ``raw`` and build the Gram matrices run by run, to hold no more than one large matrix besides ``raw``."""
         n, p = raw.short.shape
         columns = np.empty((n, p))
         gram = {kind: np.zeros((p, p)) for kind in dict.fromkeys(kinds)}
@@ -233,17 +233,17 @@ class Tangent:
         return cls(raw, columns, gram)
 
     def blend(self, colours: Mapping[str, Colour]) -> F2:
-        """Gram matrix of the columns whitened with the noise of each instrument, shape (p, p)."""
+        """Return the Gram matrix (p, p) of the columns, each reading divided by its instrument's noise."""
         return np.asarray(sum(g / colours[kind].sd_mm ** 2 for kind, g in self.gram.items()))
 
 
 def ordered(runs: Sequence[CaseRun]) -> tuple[CaseRun, ...]:
-    """Runs sorted by the time of their first reading: results do not depend on the caller's order."""
+    """Sort runs by the time of their first reading, so that results do not depend on the caller's order."""
     return tuple(sorted(runs, key=lambda r: (float(r.path.at.t_s[0]), r.path.label)))
 
 
 def whiten(case: Case, base: Baseline) -> WhitenedProblem:
-    """Fit the present simulation to the identify runs and project it out."""
+    """Build the problem of a case: fit the present simulation to the identify runs, estimate noise and project the unknowns out."""
     runs = ordered(case.of("identify"))
     use = np.concatenate([r.valid.astype(float) for r in runs])
     paths, n = tuple(r.path for r in runs), use.size
@@ -258,7 +258,7 @@ def whiten(case: Case, base: Baseline) -> WhitenedProblem:
 
 
 def linearised(problem: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedProblem:
-    """One Gauss-Newton step of the simulation, fitted together with columns of effects (mm per unit, n x k), which stay in the gap."""
+    """Make a Gauss-Newton step of the simulation, fitted together with columns (n, k) of effects; these effects stay in the gap."""
     base, tangent = problem.base, problem.tangent
     data = [r.data() for r in problem.runs]
     sd_mm = problem.sd_mm()[:, None]
@@ -279,7 +279,7 @@ def linearised(problem: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedPro
 
 
 def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
-    """The problem with its projection recomputed from gap, columns and noise."""
+    """Recompute the projection of a problem from gap, columns and noise."""
     y = problem.white(problem.gap[:, None])[:, 0]
     tangent = problem.tangent
     problem.column_cache.clear()
@@ -292,7 +292,7 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
 
 
 def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]]) -> WhitenedProblem:
-    """The problem with the noise re-estimated, with the effects ``found`` (raw columns, prior sd) projected out too."""
+    """Estimate the noise of a problem again beside the effects ``found`` (raw columns, prior sd), and exclude single laser outliers."""
     for _ in range(ROUNDS):
         problem = with_projection(problem)
         projection = problem.projection

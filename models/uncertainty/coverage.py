@@ -55,7 +55,7 @@ class Interval:
 
     @property
     def width(self) -> F1:
-        """High minus low."""
+        """Width of each interval, ``high`` minus ``low``."""
         return np.asarray(self.high - self.low)
 
 

@@ -54,7 +54,7 @@ class SuspectEffect:
 
     @property
     def label(self) -> str:
-        """``name:key``."""
+        """Label of the effect: ``name:key``, or the name alone without a key."""
         return self.effect.label(self.key)
 
 

@@ -1,8 +1,8 @@
 """Starts of the search for unnamed structures: the few positions, times and periods at which the residuals stand out.
 
-A step may occur at any time and a wave have any period, which makes thousands of starts, too many to project each column. The inner product
-of a candidate's column with the (already projected) residual needs no projection of the column, only its norm does. So a scan with
-approximate norms finds the best starts, which then compete with their exact columns.
+A step may occur at any time and a wave may have any period. That makes thousands of starts, too many to project the present simulation out
+of each column. Only the norm of a column needs this projection; its inner product with the (already projected) residual does not. So a scan
+with approximate norms finds the best starts, which then compete with their exact columns.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ PLACES = 64
 
 @dataclass(frozen=True)
 class ScanResult:
-    """Residuals of some runs: ``rest``: whitened, one array (n,) per run; ``sigma_mm``: noise of one reading of each run."""
+    """Runs to be scanned: paths, whitened residuals ``rest``, one array (n,) per run, and the noise of one reading of each run."""
 
     paths: tuple[Path, ...]
     rest: tuple[F1, ...]
     sigma_mm: tuple[float, ...]
 
     def only(self, which: list[int]) -> ScanResult:
-        """Some of the runs, in this order."""
+        """Return the runs with the indices ``which``, in this order."""
         return ScanResult(tuple(self.paths[k] for k in which), tuple(self.rest[k] for k in which), tuple(self.sigma_mm[k] for k in which))
 
     def stacked(self) -> tuple[F1, F2, F1]:
-        """Times, s, directions over noise (n, 3), 1/mm, and whitened residuals of all runs."""
+        """Return for all readings: time, s; direction of bar or beam over noise, shape (n, 3), 1/mm; whitened residual."""
         look = np.concatenate([p.look / s for p, s in zip(self.paths, self.sigma_mm, strict=True)])
         return np.concatenate([p.at.t_s for p in self.paths]), look, np.concatenate(self.rest)
 
 
 def best(score: F1, count: int, apart: int) -> list[int]:
-    """Indices of the highest values, at least ``apart`` from each other, highest first."""
+    """Return the indices of the highest positive values, highest first, more than ``apart`` from each other."""
     left = score.copy()
     out: list[int] = []
     while len(out) < count and np.isfinite(left).any() and left.max() > 0:
@@ -55,7 +55,7 @@ def best(score: F1, count: int, apart: int) -> list[int]:
 
 
 def step_instants(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Best times of a step, s, by axis and (``""``) in all directions together.
+    """Return the best times of a step, s, by axis; key ``""``: for a step in any direction.
 
     A step lasts until the end of a ball-bar set-up or of a laser run, because each laser run sets its zero anew.
     """
@@ -79,7 +79,7 @@ def step_instants(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...
 
 
 def periods(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Best periods in time, s, by axis and by instrument ("bar", "laser")."""
+    """Return the best periods of a wave in time, s, by axis and by instrument ("bar", "laser")."""
     t, look, rest = scanned.stacked()
     per_mm = np.concatenate([np.full(p.n, 1.0 / s) for p, s in zip(scanned.paths, scanned.sigma_mm, strict=True)])
     bar = np.concatenate([np.full(p.n, p.kind == "bar") for p in scanned.paths])
@@ -90,7 +90,7 @@ def periods(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
 
 
 def pitches(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Best pitches of a wave along one axis in the direction of another, mm, by error motion."""
+    """Return the best pitches, mm, of a wave along one axis in the direction of another, by error motion (``"EYX"``)."""
     q = np.concatenate([p.at.q_mm for p in scanned.paths])
     _, look, rest = scanned.stacked()
     out = {}
@@ -104,9 +104,9 @@ def pitches(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
 
 
 def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F1, bin_size: float) -> tuple[F1, F2]:
-    """Frequencies, and the reduction of chi-square by a wave in ``x`` at each, shape (columns, frequencies).
+    """Return frequencies, and the reduction of chi-square by a wave in ``x`` of each frequency, shape (columns, frequencies).
 
-    It is a Fourier transform of readings binned in ``x``, with the norms of unprojected columns.
+    It comes from a Fourier transform of the readings binned in ``x``, with norms of unprojected columns.
     """
     length = np.sum(columns**2, axis=0) / 2.0 + 1e-12
     cell = ((x - x.min()) / bin_size).astype(np.intp)
@@ -119,7 +119,7 @@ def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F
 
 
 def bursts(scanned: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Times (s), widths (s) and frequencies (Hz) of the strongest short oscillations in single ball-bar runs."""
+    """Return times (s), widths (s) and frequencies (Hz) of the strongest short oscillations within single ball-bar runs."""
     found: list[tuple[float, float, float, float]] = []
     for p, rest in zip(scanned.paths, scanned.rest, strict=True):
         if p.kind != "bar" or p.n < 20:
@@ -143,7 +143,7 @@ def bursts(scanned: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[fl
 
 
 def bumps(scanned: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:
-    """Times (s) at which the path passes the positions where a bump would explain most."""
+    """Return times (s) at which a path passes the positions where a bump would explain most."""
     q = np.concatenate([p.at.q_mm for p in scanned.paths])
     t, look, rest = scanned.stacked()
     _, cells = np.unique(np.round(q / CELL_MM).astype(int), axis=0, return_index=True)
@@ -159,7 +159,7 @@ def bumps(scanned: ScanResult, widths_mm: tuple[float, ...], count: int) -> tupl
 
 
 def _bump_gains(places: F2, tree: scipy.spatial.cKDTree, look: F2, rest: F1, widths_mm: tuple[float, ...]) -> F1:
-    """Largest reduction of chi-square by a bump of one of the widths at each position, shape (places,)."""
+    """Reduction of chi-square by a bump at each position, for the best of the widths, shape (places,)."""
     near = scipy.spatial.cKDTree(places).sparse_distance_matrix(tree, 2.5 * max(widths_mm), output_type="coo_matrix")
     total = np.zeros(len(places))
     for width in widths_mm:

@@ -1,7 +1,7 @@
-"""Structures without a name: generic effects that compete with the catalogue in the same search, mean "unknown" and locate the gap.
+"""Structures without a name: generic effects that compete with the catalogue in the same search; if they win, the verdict is "unknown".
 
 Each describes a kind of deviation (a step, a wave, a bump), whatever its cause. Without them, four of five effects outside the catalogue
-get a wrong name. A key names the axis (``"X"``) or the error motion (``"EYX"``: along X in direction Y).
+would get a wrong name. A key names the axis (``"X"``) or the error motion (``"EYX"``: along X in direction Y).
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ Starts = dict[str, dict[str, tuple[float, ...]]]
 
 
 def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """``"EYX"``: any smooth function of X in direction Y, Legendre orders 2 to 6 over the stroke."""
+    """Return columns of a smooth deviation: for ``"EYX"`` in direction Y as a function of X, Legendre orders 2 to 6 over the stroke."""
     return [p.read(lambda at, p=p: _along(key[1], _orders(p, at, key[2], SMOOTH_ORDERS))) for p in paths]  # type: ignore[misc]
 
 
 def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A smooth function (Legendre orders 1 to 3) times the direction in which the axis last moved."""
+    """Return columns as `smooth`, but of orders 1 to 3 and times the direction in which the axis last moved."""
 
     def deviation(p: Path, at: Places) -> F3:
         return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(p, at, key[2], ODD_ORDERS))
@@ -62,13 +62,13 @@ def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def wave(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """``"EYX"``: a wave of ``pitch_mm`` along X in direction Y."""
+    """Return columns of a wave: for ``"EYX"`` in direction Y along X with pitch ``pitch_mm``."""
     axis = AXES.index(key[2])
     return read_together(paths, lambda at: _along(key[1], _turns(at.q_mm[:, axis] / values["pitch_mm"])))
 
 
 def surge(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A wave in time with period ``period_s``: of an axis (``"X"``), or of the reading of an instrument (``"bar"``, ``"laser"``)."""
+    """Return columns of a wave in time with ``period_s``: of an axis (``"X"``) or of an instrument's reading (``"bar"``, ``"laser"``)."""
     period = values["period_s"]
     if key in AXES:
         return read_together(paths, lambda at: _along(key, _turns(at.t_s / period)))
@@ -76,12 +76,12 @@ def surge(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def step(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A constant offset of one axis from ``t0_s`` on."""
+    """Return the column of a constant offset of one axis from ``t0_s`` on."""
     return read_together(paths, lambda at: _along(key, (at.t_s >= values["t0_s"]).astype(np.float64)[:, None]))
 
 
 def slip(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """The workpiece side moves at ``t0_s`` (a clamp gave way): three translations, three rotations about the middle of the strokes."""
+    """Return columns of a move of the workpiece side at ``t0_s`` (a clamp gave way): three translations, three rotations."""
 
     def deviation(at: Places) -> F3:
         turned = -cross_matrix((at.q_mm - paths[0].machine.centre_mm) / ARM_MM)
@@ -92,7 +92,7 @@ def slip(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def settling(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """One axis drifts from ``t0_s`` on and settles with time constant ``tau_s``."""
+    """Return the column of an axis that drifts from ``t0_s`` on and settles with time constant ``tau_s``."""
 
     def gone(t_s: F1) -> F2:
         return np.asarray(-np.expm1(-np.maximum(t_s - values["t0_s"], 0.0) / values["tau_s"]))[:, None]
@@ -101,7 +101,7 @@ def settling(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def bump(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Deviation in any direction near one position, that of the campaign's path at ``at_s``; Gaussian with ``width_mm``."""
+    """Return columns of a deviation, in any direction, near the position at time ``at_s``: Gaussian of standard deviation ``width_mm``."""
     centre = place_at(paths, values["at_s"])
 
     def deviation(at: Places) -> F3:
@@ -122,13 +122,13 @@ def place_at(paths: tuple[Path, ...], at_s: float) -> F1:
 
 
 def lobes(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """``"Z3"``: three lobes of the ball around Z, at every position: a wave in the bar's azimuth, the same at every latitude."""
+    """Return columns of an out-of-round ball: for ``"Z3"`` three lobes around Z, a wave in the bar's azimuth equal at every latitude."""
     polar, number = AXES.index(key[0]), int(key[1:])
     return [UM * _lobed(p.look, polar, number) if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
 
 def lobe_latitude(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Freedom of form of lobes: their height changes linearly with the sine of the bar's latitude."""
+    """Return columns of a form of `lobes`: their height changes linearly with the sine of the bar's latitude."""
     polar, number = AXES.index(key[0]), int(key[1:])
     return [UM * _lobed(p.look, polar, number) * p.look[:, polar, None] if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
@@ -140,7 +140,7 @@ def _lobed(look: F2, polar: int, number: int) -> F2:
 
 
 def burst(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """A ball-bar's reading oscillates with ``frequency_hz`` about ``t0_s``, under a Gaussian of standard deviation ``width_s``."""
+    """Return columns of a ball-bar's oscillation with ``frequency_hz`` near ``t0_s``, under a Gaussian of sigma ``width_s``."""
     out = []
     for p in paths:
         since = p.at.t_s - values["t0_s"]
@@ -183,8 +183,8 @@ def generic_rivals(
     Parameters
     ----------
     residuals : dict, optional
-        Whitened residuals of runs by label, shape (n,) each, zero at invalid readings. With them a scan finds the starts; call again when
-        effects were added to the model. Without them the starts are a coarse grid.
+        Whitened residuals of runs by label, shape (n,) each, zero at invalid readings. A scan of them finds the starts, so call again after
+        effects are added to the model. Without residuals the starts are a coarse grid.
     sigma_mm : dict, optional
         Noise of one reading of "bar" and "laser"; only needed with residuals.
 
@@ -209,7 +209,7 @@ def location_of(effect: Effect, key: str, values: Values, case: Case) -> Localiz
 
     Parameters
     ----------
-    values : its non-linear parameters as found.
+    values : fitted non-linear parameters of ``effect``.
     """
     paths = tuple(r.path for r in case.of("identify", "holdout"))
     columns = effect.signal(paths, key, values)
@@ -246,7 +246,7 @@ def _scanned(scanned: ScanResult) -> Starts:
 
 
 def _coarse(paths: tuple[Path, ...]) -> Starts:
-    """Starts on a coarse grid without residuals: times within runs, periods, pitches, and positions along the path."""
+    """Return starts on a coarse grid: times within runs, periods, pitches, and positions along the paths."""
     t = np.concatenate([np.linspace(p.at.t_s[0], p.at.t_s[-1], 6) for p in paths])
     instants = tuple(float(v) for v in t + 0.5)
     places = tuple(float(v) for p in _apart(paths) for v in np.linspace(p.at.t_s[0], p.at.t_s[-1], 24))
@@ -264,7 +264,7 @@ def _coarse(paths: tuple[Path, ...]) -> Starts:
 
 
 def _apart(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-    """One run of every different path; runs back or at another feed pass the same positions."""
+    """Return one run of every different path, because runs back or at another feed pass the same positions."""
     distinct: dict[tuple[float, ...], Path] = {}
     for p in paths:
         distinct.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)
@@ -307,7 +307,7 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
 
 
 def _resolved_s(paths: Sequence[Path]) -> float:
-    """Shortest period that the fastest sampled run resolves: two intervals, s."""
+    """Shortest period, s, that the most densely sampled run resolves: two sampling intervals."""
     steps = [float(np.median(np.diff(p.at.t_s))) for p in paths if p.n > 1]
     return 2.0 * min(steps, default=np.inf)
 

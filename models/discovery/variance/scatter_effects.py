@@ -1,8 +1,8 @@
 """Effects in the variance of the readings, not in their mean: vibration, stick-slip, outliers of a laser, bursts of interference.
 
 Each is tested on whitened residuals against uniform scatter. The evidence is a log likelihood ratio less its price, on the scale of half a
-chi-square; an effect is named when it is positive. Prices account for the number of trials (frequencies, axes, windows): noise alone passes
-in less than 3 of 1000 campaigns each.
+chi-square; an effect is named when its evidence is positive. Prices account for the number of trials (frequencies, axes, windows): noise
+alone gets a given effect named in less than 3 of 1000 campaigns.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ CREEP_MM_S = 4.5
 
 
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
-    """Common deviation of the readings near the outliers, in standard deviations, and the centre of this position, (3,), mm.
+    """Find out whether laser outliers belong to a position: return how much other readings near them deviate alike, and that position.
 
-    A lost beam affects neither neighbouring readings nor the same position at another time, so the first value is then within 3.
+    The first value is in standard deviations, the second is a point (3,), mm. A lost beam affects neither neighbouring readings nor the
+    same position at another time; the first value is then within 3.
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
     rest : array, shape (n,)
         Whitened residuals; exact zeros are not readings.
     off : array of bool, shape (n,)
-        Which readings are outliers.
+        True for outliers.
     """
     total = count = most = 0.0
     clipped, middle = np.clip(rest, -LOUD, LOUD), np.zeros(3)
@@ -75,7 +76,7 @@ def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, 
 
 @dataclass(frozen=True)
 class Contaminated:
-    """Mixture of noise and outliers: gain in log likelihood, share of outliers, their typical size (sigmas) and its uncertainty."""
+    """Fit of noise with outliers: gain in log likelihood, share of outliers (``rate``), their typical size (sigmas) and its uncertainty."""
 
     gain: float
     rate: float
@@ -116,10 +117,11 @@ class VarianceFinding:
 
     Attributes
     ----------
-    name, key : of the catalogue, or ``unnamed_burst`` (a moment of one run) or ``unnamed_place`` (readings of a laser near one place).
+    name, key : name in the catalogue and axis; or ``unnamed_burst`` (some seconds of one run), ``unnamed_place`` (laser readings near one
+        position), without key.
     strength, u_strength : amplitude or typical size, um, with its standard uncertainty.
-    parameters : ``frequency_hz``; ``v_c`` (mm/s); ``rate``, share of outliers; or ``t0_s`` and ``width_s``.
-    evidence : log likelihood ratio less price; named when positive.
+    parameters : ``frequency_hz`` of a vibration; ``v_c`` (mm/s) of stick-slip; ``rate``, share of outliers; ``t0_s``, ``width_s``: burst.
+    evidence : log likelihood ratio less price; the effect is named when it is positive.
     """
 
     name: str
@@ -132,7 +134,7 @@ class VarianceFinding:
 
     @property
     def label(self) -> str:
-        """``name:key``."""
+        """Label of the effect: ``name:key``, or the name alone without a key."""
         return f"{self.name}:{self.key}" if self.key else self.name
 
 
@@ -144,7 +146,7 @@ def extra_variance(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """Find variance effects with positive evidence, highest first; at most one of vibration and stick-slip per axis.
+    """Find variance effects with positive evidence that no stronger one explains; at most one of vibration and stick-slip per axis.
 
     Parameters
     ----------
@@ -155,8 +157,8 @@ def extra_variance(
     sigma_mm : noise of one reading of each run.
     leverage : one array (n,) per run, optional
         Share of each reading's noise that the fit absorbed.
-    colours : noise by "bar" and "laser", optional
-        Noise with which the residuals were whitened; default: white.
+    colours : Colour by "bar" and "laser", optional
+        Noise with which the residuals were whitened; default: white noise.
 
     Returns
     -------
@@ -187,7 +189,7 @@ def candidates(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """All variance effects with their evidence, which may be negative; parameters as `extra_variance`."""
+    """Return all variance effects with their evidence, which may be negative; parameters as in `extra_variance`."""
     even = _studentised(whitened, leverage)
     bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
     out: list[VarianceFinding] = []
@@ -231,7 +233,7 @@ def _vibration(
 
 
 def _creep(axis: int, paths: tuple[Path, ...]) -> float | None:
-    """The single creeping speed of an axis in all bar runs that move it, mm/s; None if it also has other speeds."""
+    """Return the speed of an axis, mm/s, if it creeps at the same speed in all runs that move it; else None."""
     speeds = [np.abs(p.at.v_mm_s[:, axis]) for p in paths if np.ptp(p.at.q_mm[:, axis]) > 0]
     if not speeds:
         return None

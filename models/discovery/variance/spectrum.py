@@ -39,9 +39,10 @@ WINDOWS_S = (1.0, 2.0, 4.0)
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """A spectral line: gain in log likelihood (of the runs that prove it), number of frequencies tried, frequency, amplitude, uncertainty.
+    """A spectral line. ``gain``: gain in log likelihood from the runs that prove the line. ``tried``: number of frequencies tried.
 
-    ``p_harmonics``: p-value of the power at two to four times the frequency, which a saw-tooth has and a vibration does not have.
+    ``u_mm``: standard uncertainty of the amplitude. ``p_harmonics``: p-value of the power at two to four times the frequency, which a
+    saw-tooth has and a vibration does not have.
     """
 
     gain: float
@@ -54,10 +55,10 @@ class SpectralLine:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Spectrum of one run by aliased frequency 0 to ``rate_hz``, with residual r and direction u_a along the axis.
+    """Spectrum of one run over aliased frequencies 0 to ``rate_hz``; r: residuals, u_a: the bar's direction cosine along the axis.
 
-    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both zero where a frequency does not count. ``proves``:
-    frequencies at which a line cannot come from a form that the bar meets at every turn.
+    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both zero where a frequency does not count. ``proves``: whether
+    a line at this frequency is too fast for a form of balls or machine that the bar passes once per turn (`LOBES_PER_TURN`).
     """
 
     rate_hz: float
@@ -66,7 +67,7 @@ class _Spectrum:
     proves: np.ndarray[tuple[int], np.dtype[np.bool_]]
 
     def at(self, f: F1) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Index of physical frequencies."""
+        """Return the indices in the spectrum to which physical frequencies f, Hz, are aliased."""
         return np.asarray(np.round(np.mod(f / self.rate_hz, 1.0) * len(self.size)).astype(np.intp) % len(self.size))
 
 
@@ -101,7 +102,7 @@ def line_of_axis(
 
 
 def _harmonics(spectra: list[_Spectrum], f: float) -> float:
-    """Probability that noise alone has as much power at the harmonics of a line."""
+    """Probability that noise alone has as much power at the harmonics of a line of frequency f."""
     total, freedom = 0.0, 0
     for s in spectra:
         for i in s.at(f * np.array([2.0, 3.0, 4.0])):
@@ -127,7 +128,7 @@ def _spectrum(axis: int, path: Path, rest: F1, sigma_mm: float, colour: Colour |
 
 
 def fast(path: Path, rest: F1) -> F1:
-    """High-passed residuals of a run, because leakage of slow changes would raise all other frequencies."""
+    """High-pass the residuals of a run, because slow changes would leak into all other frequencies."""
     n = rest.size
     x = np.arange(n) / max(n, 1)
     turns = 2.0 * np.pi * np.outer(x, np.arange(1, min(int(_low_cycles(path)), n // 6) + 1))
@@ -136,23 +137,23 @@ def fast(path: Path, rest: F1) -> F1:
 
 
 def _low_cycles(path: Path) -> float:
-    """Cycles per run below which a frequency counts as a residue of the mean model."""
+    """Number of cycles per run up to which a frequency counts as a residue of the mean model."""
     return LOW_CYCLES + PER_TURN * _turns_of_bar(path)
 
 
 def _turns_of_bar(path: Path) -> float:
-    """Angle through which the bar turns along a run, in turns."""
+    """Return how many turns the bar makes along a run."""
     return float(np.linalg.norm(np.diff(path.look, axis=0), axis=1).sum()) / (2.0 * np.pi)
 
 
 def _noise_power(f: F1, colour: Colour) -> F1:
-    """Ratio of the noise power at a frequency (cycles per reading) to that of white noise of the same variance."""
+    """Return the noise power at frequencies f (cycles per reading) over that of white noise with the same variance."""
     s, m = colour.share, colour.memory
     return np.asarray(1.0 - s + s * (1.0 - m * m) / (1.0 - 2.0 * m * np.cos(2.0 * np.pi * f) + m * m))
 
 
 def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]:
-    """Most likely common amplitude of a line with a free phase in every run: gain, amplitude, its uncertainty."""
+    """Fit an amplitude common to all runs, with a free phase in each; return gain in log likelihood, amplitude and its uncertainty."""
     at = [int(s.at(np.array([f]))[0]) for s in spectra]
     z = np.array([s.size[i] for s, i in zip(spectra, at, strict=True)])
     e = np.array([s.energy[i] for s, i in zip(spectra, at, strict=True)])
@@ -170,7 +171,11 @@ def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Roughness:
-    """Stick-slip of one axis: gain in log likelihood, number of gates tried, gate ``v_c`` (mm/s), half height of the saw-tooth, weights."""
+    """Stick-slip of one axis, found by a gate: a weight of the readings that falls with the axis' speed.
+
+    ``gain``: gain in log likelihood. ``tried``: number of gates tried. ``v_c``: speed of the gate, mm/s. ``size_mm``, ``u_mm``: half height
+    of the saw-tooth and its standard uncertainty. ``weight``: square root of the gate, one array per run.
+    """
 
     gain: float
     tried: float
@@ -181,10 +186,10 @@ class Roughness:
 
 
 def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> dict[int, Roughness]:
-    """Find the most likely speed of each axis below which the readings are rougher; axes that never creep are left out.
+    """Find for each axis the most likely speed below which the readings are rougher; axes that never creep are left out.
 
     A saw-tooth of half height h decreases with speed as exp(-(v/v_c)^2) (Stribeck's curve) and has the variance h^2/3. Scatter along each
-    axis at any speed is fitted too, because a vibration is not stick-slip. Deviations that are constant from reading to reading do not
+    axis at any speed is fitted too, because a vibration is not stick-slip. Deviations that are equal in neighbouring readings do not
     count: they may be residues of the mean model at a reversal.
     """
     look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
@@ -208,7 +213,7 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
 
 
 def _readings(gate: F1) -> float:
-    """Effective number of readings in a gate."""
+    """Effective number of readings to which a gate gives weight."""
     return float(gate.sum() ** 2 / max(float(gate @ gate), 1e-300))
 
 
@@ -222,7 +227,7 @@ def _rough(rest: F1) -> F1:
 
 @dataclass(frozen=True)
 class _RoughnessFit:
-    """Squared residuals with the scatter along the axes fitted, to test for more scatter within a gate."""
+    """Squared residuals, and a fit of the scatter along the axes at any speed, to test gates (`Roughness`) for additional scatter."""
 
     square: F1
     plain: F2
@@ -240,7 +245,7 @@ class _RoughnessFit:
         return float(max(slope, 0.0) ** 2 / np.sum((gate / v) ** 2))
 
     def gain(self, gate: F1) -> tuple[float, float, float]:
-        """Log likelihood gained by extra variance within a gate, the variance, its uncertainty."""
+        """Fit additional variance within a gate; return gain in log likelihood, the variance and its standard uncertainty."""
         top = float(gate.max())
         full = np.column_stack([self.plain, gate / top])
         found = _likelihood(self.square, full, np.append(self.start[1:], 0.5))
@@ -253,7 +258,7 @@ class _RoughnessFit:
 
 
 def _likelihood(square: F1, columns: F2, start: F1) -> F1:
-    """Most likely white scatter and non-negative extra variances per column (in units of the white one)."""
+    """Return the most likely white variance, then a non-negative additional variance per column, in units of the white one."""
     n = square.size
 
     def cost(extra: F1) -> tuple[float, F1]:
@@ -268,7 +273,7 @@ def _likelihood(square: F1, columns: F2, start: F1) -> F1:
 
 
 def loud_windows(paths: tuple[Path, ...], rest: tuple[F1, ...]) -> tuple[float, float, int, float, float, float] | None:
-    """The window with the most scatter: gain, windows tried, index of the run, middle (s), half length (s), extra variance over noise."""
+    """Find the window with the most scatter: gain, windows tried, index of run, middle (s), half length (s), extra variance over noise."""
     best: tuple[float, float, int, float, float, float] | None = None
     tried = 0.0
     for k, (p, r) in enumerate(zip(paths, rest, strict=True)):
