@@ -1,7 +1,6 @@
 """Find the standstills in the readings of a program that Abbe did not start, and assign them to the planned ones.
 
-Below, "place" means a planned standstill, given by its target along the measured direction, mm. The deviation of a standstill at a place is
-its reading minus the target, less a constant offset.
+A "place" is a planned standstill, given by its target, mm, along the measured direction. A deviation is a reading minus target and offset.
 """
 
 from __future__ import annotations

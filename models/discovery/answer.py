@@ -13,11 +13,8 @@ Verdict = Literal["none", "named", "unknown"]
 
 @dataclass(frozen=True)
 class Significance:
-    """Result of one localization test, with statistic and family-wise p-value.
-
-    ``kind``: "run", "test", "axis", "direction", "feed", "time", "position", "frequency", "temperature" or "instrument". ``value``: which
-    run, axis, ... as text.
-    """
+    """Result of one localization test, with family-wise p-value. ``kind``: "run", "test", "axis", "direction", "feed", "time", "position",
+    "frequency", "temperature" or "instrument"; ``value``: which run, axis, ... as text."""
 
     kind: str
     value: str
@@ -27,11 +24,8 @@ class Significance:
 
 @dataclass(frozen=True)
 class Localization:
-    """Where a gap or an effect is located; a field that is None or empty: not located in this respect.
-
-    The fields are those of ``where`` in docs/schemas/discovery.schema.json. ``shape``: form of the deviation, as text. ``table``: all
-    tests.
-    """
+    """Where a gap or an effect is located; None or empty: not located in this respect. The fields are those of ``where`` in
+    docs/schemas/discovery.schema.json. ``shape``: form of the deviation, as text. ``table``: all tests."""
 
     tests: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
@@ -88,11 +82,8 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class NextTest:
-    """Proposed measurement: ``adds`` as in docs/schemas/discovery.schema.json.
-
-    ``separates``: labels of the suspects that it separates; for a structure without a name, possible causes as text. The expected
-    separation is None if it is unknown. ``like``: the run to repeat or vary, if any.
-    """
+    """Proposed measurement, ``adds`` as in docs/schemas/discovery.schema.json. ``separates``: labels of the suspects that it separates; for
+    a structure without a name, possible causes. Expected separation: None if unknown. ``like``: the run to repeat or vary, if any."""
 
     adds: tuple[str, ...]
     separates: tuple[str, ...]
@@ -164,15 +155,13 @@ class Discovery:
     verdict : "none": the present model explains the runs; "named": named effects are missing; "unknown": something is missing that the
         catalogue does not explain.
     effects : the named effects, strongest evidence first.
-    rejected : labels that were found but not named, each with the reason: structures without a name, effects of less evidence than these,
-        residues of other effects.
-    beside : structures without a name found beside named effects, (label, evidence), strongest first: the part of the gap that the named
-        effects do not explain.
+    rejected : labels found but not named, each with the reason: structures without a name, effects of less evidence, residues of effects.
+    beside : structures without a name that explain a part of the gap beside the named effects, (label, evidence), strongest first.
     confounded_with : rivals of the named effects that the data do not exclude.
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : gap of the runs of each role ("identify", "holdout").
-    residual_before_mm, residual_after_mm, predicted_before_mm, predicted_mm : residuals and predictions without and with the effects, by
-        run label; sealed runs have predictions only.
+    residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
+    predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.
     noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals.
     p_value : p-value of the whole finding.
     theta, theta_names, theta_covariance : unknowns of the present simulation, fitted together with the effects.

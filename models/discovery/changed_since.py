@@ -401,9 +401,8 @@ class Changed:
     """All changes found.
 
     ``before_mm``: rms of readings minus the old solution. ``after_mm``: the same with the changes that the OTHER half of the set-ups chose.
-    ``judged``: gain in log likelihood of each half by the other's choice, the smaller of the two. These three are None with too few
-    set-ups. ``floor_mm``: rms noise. ``hidden``: bound on the change (m/m, rad) of each scale and squareness that these runs can show, but
-    was not named.
+    ``judged``: gain in log likelihood of each half by the other's choice, the smaller of both. Too few set-ups: these three are None.
+    ``floor_mm``: rms noise. ``hidden``: bound on each change of scale (m/m) or squareness (rad) that was not named but would show.
     """
 
     changes: tuple[Change, ...]

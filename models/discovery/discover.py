@@ -97,8 +97,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
         Its identify runs are fitted, its holdout runs judge the result, its sealed runs are predicted.
     effects : tuple of Effect
         Effects to choose from.
-    progress : function, optional
-        Called with a text and the share of the work done, 0 to 1.
+    progress : function (text, share of the work done from 0 to 1), optional
 
     Returns
     -------

@@ -84,9 +84,8 @@ def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float
 def strength_of(problem: WhitenedProblem, pick: Pick, c: F1, cov: F2) -> tuple[float, float]:
     """Strength and its standard uncertainty, in the effect's unit, from its coefficients (forms last) and their covariance.
 
-    The uncertainty has four parts: that of the coefficients (with free non-linear parameters), the difference between true form and
-    formula, the share of the effect that the present simulation absorbs (`Effect.unseen`), and the choice of a sensor's start value
-    (`as_plain`).
+    The uncertainty has four parts: the coefficients (with free non-linear parameters), the true form (`true_to_form`), the share of the
+    effect that the present simulation absorbs (`Effect.unseen`), and the choice of a sensor's start value (`as_plain`).
     """
     effect = pick.effect
     plain = as_plain(problem, pick)
@@ -214,8 +213,7 @@ def finding(
     Parameters
     ----------
     problem, plain : the problem after the search, with noise estimated together with the findings; the problem before the search.
-    found, loud : the mean effects and the variance effects found.
-    solved, rivals : solution with ``found``; rivals of each of them, in the same order.
+    found, loud : mean and variance effects found. solved, rivals : solution with ``found``, and the rivals of each of these.
     predicted : predicted readings of every run by label, mm, without and with the effects.
     """
     case, judgement = problem.case, _judge(problem, found, loud, solved, rivals)

@@ -21,9 +21,7 @@ LONE = 7.0
 
 @dataclass(frozen=True)
 class Colour:
-    """Noise of one instrument: standard deviation of a reading, mm; ``share`` of its variance in the correlated part, with correlation
-    ``memory`` from reading to reading.
-    """
+    """Noise of one instrument. ``share``: correlated part of its variance; ``memory``: correlation of this part from reading to reading."""
 
     sd_mm: float
     share: float = SHARE
@@ -69,8 +67,7 @@ def level(
 ) -> dict[str, Colour]:
     """Estimate the noise of each instrument from residuals that are whitened but not divided by the noise, mm (`unscaled`).
 
-    Differences of neighbours are insensitive to smooth effects that are not in the model yet. They are used if they give clearly less noise
-    (`CLEARLY`).
+    Differences of neighbours, insensitive to smooth effects not yet in the model, are used if they give clearly less noise (`CLEARLY`).
     """
     out: dict[str, Colour] = {}
     for kind in dict.fromkeys(kinds):

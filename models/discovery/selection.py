@@ -101,8 +101,7 @@ class Selection:
 def price(pick: Pick, logs: float, readings: int, labels: int) -> float:
     """Return the gain that a new label needs: a price for each parameter, for the number of labels tried, and a threshold.
 
-    ``logs``: log of the number of readings that a column changes, summed over the columns; each non-linear parameter costs the log of the
-    number of all ``readings``.
+    ``logs``: log of the number of readings that a column changes, summed over the columns; a non-linear parameter costs log(``readings``).
     """
     return (
         logs

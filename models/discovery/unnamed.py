@@ -76,11 +76,9 @@ def _place(location: Localization) -> list[str]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Experiment for a kind of structure: the first addition of ``adds`` that the campaign lacks.
-
-    If it lacks none of these, the last one is proposed again (with ``always``), or else a repetition of the run. ``between``: the two
-    causes that the experiment separates; ``why``: text with ``{run}`` and ``{standstill}``.
-    """
+    """Experiment for a kind of structure: the first addition of ``adds`` that the campaign lacks. If it lacks none of these, the last one
+    is proposed again (with ``always``), or else a repetition of the run. ``between``: the two causes that the experiment separates;
+    ``why``: text with ``{run}`` and ``{standstill}``."""
 
     adds: tuple[str, ...]
     between: tuple[str, str]

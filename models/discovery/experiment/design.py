@@ -2,8 +2,7 @@
 
 For every addition that the campaign lacks, each rival is fitted to the leading suspect's signal over old and new runs, with all unknowns
 free: the rival's coefficients, the present simulation, the set-ups. The norm of the residual, in sigmas of the noise, is the expected
-separation. The addition with the largest gain per minute is proposed; additions with ball-bar or laser that separate all rivals come first,
-because few shops have other optics and standards.
+separation. The addition with the largest gain per minute is proposed; those that separate all rivals by ball-bar or laser come first.
 """
 
 from __future__ import annotations

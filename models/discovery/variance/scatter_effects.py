@@ -49,8 +49,7 @@ CREEP_MM_S = 4.5
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
     """Find out whether laser outliers belong to a position: return how much other readings near them deviate alike, and that position.
 
-    The first value is in standard deviations, the second is a point (3,), mm. A lost beam affects neither neighbouring readings nor the
-    same position at another time; the first value is then within 3.
+    Units: standard deviations; mm, shape (3,). A lost beam affects no other readings nearby; the first value is then within 3.
 
     Parameters
     ----------
@@ -117,8 +116,7 @@ class VarianceFinding:
 
     Attributes
     ----------
-    name, key : name in the catalogue and axis; or ``unnamed_burst`` (some seconds of one run), ``unnamed_place`` (laser readings near one
-        position), without key.
+    name, key : name in the catalogue and axis; or ``unnamed_burst`` (seconds of one run), ``unnamed_place`` (laser, near one position).
     strength, u_strength : amplitude or typical size, um, with its standard uncertainty.
     parameters : ``frequency_hz`` of a vibration; ``v_c`` (mm/s) of stick-slip; ``rate``, share of outliers; ``t0_s``, ``width_s``: burst.
     evidence : log likelihood ratio less price; the effect is named when it is positive.

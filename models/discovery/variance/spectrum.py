@@ -41,8 +41,7 @@ WINDOWS_S = (1.0, 2.0, 4.0)
 class SpectralLine:
     """A spectral line. ``gain``: gain in log likelihood from the runs that prove the line. ``tried``: number of frequencies tried.
 
-    ``u_mm``: standard uncertainty of the amplitude. ``p_harmonics``: p-value of the power at two to four times the frequency, which a
-    saw-tooth has and a vibration does not have.
+    ``p_harmonics``: p-value of the power at two to four times the frequency, which a saw-tooth has and a vibration does not have.
     """
 
     gain: float
@@ -171,10 +170,9 @@ def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Roughness:
-    """Stick-slip of one axis, found by a gate: a weight of the readings that falls with the axis' speed.
+    """Stick-slip of one axis, found by a gate (weights of readings that fall with its speed; ``weight``: their square roots by run).
 
-    ``gain``: gain in log likelihood. ``tried``: number of gates tried. ``v_c``: speed of the gate, mm/s. ``size_mm``, ``u_mm``: half height
-    of the saw-tooth and its standard uncertainty. ``weight``: square root of the gate, one array per run.
+    ``gain``: gain in log likelihood. ``tried``: number of gates tried. ``v_c``: gate speed, mm/s. ``size_mm``: half height of a saw-tooth.
     """
 
     gain: float
