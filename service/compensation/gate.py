@@ -255,5 +255,8 @@ def check_promise(predicted: Predicted, limits: PushLimits) -> None:
         The promised improvement is too small, absolutely or against the uncertainty of the model (`PushLimits`).
     """
     no = promise_reason(predicted.before_mm, predicted.after_mm, predicted.u_model_mm, limits)
-    if no:
-        raise TableRefused(no, "the present table is as good as these runs can tell; nothing was written")
+    if not no:
+        return
+    if predicted.u_model_mm > limits.share * predicted.before_mm:
+        raise TableRefused(no, "these runs know the errors too poorly: measure more (`abbe plan`); nothing was written")
+    raise TableRefused(no, "tables of this kind take out no more: `abbe solve --tables` shows what other kinds could; nothing was written")

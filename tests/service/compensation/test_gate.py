@@ -8,10 +8,10 @@ from typing import Any, cast
 import pytest
 
 from abbe.service.compensation import gate
-from abbe.service.compensation.gate import PushContext
+from abbe.service.compensation.gate import PushContext, check_promise
 from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.errors import TableRefused
-from abbe.service.push.limits import Capabilities
+from abbe.service.push.limits import Capabilities, PushLimits
 
 
 class Control:
@@ -86,3 +86,19 @@ async def test_a_control_that_was_never_proved_stops_the_measurement_for_it(monk
     control = Control(monkeypatch, commissioned=False)
     with pytest.raises(TableRefused, match="never proved"):
         await gate.check_preconditions(control.context)
+
+
+@pytest.mark.parametrize(
+    ("before_um", "after_um", "u_um", "why"),
+    [
+        (9.9, 4.0, 10.3, "know the errors too poorly: measure more"),
+        (4.7, 4.2, 0.9, "tables of this kind take out no more"),
+        (10.0, 9.9, 0.01, "tables of this kind take out no more"),
+    ],
+)
+def test_tables_that_promise_too_little_are_refused_with_the_true_reason(before_um: float, after_um: float, u_um: float, why: str) -> None:
+    """A torso of a campaign is not a machine that is as good as it can be."""
+    predicted = SimpleNamespace(before_mm=before_um * 1e-3, after_mm=after_um * 1e-3, u_model_mm=u_um * 1e-3)
+    with pytest.raises(TableRefused, match="not enough to write") as refused:
+        check_promise(cast("Any", predicted), PushLimits())
+    assert why in refused.value.remedy
